@@ -17,6 +17,8 @@ from msmpetsc.contact.obstacles.reflection import StepTaken, slowed
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
 from msmpetsc.contact.surface.term import SurfaceContact
 
+Placed = tuple[Positions, Indices | None]  # q (owned, 3) [m] and sides (o, owned or more), if any
+
 
 class Environment:
     """Loads, anchors and obstacles of a model. An implicit step asks once for its end, an explicit one in each substep.
@@ -117,26 +119,17 @@ class Environment:
         def at(time: float) -> list[Any]:
             loads = [load.state_at(time) for load in self.pulling]
             anchors = [anchor.holds_at(time) and tuple(anchor.path.displacement_at(time)) for anchor in self.anchors]
-            return [
-                *loads,
-                *anchors,
-                *(o.acts_at(time) and tuple(o.path.displacement_at(time)) for o in self.obstacles),
-            ]
+            obstacles = [o.acts_at(time) and tuple(o.path.displacement_at(time)) for o in self.obstacles]
+            return [*loads, *anchors, *obstacles]
 
         return at(begin) == at(end)
 
     def last_change(self, until: float) -> float:
-        """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
+        """Return when anything changes for the last time [s] before ``until``, or 0."""
         return max((time for time in self.events() if time <= until), default=0.0)
 
     def contact_faces(
-        self,
-        q: Positions,
-        end: Positions,
-        time: float,
-        time_step: float,
-        before: Indices | None,
-        held: Mask,
+        self, q: Positions, end: Positions, time: float, time_step: float, before: Indices | None, held: Mask
     ) -> Indices:
         """Return the sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step.
 
@@ -163,20 +156,13 @@ class Environment:
         )
 
     def contact(
-        self,
-        q: Positions,
-        end: Positions,
-        time: float,
-        time_step: float,
-        sides: Indices,
-        before: Positions | None = None,
+        self, q: Positions, end: Positions, time: float, time_step: float, sides: Indices | None, last: Positions | None
     ) -> Contact | None:
         """Return what presses in the step from q to about ``end``, friction included; None if nothing does.
 
-        before : (l, 3) [m] positions one step before q, of a step that looks back to them
+        last : (l, 3) [m] positions one step before q, of a step that looks back to them
         """
         owned, surface = self.lattice.owned, None
-        last = None if before is None else before[:owned]
         pressing = self._pressing(time, sides)
         states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
         if self.self_contact:
@@ -249,18 +235,10 @@ class Environment:
         new = [p.state_at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
         return Contact(new, self.lattice.owned).energy(q) if new else 0.0
 
-    def friction_work_bound(
-        self,
-        before: tuple[Positions, Indices | None],
-        after: tuple[Positions, Indices | None],
-        time: float,
-        time_step: float,
-    ) -> float:
+    def friction_work_bound(self, before: Placed, after: Placed, time: float, time_step: float) -> float:
         """Return no less than the work [J] that friction of moving obstacles does on this rank's nodes in a step.
 
         It is mu N times how far they go.
-
-        before, after : positions (owned, 3) [m] and sides (o, owned or more), None where there are none
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
@@ -270,27 +248,18 @@ class Environment:
                     work += p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
         return work
 
-    def change_of_push(
-        self,
-        before: tuple[Positions, Indices | None],
-        after: tuple[Positions, Indices | None],
-        time: float,
-        time_step: float,
-    ) -> Floats:
-        """Return by how much the push of penalties on this rank's nodes changes in a step, (owned,) [N].
-
-        before, after : positions (owned, 3) [m] and sides (o, owned or more), None where there are none
-        """
+    def change_of_push(self, before: Placed, after: Placed, time: float, time_step: float) -> Floats:
+        """Return how much the push of penalties on this rank's nodes changes in a step, (owned,) [N]."""
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
-            depths = [
-                self._pushed(row, state, when) if p.obstacle.acts_at(when) else np.zeros_like(change)
-                for state, when in ((before, time - time_step), (after, time))
-            ]
-            change += p.stiffness * np.abs(depths[1] - depths[0])
+            deeper = np.zeros_like(change)
+            for sign, state, when in ((-1, before, time - time_step), (1, after, time)):
+                if p.obstacle.acts_at(when):
+                    deeper += sign * self._pushed(row, state, when)
+            change += p.stiffness * np.abs(deeper)
         return change
 
-    def _pushed(self, row: int, state: tuple[Positions, Indices | None], time: float) -> Floats:
+    def _pushed(self, row: int, state: Placed, time: float) -> Floats:
         """Return how deep nodes (owned,) of a state are in a penalty's obstacle at a time [s], 0 outside [m]."""
         q, sides = state
         side = (self.no_sides if sides is None else sides)[row, : len(q)]

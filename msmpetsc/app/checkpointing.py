@@ -104,7 +104,7 @@ class Signals:
             signal.signal(number, handler)
 
     def begin(self) -> None:
-        """Mark that steps are taken from now on: before, there is nothing that a SIGINT could keep."""
+        """Mark that steps are taken from now on: before, a SIGINT has nothing to keep."""
         self._stepping = True
 
     def agree(self, due: bool) -> tuple[bool, int]:

@@ -1,5 +1,6 @@
-"""The end of all ranks when some fail: together, with one line and one exit status."""
+"""What all ranks say together: the log, which rank 0 alone writes; and one line and one exit status when some fail."""
 
+import logging
 import sys
 import time
 import traceback
@@ -14,6 +15,26 @@ if TYPE_CHECKING:
 
 STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the other
+LINE = "msmpetsc: %(levelname)s: %(message)s"
+TIMED = "msmpetsc: %(levelname)s [%(relativeCreated).0f ms]: %(message)s"
+
+
+@contextmanager
+def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False) -> Iterator[None]:
+    """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with milliseconds."""
+    log = logging.getLogger("msmpetsc")
+    before = log.handlers, log.level
+    logging.addLevelName(logging.WARNING, "warning")
+    logging.addLevelName(logging.INFO, "note")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter(TIMED if timed else LINE))
+    log.handlers = [handler]
+    log.setLevel(level if comm.rank == 0 else logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log.handlers = before[0]
+        log.setLevel(before[1])
 
 
 @contextmanager

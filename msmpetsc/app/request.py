@@ -14,13 +14,7 @@ from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar, cast
 
-from msmpetsc.app.checks import (
-    MEASURE_NAMES,
-    RESULT_NAMES,
-    checked_file,
-    checked_path,
-    refuse_other_format,
-)
+from msmpetsc.app.checks import MEASURE_NAMES, RESULT_NAMES, checked_file, checked_path, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.solve.petsc.words import words_of
@@ -208,15 +202,12 @@ def asked_by(request: Callable[P, RunRequest]) -> Callable[[Callable[[Callable[[
             return function(partial(request, *args, **keywords))
 
         signature = inspect.signature(request)
-        parameters = [each.replace(annotation=_plain(each.annotation)) for each in signature.parameters.values()]
+        types = {name: each.annotation.__origin__ for name, each in signature.parameters.items()}
+        types = {name: getattr(kind, "__forward_arg__", kind) for name, kind in types.items()}
+        parameters = [each.replace(annotation=types[name]) for name, each in signature.parameters.items()]
         told = "\n".join(f"    {name:16} : {option.help}" for name, option in OPTIONS.items())
         of_fields.__doc__ = f"{function.__doc__}\n{told}\n"
         of_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # which help() shows
         return of_fields
 
     return decorate
-
-
-def _plain(annotation: Any) -> Any:
-    """Return the type of an annotated one."""
-    return getattr(annotation.__origin__, "__forward_arg__", annotation.__origin__)

@@ -36,7 +36,7 @@ OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that ma
 
 
 def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
-    """Return what is to be resumed, None for a run from the start (collective). Raises InputError."""
+    """Return what is to be resumed, None to run from the start (collective). Raises InputError."""
     if request.resume is None:
         return None
     path = Path(request.resume)
@@ -83,28 +83,21 @@ def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
     if not text or not file or not file.isprintable():
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
     scene = scene_of(Path(file), text, changes, presets)
-    _refuse_files_of_others(earlier, Path(file), scene, changes)
-    return scene
-
-
-def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes: list[str]) -> None:
-    """Raise InputError for a file named by a result's scene that neither lies beside it nor is
-    named by that scene's file or by the user.
-
-    The result may be from anywhere, and so may be what it says of the folder in which its scene lay.
-    """
+    # The result may be from anywhere, and so may be what it says of the folder in which its scene lay: each file that
+    # it names must lie beside it, or be named by that scene's file or by the user.
     given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
     known = set(MODELS)
     with suppress(InputError):
         known |= {name for _, name in load_scene(file).named_files()}
     for path, name in scene.named_files():
         keys = tuple(map(str, path))
-        lies_beside = (file.parent / name).resolve().parent == earlier.path.resolve().parent
+        lies_beside = (Path(file).parent / name).resolve().parent == earlier.path.resolve().parent
         if not (name in known or lies_beside or any(keys[: len(own)] == own for own in given)):
             raise InputError(
-                f"{earlier.path} names {as_given(name)}, and {as_given(str(file))} does not: name the SCENE too, "
+                f"{earlier.path} names {as_given(name)}, and {as_given(file)} does not: name the SCENE too, "
                 f"or --set {'.'.join(keys)}=PATH"
             )
+    return scene
 
 
 class Resumed:

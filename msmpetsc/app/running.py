@@ -22,14 +22,13 @@ from msmpetsc.backend.kernel import cache_is_empty
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.results.constant_parts import write_model
 from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.restart import Earlier
-from msmpetsc.results.writer import Begin, ResultFile
+from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene, scene_in
 from msmpetsc.scene.schema import Solver
-from msmpetsc.solve.instrumentation import Probes, begin_timing
+from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import find_preset, preset_names, shown_options
@@ -64,11 +63,6 @@ class RunEnd:
     signal: int
     failure: StepFailed | None
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether all steps were taken."""
-        return not self.signal and self.failure is None
-
 
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
     """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
@@ -76,7 +70,7 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     choose(comm, request.device)
     began = perf_counter()
     if request.measure:
-        begin_timing()
+        PETSc.Log.begin()
     probes = Probes(request.true_error, request.trace)
     interval = Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
@@ -135,7 +129,7 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
     request = plan.request
     if request.measured:
         ended.cost.write(request.measured, request.command, ended.failure)
-    left = write_companions(comm, request, ended.is_whole)
+    left = write_companions(comm, request, whole=not ended.signal and ended.failure is None)
     on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, ended.cost.setup, left))
     if ended.failure:
         raise ended.failure
@@ -171,9 +165,6 @@ def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier 
     lines = shown_options(solvers)
     silence_options_left()
     return lines
-
-
-# Before the steps
 
 
 def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
@@ -237,9 +228,6 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
         plan.resumed.restore(comm, file, simulation)
     file.start_frames(simulation.stored, model.lattice.owned, simulation.rows, simulation.saved())
     return simulation.stored_until(simulation.step) if simulation.step else 0
-
-
-# After the steps
 
 
 def write_companions(comm: MPI.Intracomm, request: RunRequest, whole: bool) -> list[Path]:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.ending import ending_together
-from msmpetsc.app.log import logged_on_root
+from msmpetsc.app.ending import ending_together, logged_on_root
 from msmpetsc.app.request import FLAGS
 from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import InputError
@@ -21,13 +20,6 @@ from msmpetsc.solve.petsc.initialise import lent_options, start_for_runs
 from msmpetsc.solve.petsc.words import words_of
 
 Source = str | PathLike[str] | Mapping[str, Any] | Scene  # a scene file, its tables, or a scene
-
-
-def scene_from(source: Source, changes: Mapping[str, Any] | None = None) -> Scene:
-    """Return a scene from its file, its tables or another scene, with changes. Raises InputError."""
-    if isinstance(source, Scene):
-        return source.changed(changes or {})
-    return Scene.of(source, changes=changes) if isinstance(source, Mapping) else Scene.load(source, changes)
 
 
 def frames(
@@ -75,7 +67,9 @@ class Simulation:
         if device not in (None, "cpu", "cuda"):
             raise InputError(f"device is cpu or cuda, not {device!r}")
         self.comm, self.device = MPI.COMM_WORLD, device
-        self.scene = scene_from(scene)
+        if not isinstance(scene, Scene):
+            scene = Scene.of(scene) if isinstance(scene, Mapping) else Scene.load(scene)
+        self.scene = scene
         self.model: Model | None = None
         self._words = words_of(petsc_options)
         self._shape: Geometry | None = None  # that the model was made of
@@ -140,7 +134,7 @@ class Simulation:
         return simulation.frames()
 
     def _lend_options(self, until_the_end: ExitStack) -> bool:
-        """Lend PETSc these options; return whether no other simulation is under way (collective)."""
+        """Lend PETSc these options; return whether no other simulation is begun (collective)."""
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
         from msmpetsc.solve.presets import in_use
         from msmpetsc.solve.refused_options import refuse_early

@@ -7,8 +7,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from msmpetsc.app.ending import STATUS_INTERRUPTED, ending_together
-from msmpetsc.app.log import logged_on_root
+from msmpetsc.app.ending import STATUS_INTERRUPTED, ending_together, logged_on_root
 from msmpetsc.app.request import RunRequest, asked_by
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""What a run says of itself on stderr: rank 0 alone, from bodies and counts to the files it leaves."""
+"""What a run says on stderr: rank 0 alone, from bodies and counts to the files it leaves."""
 
 import shlex
 from collections.abc import Iterable
@@ -20,9 +20,19 @@ from msmpetsc.solve.simulate import TimeLoop
 
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
-    """Log what the model is of, its counts, and the nodes that tables take (collective)."""
+    """Log size, volume and mass of each body, counts, and the nodes that anchors and forces take (collective)."""
     lattice = model.lattice
-    log_bodies(comm, model)
+    masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(model.bodies))
+    shares = np.bincount(lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(model.bodies))
+    sums = comm.allreduce(np.array([masses, shares * lattice.cell_size**3]))
+    for number, (body, (mass, volume)) in enumerate(zip(model.bodies, sums.T, strict=True)):
+        mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
+        if body.report.closed:
+            enclosed = abs(body.report.volume)
+            mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
+        name = f"body.{number}" if len(model.bodies) > 1 else "body"
+        size = " x ".join(f"{length:.4g}" for length in body.bounds[1] - body.bounds[0])
+        log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
     held = int(lattice.pinned[: lattice.owned].sum())
     cells, springs, pinned = (comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, held))
     log.info(
@@ -51,27 +61,6 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
             'shows it, time.integrator = "static" goes to rest at once',
             time.step / period, period, period / STEPS_A_PERIOD,
         )  # fmt: skip
-
-
-def log_bodies(comm: MPI.Comm, model: Model) -> None:
-    """Log size, volume and mass of each body and its part of the lattice (collective)."""
-    lattice = model.lattice
-    masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(model.bodies))
-    shares = np.bincount(lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(model.bodies))
-    sums = comm.allreduce(np.array([masses, shares * lattice.cell_size**3]))
-    for number, (body, (mass, volume)) in enumerate(zip(model.bodies, sums.T, strict=True)):
-        mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
-        if body.report.closed:
-            enclosed = abs(body.report.volume)
-            mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
-        name = f"body.{number}" if len(model.bodies) > 1 else "body"
-        size = sides(body.bounds[1] - body.bounds[0])
-        log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
-
-
-def sides(lengths: Iterable[float]) -> str:
-    """Return "0.3 x 0.2325 x 0.2974" of three lengths."""
-    return " x ".join(f"{length:.4g}" for length in lengths)
 
 
 def taken(reaches: Iterable[Reach]) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES
-from msmpetsc.cli.command_table import COMMANDS, SAID, Argument, Shown
+from msmpetsc.cli.command_table import COMMANDS, SAID, Shown
 from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, did_you_mean, printable
 
@@ -25,7 +25,11 @@ TAKE_PETSC_OPTIONS = ("run",)
 def parsed(words: list[str]) -> argparse.Namespace:
     """Parse a whole command line: our own arguments, and PETSc's options. Raises InputError."""
     ours, petsc = split_petsc_options(words)
-    _refuse_unknown_command(ours)
+    if ours and ours[0] not in COMMANDS and not ours[0].startswith("-"):
+        word = printable(ours[0], 60)
+        if word.endswith(SCENE_NAMES):
+            raise InputError(f"{word} is no command, did you mean 'msmpetsc run {word}'?")
+        raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
     _refuse_one_dash(ours, petsc)
     args, unknown = command_parser().parse_known_args(ours, argparse.Namespace(petsc_options=shlex.join(petsc)))
     if unknown:
@@ -47,16 +51,6 @@ def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
 
 def _is_petsc_option(word: str) -> bool:
     return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
-
-
-def _refuse_unknown_command(ours: list[str]) -> None:
-    """Raise InputError for a word that is no command, with the one that may be meant."""
-    if not ours or ours[0] in COMMANDS or ours[0].startswith("-"):
-        return
-    word = printable(ours[0], 60)
-    if word.endswith(SCENE_NAMES):
-        raise InputError(f"{word} is no command, did you mean 'msmpetsc run {word}'?")
-    raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
@@ -121,17 +115,17 @@ def command_parser() -> Parser:
         add = commands.add_parser(
             name, help=command.help, description=about, epilog=examples, formatter_class=RawDescriptionHelpFormatter
         )
-        for argument in command.arguments:
-            add.add_argument(*argument.names, **argument.keywords)
+        for names, keywords in command.arguments:
+            add.add_argument(*names, **keywords)
         for choice in filter(None, (command.exclusive, SAID)):
             group = add.add_mutually_exclusive_group()
-            for argument in choice:
-                group.add_argument(*argument.names, **argument.keywords)
+            for names, keywords in choice:
+                group.add_argument(*names, **keywords)
     return parser
 
 
 def option_names(command: str) -> list[str]:
     """List the options of a command: "--preset"."""
     known = COMMANDS[command]
-    given: tuple[Argument, ...] = (*known.arguments, *known.exclusive, *SAID)
-    return ["--help", *(name for argument in given for name in argument.names if name.startswith("-"))]
+    given = (*known.arguments, *known.exclusive, *SAID)
+    return ["--help", *(name for names, _ in given for name in names if name.startswith("-"))]

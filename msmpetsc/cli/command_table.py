@@ -1,28 +1,24 @@
-"""Every command with its help, its arguments and its examples: the table that the parser is made of."""
+"""Every command with its help, arguments and examples: what the parser is made of."""
 
 import argparse
 import sys
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.app.request import OPTIONS, RunRequest, flag_of
 from msmpetsc.results.frame_choice import frames_in
 
-
-class Argument(NamedTuple):
-    """An argument as argparse's ``add_argument`` takes it."""
-
-    names: tuple[str, ...]
-    keywords: dict[str, Any]
+Argument = tuple[tuple[str, ...], dict[str, Any]]  # names and keywords, as argparse's ``add_argument`` takes them
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command, which the module of its name in ``commands`` carries out.
+    """A command.
 
     exclusive : arguments of which only one may be given
     alone     : why it is for one process, if it is
+    module    : in ``commands``, that carries it out; that of its name if empty
     """
 
     help: str
@@ -31,6 +27,7 @@ class Command:
     exclusive: tuple[Argument, ...] = ()
     description: str | None = None
     alone: str = ""
+    module: str = ""
 
 
 class Shown(argparse.Action):
@@ -55,7 +52,7 @@ def listed_presets() -> str:
 
 def argument(*names: str, **keywords: Any) -> Argument:
     """Return an argument of these names."""
-    return Argument(names, keywords)
+    return names, keywords
 
 
 def switch(name: str, about: str) -> Argument:
@@ -320,7 +317,7 @@ COMMANDS = {
     ),
     "schema": Command(
         "print the JSON schema of a scene, for editors", ("msmpetsc schema > msmpetsc.schema.json",),
-        alone="it prints on one process",
+        alone="it prints on one process", module="keys",
     ),
     "doctor": Command(
         "say what is installed, and how to get what is not",

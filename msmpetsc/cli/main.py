@@ -9,8 +9,7 @@ import traceback
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together
-from msmpetsc.app.log import logged_on_root
+from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.command_table import COMMANDS, RUNS_ITSELF
 from msmpetsc.cli.ranks import world
@@ -38,9 +37,10 @@ def main(arguments: list[str] | None = None) -> int:
             with ending_together(comm, "render" if args.command in DRAWING else "run"):
                 if refused is not None:
                     raise refused
-                if COMMANDS[args.command].alone:
-                    start_alone(comm, args.command)
-                return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
+                command = COMMANDS[args.command]
+                if command.alone:
+                    start_alone(comm, args.command, command.alone)
+                return import_module(f"msmpetsc.cli.commands.{command.module or args.command}").run(args)
         except MsmpetscError as error:
             if comm.rank == 0:
                 if args.verbose:
@@ -57,12 +57,11 @@ def main(arguments: list[str] | None = None) -> int:
             return STATUS_BUG
 
 
-def start_alone(comm: "MPI.Comm", command: str) -> None:
+def start_alone(comm: "MPI.Comm", command: str, why: str) -> None:
     """Raise InputError where mpiexec has started more than one of a command that is for one process.
 
     SIGTERM to one that runs others ends those, too, as Ctrl-C does.
     """
-    why = COMMANDS[command].alone
     if comm.size > 1:
         raise InputError(f"{command} is started without mpiexec: {why}")
     if why == RUNS_ITSELF:

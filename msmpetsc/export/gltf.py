@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.export.moments import Moments
+from msmpetsc.export.moments import Moments, normals
 
 FLOAT, UNSIGNED = 5126, 5125  # component types
 POINTS, TRIANGLES = 34962, 34963  # uses of a buffer view: vertex data, indices
@@ -86,21 +86,8 @@ def write_glb(moments: Moments, path: Path) -> None:
             file.write(times.tobytes() + np.eye(len(others) + 1, len(others), -1, np.float32).tobytes())
 
 
-def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
-    a, b, c = (points[triangles[:, corner]].astype(float) for corner in range(3))
-    of_faces = np.cross(b - a, c - a)
-    corners = triangles.ravel()
-    sums = [np.bincount(corners, np.repeat(of_faces[:, axis], 3), len(points)) for axis in range(3)]
-    vectors = np.stack(sums, axis=1)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    flat = length[:, 0] == 0  # a point of no triangle, or of folded ones: any direction is as good
-    vectors[flat], length[flat] = (0, 0, 1), 1
-    return (vectors / length).astype(np.float32)
-
-
 def _target(moments: Moments, frame: int, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far points and normals of a frame are from those of the first, (v, 3) float32 each."""
+    """Return how far a frame's points and normals are from the first's, (v, 3) float32 each."""
     points = moments.points(frame).astype(np.float32)
     return points - base, normals(points, moments.cells) - normals(base, moments.cells)
 

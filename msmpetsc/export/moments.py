@@ -22,7 +22,7 @@ class Moments:
     """
 
     def __init__(self, run: Result, mesh: Mesh, frames: Sequence[int]):
-        """Raises InputError for a result without a surface, where that is asked for, or a damaged one."""
+        """Raises InputError for a result without the surface asked for, or a damaged one."""
         self.run, self.mesh, self.frames = run, mesh, list(frames)
         if mesh == "surface" and "surface/points" not in run:
             raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
@@ -86,3 +86,16 @@ def green_strain(rest: np.ndarray, cells: np.ndarray, points: np.ndarray) -> np.
         F += points[cells[:, corner], :, None] * gradient
     strain = 0.5 * (F.transpose(0, 2, 1) @ F - np.eye(3))
     return strain[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
+
+
+def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
+    a, b, c = (points[triangles[:, corner]].astype(float) for corner in range(3))
+    of_faces = np.cross(b - a, c - a)
+    corners = triangles.ravel()
+    sums = [np.bincount(corners, np.repeat(of_faces[:, axis], 3), len(points)) for axis in range(3)]
+    vectors = np.stack(sums, axis=1)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    flat = length[:, 0] == 0  # a point of no triangle, or of folded ones: any direction is as good
+    vectors[flat], length[flat] = (0, 0, 1), 1
+    return (vectors / length).astype(np.float32)

@@ -10,8 +10,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from msmpetsc.errors import one_line
-from msmpetsc.export.gltf import normals
-from msmpetsc.export.moments import Moments
+from msmpetsc.export.moments import Moments, normals
 
 CLAY = (0.8, 0.55, 0.4)
 UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}  # the axes that USD knows as upward

@@ -13,7 +13,6 @@ cannot tell apart is equal, and so are two NaN, or two infinities of one sign.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -49,7 +48,7 @@ class FieldError:
     worst: Indices
 
     def first_above(self, rtol: float) -> int | None:
-        """Return which of the frames compared is the first whose error is above rtol; None for none."""
+        """Return which frame compared is the first whose error is above rtol; None for none."""
         above = np.flatnonzero(self.errors > rtol)
         return int(above[0]) if len(above) else None
 
@@ -69,17 +68,7 @@ class Comparison:
     left_out: list[str]
 
 
-class Distances(NamedTuple):
-    """One field of two runs at p pairs of frames.
-
-    greatest : (p,) greatest distance of two rows
-    worst    : (p,) its row
-    size     : greatest size in any frame, from rest where the field is one of positions
-    """
-
-    greatest: Floats
-    worst: Indices
-    size: float
+Distances = tuple[Floats, Indices, float]
 
 
 @np.errstate(all="ignore")  # what overflows differs, and is reported as that
@@ -111,6 +100,8 @@ def rest_of(run: Result, name: str) -> Positions | None:
 
 
 def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
+    """Return of a field the greatest distance of two rows and its row, (p,) each; and the greatest
+    size in any frame, from rest where the field is one of positions."""
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
         raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
@@ -127,7 +118,7 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
         for values in (a_values, b_values):
             sizes = _row_lengths(values if rest is None else values - rest)
             size = max(size, sizes[np.isfinite(sizes)].max(initial=0.0))
-    return Distances(greatest, worst, float(size))
+    return greatest, worst, float(size)
 
 
 def difference(a: Array, b: Array, digits: float) -> Floats:
@@ -150,9 +141,12 @@ def _row_lengths(rows: Array) -> Floats:
 
 def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:
     """Return what the errors of each field are relative to."""
-    scales = {name: distance.size for name, distance in distances.items()}
+    scales = {name: size for name, (_, _, size) in distances.items()}
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
-    least = _least_energy(a)
+    least = 0.0  # of the stiffest and longest spring, strained by LEAST_STRAIN [J]
+    if all(name in a.lattice and len(a.lattice[name]) for name in ("stiffness", "rest_length")):
+        longest = a.lattice.rest_length[:].max()
+        least = float(0.5 * a.lattice.stiffness[:].max() * (LEAST_STRAIN * longest) ** 2)
     energy, kinetic = (max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"]))
     for name in scales:
         if name in ENERGIES:
@@ -178,13 +172,6 @@ def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> floa
     values = [energy - energy[0] if name == "potential" else energy for name, energy in energies]
     sizes = np.abs(np.concatenate([np.empty(0), *values]))
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
-
-
-def _least_energy(run: Result) -> float:
-    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 for none."""
-    if not all(name in run.lattice and len(run.lattice[name]) for name in ("stiffness", "rest_length")):
-        return 0.0
-    return float(0.5 * run.lattice.stiffness[:].max() * (LEAST_STRAIN * run.lattice.rest_length[:].max()) ** 2)
 
 
 def rows_agree(a: Array, b: Array, slack: float) -> Mask:

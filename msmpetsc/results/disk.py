@@ -145,7 +145,7 @@ def refuse_small_disk(path: Path, planned: int) -> None:
 
 
 def copy_sparse(source: int, path: Path) -> None:
-    """Copy the file of a descriptor to a new name; zeros, which frames to come are, take no room."""
+    """Copy a descriptor's file to a new name; zeros, which frames to come are, take no room."""
     with open(path, "xb") as copy:
         for start in range(0, size := os.fstat(source).st_size, 2**20):
             if (piece := os.pread(source, 2**20, start)).strip(b"\0"):

@@ -33,7 +33,7 @@ def of_ranks(name: str) -> bool:
 
 
 class Plan(NamedTuple):
-    """One dataset to be laid out: its name in the file, its shape and that of its chunks, its type."""
+    """One dataset to be laid out: name in the file, its shape and that of its chunks, its type."""
 
     name: str
     shape: tuple[int, ...]

@@ -62,16 +62,14 @@ class Result:
         try:
             with plain_damage(self.path):
                 self.attributes = {name: as_python(value) for name, value in self.file.attrs.items()}
-                self._datasets = self._lazy(checked_datasets(self.file))
+                rows = {"frames": finished(self.file)}
+                datasets = checked_datasets(self.file).items()
+                self._datasets = {name: LazyArray(data, rows.get(name.partition("/")[0])) for name, data in datasets}
         except BaseException:
             self.close()
             raise
         self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
         self.frames = self._group("frames")
-
-    def _lazy(self, datasets: dict[str, h5py.Dataset]) -> dict[str, LazyArray]:
-        count = finished(self.file)
-        return {name: LazyArray(data, count if name.startswith("frames/") else None) for name, data in datasets.items()}
 
     def _group(self, group: str) -> Arrays:
         start = f"{group}/"
@@ -91,8 +89,8 @@ class Result:
     def __repr__(self) -> str:
         if not self.file:
             return f"<closed {self.path}>"
-        nodes, frames = self.lattice.nodes.shape[0], len(self.frames.time)
-        return f"<{self.path}: {frames} frames of {nodes} nodes, {self.attributes.get('command', 'no command')}>"
+        counts = f"{len(self.frames.time)} frames of {len(self.lattice.nodes)} nodes"
+        return f"<{self.path}: {counts}, {self.attributes.get('command', 'no command')}>"
 
     def _repr_html_(self) -> str:
         """Return the result as a notebook shows it: what it is of, and its arrays."""
@@ -142,7 +140,7 @@ class Result:
 
     @cached_property
     def embedding(self) -> "csr_array | None":
-        """W (v, n): surface points = W @ positions; None where the scene has output.surface = false."""
+        """W (v, n): surface points = W @ positions; None where a scene has output.surface = false."""
         from scipy.sparse import csr_array
 
         if not self._embedding:
@@ -244,7 +242,7 @@ def finished(file: h5py.File) -> int:
 
 
 def newest_slot(steps: Indices) -> int | None:
-    """Return the slot of the newest checkpoint from the steps (2,) of both; None if neither has one."""
+    """Return the slot of the newest checkpoint from the steps (2,) of both; None for none."""
     slot = int(np.argmax(steps))
     return slot if steps[slot] >= 0 else None
 

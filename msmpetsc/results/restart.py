@@ -57,17 +57,13 @@ class Earlier:
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
             names = _checked_numbers(path, result.file)
-            count, planned = len(result.frames.time), result.frames.time.planned[0]
-            at_rest = bool(count) and _is_at_rest(result, names or [])
+            count = len(result.frames.time)
+            planned = result.frames.time.planned[0]
+            slot = newest_slot(result["checkpoint/step"][:]) if count and AT_REST in (names or ()) else None
+            at_rest = slot is not None and result["checkpoint/numbers"][slot][(names or []).index(AT_REST)] == 1
             step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
-        return cls(path, texts, true_error, step, count, planned, at_rest)
-
-
-def _is_at_rest(result: Result, names: list[str]) -> bool:
-    """Return whether the newest checkpoint, with numbers of these names, is of a run at rest."""
-    slot = newest_slot(result["checkpoint/step"][:]) if AT_REST in names else None
-    return slot is not None and bool(result["checkpoint/numbers"][slot][names.index(AT_REST)] == 1)
+        return cls(path, texts, true_error, step, count, planned, bool(at_rest))
 
 
 def _checked_numbers(path: Path, file: h5py.File) -> list[str] | None:
@@ -113,7 +109,7 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
 
 
 def _newest(path: Path, file: h5py.File) -> tuple[int, list[str], Checkpoint] | None:
-    """Return slot, names of rows, step and numbers of the newest checkpoint; None if there is none."""
+    """Return slot, names of rows, step and numbers of the newest checkpoint; None for none."""
     numbers = _checked_numbers(path, file)
     if numbers is None:
         return None

@@ -1,9 +1,8 @@
-"""Series of a result: one row a frame of energies, forces and places of probes, as a table of text."""
+"""Series of a result: a row a frame of energies, forces and places of probes, as text."""
 
 import csv
 import io
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError
@@ -17,16 +16,12 @@ SERIES = (
 )  # fmt: skip
 
 
-class NamedSeries(NamedTuple):
-    """A column: its name with its unit, and a number a frame (T,)."""
+def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
+    """Yield the columns of a result, the time first: name with unit, and a number a frame (T,).
 
-    name: str
-    values: Floats
-
-
-def columns_of(run: Result, scene: SceneFile) -> Iterator[NamedSeries]:
-    """Yield the columns of a result, the time first. Raises InputError where they are not those of the scene."""
-    yield NamedSeries("time [s]", run.frames.time[:])
+    Raises InputError where they are not those of the scene.
+    """
+    yield "time [s]", run.frames.time[:]
     names = {
         "reaction": [table.key for table in held_by(scene)],
         "push": [f"obstacle.{number}" for number in range(len(scene.obstacle))],
@@ -43,14 +38,13 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[NamedSeries]:
         for row, whose in enumerate(of_rows):
             for axis, letter in enumerate(axes):
                 words = " ".join(filter(None, [name, whose, letter]))
-                yield NamedSeries(f"{words} [{array.unit}]", values[:, row, axis])
+                yield f"{words} [{array.unit}]", values[:, row, axis]
 
 
 def series_text(run: Result, scene: SceneFile) -> str:
     """Return the series as CSV: a line of names and units, then one a frame. Raises InputError."""
-    columns = list(columns_of(run, scene))
-    text = io.StringIO()
+    columns, text = dict(columns_of(run, scene)), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([column.name for column in columns])
-    writer.writerows(zip(*(column.values.tolist() for column in columns), strict=True))
+    writer.writerow(columns)
+    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
     return text.getvalue()

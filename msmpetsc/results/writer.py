@@ -25,10 +25,12 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array
+from msmpetsc.build import Model
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.fields import FRAME_FIELDS, Frame, unit_of
+from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.results.disk import (
     Lock,
     Storage,
@@ -39,15 +41,10 @@ from msmpetsc.results.disk import (
     refuse_small_disk,
 )
 from msmpetsc.results.layout import Layout, of_ranks, open_to_write
-from msmpetsc.results.reader import (
-    FORMAT,
-    FORMAT_VERSION,
-    checked_dataset,
-    finished,
-    open_result,
-    plain_damage,
-)
+from msmpetsc.results.reader import FORMAT, FORMAT_VERSION, checked_dataset, finished, open_result, plain_damage
 from msmpetsc.results.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
+
+NOTHING = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))  # what ranks but the first have of surfaces
 
 
 class Begin(Enum):
@@ -133,11 +130,7 @@ class ResultFile:
         self._copied = frames
 
     def start_frames(
-        self,
-        count: int,
-        nodes: int,
-        also: Mapping[str, int] | None = None,
-        saved: Checkpoint | None = None,
+        self, count: int, nodes: int, also: Mapping[str, int] | None = None, saved: Checkpoint | None = None
     ) -> None:
         """Plan the frames and checkpoints, and give the file its name.
 
@@ -163,7 +156,10 @@ class ResultFile:
             self.write_checkpoint(saved)
         with self._together():
             if self._file is not None:
-                self._publish(self._file)
+                if self._begin is not Begin.IN_PLACE:
+                    self._flush(self._file)
+                    self._refuse_to_replace()
+                    os.replace(self._part, self.path)
                 self._same = os.open(self.path, os.O_RDONLY)
                 self._numbers = {
                     name: dataset
@@ -278,15 +274,8 @@ class ResultFile:
                     file["frames"][name][index] = row
         self.finished = count
 
-    def _publish(self, file: h5py.File) -> None:
-        """Give a new file its name."""
-        if self._begin is not Begin.IN_PLACE:
-            self._flush(file)
-            self._refuse_to_replace()
-            os.replace(self._part, self.path)
-
     def _refuse_removed(self) -> None:
-        """Raise InputError where no name leads to the file any more; what it holds gets one again."""
+        """Raise InputError where no name leads to the file now; what it holds gets one again."""
         if self._same is None or os.fstat(self._same).st_nlink:
             return
         copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
@@ -335,7 +324,7 @@ class ResultFile:
     def _collect(
         self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
     ) -> None:
-        """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
+        """Write the ranks' rows, `counts` of them, into dataset `name`, or its row `index`."""
         rows = np.ascontiguousarray(rows, dtype)
         if self._direct is not None and index is not None:
             self._write_directly(self._direct, rows, counts, name, index)
@@ -357,3 +346,40 @@ class ResultFile:
         chunk, offsets = self._comm.bcast((chunk, offsets))
         with self._together():
             write_bytes(descriptor, rows, sum(counts[: self._comm.rank]), chunk, offsets)
+
+
+def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
+    """Write the parts of the file that do not change with time (collective)."""
+    lattice, owned = model.lattice, model.lattice.owned
+    springs = slice(lattice.springs_owned)
+    numbers = lattice.global_numbers
+    file.write("lattice/nodes", lattice.nodes[:owned])
+    file.write("lattice/cells", lattice.cells)
+    file.write("lattice/cell_kind", lattice.cell_kind)
+    file.write("lattice/cell_share", lattice.cell_share)
+    file.write("lattice/springs", numbers[lattice.springs[springs]])
+    file.write("lattice/rest_length", lattice.rest_length[springs])
+    file.write("lattice/stiffness", lattice.stiffness[springs])
+    file.write("lattice/mass", lattice.mass)
+    file.write("lattice/pinned", numbers[:owned][lattice.pinned[:owned]])
+    several = len(model.bodies) > 1
+    if several:
+        file.write("lattice/body", lattice.body[:owned].astype("i4"))
+    if comm.bcast(bool(model.solids)):  # all of them on rank 0
+        solids = joined([*model.solids.values()]) or NOTHING
+        counts = [len(solid.triangles) for solid in model.solids.values()]
+        file.write("obstacle/points", solids.points)
+        file.write("obstacle/triangles", solids.triangles)
+        file.write("obstacle/number", np.repeat(np.array([*model.solids], "i4"), counts))
+    surface, embedding = model.surface or NOTHING, model.embedding
+    if embedding is None:
+        return
+    if several:
+        file.write("surface/body", model.body_of_point.astype("i4"))
+    file.write("surface/points", surface.points)
+    file.write("surface/triangles", surface.triangles)
+    offset = comm.exscan(len(embedding.indices)) or 0
+    indptr = embedding.indptr[1:] + offset
+    file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
+    file.write("embedding/indices", embedding.indices)
+    file.write("embedding/weights", embedding.weights)

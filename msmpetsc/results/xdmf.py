@@ -13,8 +13,8 @@ NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 def write_xdmf(h5_path: str | Path) -> Path:
     """Write x.xdmf beside x.h5 once that is closed, and return its path. Raises InputError.
 
-    Two temporal collections: the surface triangles, where the surface was stored, and the lattice cells with their
-    stress, where that was.
+    Two temporal collections: the surface triangles, where the surface was stored, and the lattice
+    cells with their stress, where that was.
     """
     h5_path = Path(h5_path)
     root = ET.Element("Xdmf", Version="3.0")

@@ -53,7 +53,7 @@ def tables_of(scene: Any, kind: str) -> Iterator[OfBody]:
 
 
 def held_by(scene: Any) -> Iterator[OfBody]:
-    """Yield the tables of what holds nodes, pins and then anchors: of two on a node the first has it."""
+    """Yield the tables of pins, then of anchors: of two that hold a node the first has it."""
     for kind in ("pin", "anchor"):
         yield from tables_of(scene, kind)
 

@@ -14,7 +14,7 @@ IF_ABSENT = re.compile(r"[;,] ([^;,]+) if absent")
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 UNREACHED = 1e18  # a bound beyond it only keeps numbers within a double or a 64-bit integer
 BRACES = re.compile(r"\{.*?\}")  # of an example: units within are not the key's own
-UNIT = re.compile(r"\[([^]]+)\]")
+UNIT, LAST_UNIT = re.compile(r"\[([^]]+)\]"), re.compile(r"\s*\[[^]]+\]$")
 NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")  # the number of a [[table]]
 
 
@@ -62,7 +62,9 @@ def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterato
             default = f"one of {', '.join(one_of)}"
         else:
             default = "required" if name in table.get("required", ()) else _default(found, text)
-        yield SceneKey(prefix + name, _units(text), default, _bounds(found), _about(text))
+        units = " or ".join(dict.fromkeys(UNIT.findall(BRACES.sub("", text))))
+        about = LAST_UNIT.sub("", IF_ABSENT.sub("", LAST_UNIT.sub("", IF_ABSENT.sub("", text)))).strip()
+        yield SceneKey(prefix + name, units, default, _bounds(found), about)
 
 
 def _default(found: dict[str, Any], text: str) -> str:
@@ -73,22 +75,12 @@ def _default(found: dict[str, Any], text: str) -> str:
     return "none" if value in (None, [], "") else str(value).lower() if isinstance(value, bool) else f"{value}"
 
 
-def _units(text: str) -> str:
-    """Return the units that a description names in brackets, each once."""
-    return " or ".join(dict.fromkeys(UNIT.findall(BRACES.sub("", text))))
-
-
 def _bounds(found: dict[str, Any]) -> str:
     if "enum" in found:
         return " | ".join(map(str, found["enum"]))
     bounds = [f"{sign} {found[word]:g}" for word, sign in BOUNDS.items() if abs(found.get(word, UNREACHED)) < UNREACHED]
     kind = {"boolean": "true | false", "integer": "whole", "array": "list", "string": "text"}.get(found.get("type", ""))
     return " ".join(filter(None, [kind, ", ".join(bounds)]))
-
-
-def _about(text: str) -> str:
-    about = IF_ABSENT.sub("", re.sub(r"\s*\[[^]]+\]$", "", IF_ABSENT.sub("", text)))
-    return re.sub(r"\s*\[[^]]+\]$", "", about).strip()
 
 
 def _without_null(node: Any) -> Any:

@@ -17,16 +17,7 @@ from pydantic import (
 
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import rule
-from msmpetsc.scene.values import (
-    Direction,
-    FunctionName,
-    ListOf,
-    NotNegative,
-    Positive,
-    Table,
-    Vector,
-    after_start,
-)
+from msmpetsc.scene.values import Direction, FunctionName, ListOf, NotNegative, Positive, Table, Vector, after_start
 
 
 class Twist(Table):

@@ -98,11 +98,14 @@ def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict
     problems = error.errors(include_url=False)
     for e in problems[:MOST_REPORTED]:
         culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
-        number = _line(e["loc"], prefixes)
+        depths = [_depth(data, e["loc"]) for _, data in prefixes]  # of a key, or a table around it
+        deepest = max(depths, default=0)
+        number = prefixes[depths.index(deepest)][0] if deepest else None
         where = (
             f" (--set {as_given(culprit)}{_in_place(e, culprit)})" if culprit else f" (line {number})" if number else ""
         )
-        lines.append(": ".join(filter(None, [str(path), _key(e["loc"]), f"{_words(e)}{where}"])))
+        key = ".".join(key if re.fullmatch(r"[\w-]+", key) else _got(key) for key in map(str, e["loc"]))
+        lines.append(": ".join(filter(None, [str(path), key, f"{_words(e)}{where}"])))
     more = len(problems) - MOST_REPORTED
     return [*lines, f"{path}: and {more} more"] if more > 0 else lines
 
@@ -123,11 +126,6 @@ def as_given(value: Any) -> str:
 
 def _got(value: Any) -> str:
     return as_given(value) if not isinstance(value, str) else json.dumps(as_given(value), ensure_ascii=False)
-
-
-def _key(loc: KeyPath) -> str:
-    """Return the key path as --set takes it; keys that are not bare stand in quotes."""
-    return ".".join(key if re.fullmatch(r"[\w-]+", key) else _got(key) for key in map(str, loc))
 
 
 def _words(e: ErrorDetails) -> str:
@@ -191,13 +189,6 @@ def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
         statements.append((start, data))
         start = end + 1
     return statements
-
-
-def _line(loc: KeyPath, prefixes: list[tuple[int, dict[str, Any]]]) -> int | None:
-    """Return the line on which the key first stands, or else the innermost table around it that the file has."""
-    depths = [_depth(data, loc) for _, data in prefixes]
-    deepest = max(depths, default=0)
-    return prefixes[depths.index(deepest)][0] if deepest else None
 
 
 def _depth(data: Any, loc: KeyPath) -> int:

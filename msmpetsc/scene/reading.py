@@ -112,7 +112,7 @@ def scene_of(
 
 
 def _given(scene: SceneFile) -> dict[str, Any]:
-    """Return the tables that a scene has, not those that are absent: of mesh and body it has but one."""
+    """Return the tables that a scene has: of mesh and body it has but one."""
     return {name: getattr(scene, name) for name in scene.model_fields_set}
 
 

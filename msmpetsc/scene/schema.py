@@ -139,7 +139,7 @@ class SceneFile(Table):
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, kind: str) -> Iterator[OfBody]:
-        """Yield the tables of a kind that take a region: those of all bodies, then those of each."""
+        """Yield tables of a kind that take a region: those of all bodies, then those of each."""
         return tables_of(self, kind)
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:

@@ -17,8 +17,11 @@ def one_state(data: Any) -> Any:
     Of step and duration, either says how long the other is.
     """
     time = data.get("time") if isinstance(data, dict) else None
-    if not isinstance(time, dict) or time.get("integrator") != STATIC or any(map(_changes, _loads(data))):
+    if not isinstance(time, dict) or time.get("integrator") != STATIC:
         return data
+    for load in _loads(data):
+        if isinstance(load.get("total"), dict) or "function" in load or any(name in load for name in OF_TIME):
+            return data
     one = time.get("step", time.get("duration", 1.0))
     return {**data, "time": {"step": one, "duration": one, **time}}
 
@@ -30,11 +33,6 @@ def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
         for table in given if isinstance(given, list | tuple) else ():
             if isinstance(table, dict):
                 yield from _loads(table) if name == "body" else [table]
-
-
-def _changes(load: dict[str, Any]) -> bool:
-    """Return whether a load may not be the same at all times, as a function of the user's may not."""
-    return isinstance(load.get("total"), dict) or "function" in load or any(name in load for name in OF_TIME)
 
 
 def unlike_the_integrator(scene: Any) -> Iterator[Broken]:

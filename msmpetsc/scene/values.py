@@ -73,7 +73,7 @@ def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | N
 
 
 def only_for(key: str, value: str) -> Callable[..., Any]:
-    """Return the validator of what has a meaning only where another key of its table has this value."""
+    """Return the validator of what only matters where another key of its table has this value."""
 
     def check(cls: Any, given: Any, info: ValidationInfo) -> Any:
         if info.data.get(key, value) != value:
@@ -113,7 +113,7 @@ class Table(BaseModel):
     one_of: ClassVar[tuple[str, ...]] = ()
 
     def broken_rules(self) -> Iterator[Broken]:
-        """Yield the rules between its keys that a table breaks, each of which is sound by itself."""
+        """Yield the rules between its keys that a table breaks, each key sound by itself."""
         return iter(())
 
     @model_validator(mode="wrap")

@@ -130,7 +130,8 @@ class EnergyBalance:
         self._refuse_infinite(solved.kinetic + solved.inner, result)
         if result.static:  # which owes nothing to the state before
             return before.budget
-        bounces = self._bounces(result, after)
+        own = after.q is not result.position or after.q_previous is not result.previous
+        bounces = self.environment.strikes and self.comm.allreduce(own, MPI.LOR)  # once the step was solved
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
@@ -172,13 +173,6 @@ class EnergyBalance:
             return "a smaller time.substep" if explicit else "a smaller time.step"
         return "a smaller time.step or a smaller solver.error"
 
-    def _bounces(self, result: StepResult, after: State) -> bool:
-        """Whether any node was struck once the step was solved (collective)."""
-        if not self.environment.strikes:
-            return False
-        own = after.q is not result.position or after.q_previous is not result.previous
-        return self.comm.allreduce(own, MPI.LOR)
-
     def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Floats:
         """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of
         obstacles that drag, and that which the step counted itself; and its swing (collective)."""
@@ -190,12 +184,13 @@ class EnergyBalance:
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
         contact = environment.push(when, sides)
         known = self.known if self.known and q is self.known[0] else None  # whose elastic energy is known
+        ended = result.position[owned], after.sides
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
             np.vdot(environment.load(time), result.position[owned] - q[owned])
-            + environment.friction_work_bound((q[owned], sides), (result.position[owned], after.sides), time, time_step)
+            + environment.friction_work_bound((q[owned], sides), ended, time, time_step)
             + result.viscous_work,
             result.work,
             result.swing,

@@ -31,7 +31,7 @@ class Forces:
 
     def __call__(self, q: Positions, time: float, sides: Indices | None, step: StepResult | None) -> dict[str, Any]:
         """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
-        lattice, environment, owned = self.model.lattice, self.environment, self.model.lattice.owned
+        environment, owned = self.environment, self.model.lattice.owned
         problem = step.problem if step else None
         contact = problem.contact if problem else environment.push(time, sides)
         held, load = np.zeros_like(q), environment.load(time)
@@ -43,13 +43,13 @@ class Forces:
         if step and step.viscous is not None:
             held += step.viscous
         if step and problem:
-            held += lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
+            held += self.model.lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
         held *= environment.fixed_at(time)[:owned, None]
         sums = {"reaction": self.model.holders.totals(held), "load": to_host(load.sum(axis=0)), **pushes}
         return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
 
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
-        """Return what obstacles (o, 3) and the surface on each body (b, 3) push this rank's nodes with [N]."""
+        """Return the pushes of obstacles (o, 3) and of contact on bodies (b, 3) on this rank's nodes with [N]."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
         push, penalties = np.zeros((len(self.model.obstacles), 3)), self.environment.penalties
         for state in contact.states if contact else ():

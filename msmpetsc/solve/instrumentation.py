@@ -1,4 +1,4 @@
-"""Measurements of a run beside its frames: true errors, the iterates of one step, where the time went."""
+"""Measurements beside a run's frames: true errors, the iterates of one step, where the time went."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -54,16 +54,6 @@ class Trace:
 
         stepper.observer = observe
 
-    def as_lists(self, index: int, errors: Rows) -> dict:
-        """The trace as plain lists, with the errors (k, 2) of the iterates."""
-        lists = {"iteration": self.iteration, "ksp_its": self.ksp_its, "seconds": self.seconds}
-        return {"frame": index, **lists, "position_error": errors[:, 0].tolist(), "energy_error": errors[:, 1].tolist()}
-
-
-def begin_timing() -> None:
-    """Have PETSc time its events from here on."""
-    PETSc.Log.begin()
-
 
 def times(comm: MPI.Comm) -> dict[str, float]:
     """Seconds in events of the run, those of its references left out, the greatest of all ranks (collective)."""
@@ -71,28 +61,28 @@ def times(comm: MPI.Comm) -> dict[str, float]:
 
 
 def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
-    """How many hierarchies of multigrid were built, and bytes of all ranks that the last one holds (collective)."""
-    multigrid = stepper.jacobian.preconditioner.multigrid if stepper else None
-    own = _stored_bytes(multigrid.multigrid) if multigrid else 0
-    return {"builds": count(HIERARCHY.name), "bytes": comm.allreduce(own)}
+    """How many hierarchies of multigrid were built, and bytes of all ranks that the last one holds (collective).
 
-
-def _stored_bytes(multigrid: Multigrid) -> int:
-    """Return bytes of this rank that a hierarchy keeps beside the lattice, without what factors the coarsest level.
-
-    They are P and matrix of each coarse level, what sums the first, the finest level's blocks.
+    They are those beside the lattice, without what factors the coarsest level: P and matrix of each
+    coarse level, what sums the first, the finest level's blocks.
     """
-    levels = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
-    total, fine = multigrid.sum, multigrid.fine
-    arrays: list[Array] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
-    arrays += [*total.springs, *total.nodes, *total.cells]
-    return levels + sum(array.nbytes for array in (*arrays, *_blocks(multigrid)))
+    own = 0
+    chosen = stepper.jacobian.preconditioner.multigrid if stepper else None
+    if chosen:
+        multigrid = chosen.multigrid
+        total = multigrid.sum
+        fine = multigrid.fine
+        arrays: list[Array] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
+        arrays += [*total.springs, *total.nodes, *total.cells, *_blocks(multigrid)]
+        own = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
+        own += sum(array.nbytes for array in arrays)
+    return {"builds": count(HIERARCHY.name), "bytes": comm.allreduce(own)}
 
 
 def _blocks(multigrid: Multigrid) -> list[Rows]:
     """Arrays that the finest level's Hessian has of its own, not of the lattice."""
-    elasticity, hessian = multigrid.fine.elasticity, multigrid.fine.elastic
-    lent = {id(array) for part in elasticity.parts for array in vars(part).values()}
+    hessian = multigrid.fine.elastic
+    lent = {id(array) for part in multigrid.fine.elasticity.parts for array in vars(part).values()}
     parts = [part for part in hessian.parts if isinstance(part, partial)] if hessian else []
     return [array for part in parts for array in part.args if hasattr(array, "nbytes") and id(array) not in lent]
 
@@ -101,5 +91,5 @@ def _of_matrix(matrix: PETSc.Mat) -> int:
     """Return bytes of a rank's part of an AIJ matrix; 0 where it is not there yet."""
     if not matrix:
         return 0
-    rows, nonzeros = matrix.getLocalSize()[0], matrix.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"]
-    return int(nonzeros) * (INDEX + VALUE) + (rows + 1) * INDEX
+    nonzeros = matrix.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"]
+    return int(nonzeros) * (INDEX + VALUE) + (matrix.getLocalSize()[0] + 1) * INDEX

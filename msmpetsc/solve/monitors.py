@@ -35,9 +35,12 @@ class Monitors:
         """Count the cells inside out at q (l, 3) [m] (collective)."""
         self.now, position = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
+            remedy = "a smaller time.step or a smaller solver.error helps to keep them as they were"
+            if not self.lattice.stiffening > 0 and self.lattice.solid is None:
+                remedy = 'springs cannot turn them back, material.law = "neo-hookean" can'
             log.warning(
                 "frame %d (t = %.6g s): %d cell%s inside out, the worst %s; %s",
-                index, time, self.now, "s are" if self.now > 1 else " is", position, self._remedy(),
+                index, time, self.now, "s are" if self.now > 1 else " is", position, remedy,
             )  # fmt: skip
         self.frames += self.now > 0
         self.most = max(self.most, self.now)
@@ -92,8 +95,3 @@ class Monitors:
             log.warning(
                 "in %d frames there was energy from nowhere, up to %.2g%% of all", self.gaining, 100 * self.worst_gain
             )
-
-    def _remedy(self) -> str:
-        if self.lattice.stiffening > 0 or self.lattice.solid is not None:
-            return "a smaller time.step or a smaller solver.error helps to keep them as they were"
-        return 'springs cannot turn them back, material.law = "neo-hookean" can'

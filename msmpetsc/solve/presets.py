@@ -6,9 +6,7 @@ options always mean the linear solve with A (or with the true Hessian, for ``new
 """
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 from petsc4py import PETSc
 
@@ -186,11 +184,7 @@ def find_preset(name: str) -> Preset:
         return PRESETS[name]
     if name not in ADDED.names():
         raise InputError(f"solver.preset: unknown preset {name!r}{did_you_mean(name, preset_names())}")
-    return _made_of(name, ADDED.find(name))
-
-
-def _made_of(name: str, added: Mapping[str, Any]) -> Preset:
-    """Return a preset of what was registered or installed: {"options": ..., "based_on": ..., "about": ...}."""
+    added = ADDED.find(name)  # {"options": ..., "based_on": ..., "about": ...}
     try:
         base = PRESETS[added.get("based_on", "newton")]
         words = options_of(words_of(added["options"]))
@@ -201,27 +195,6 @@ def _made_of(name: str, added: Mapping[str, Any]) -> Preset:
         ) from None
 
 
-def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
-    """Put the preset's options where the user has set none into PETSc's database; returns their names.
-
-    SNES then does not give up before the ``budget`` of iterations is spent.
-    """
-    options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
-    database = PETSc.Options()
-    users = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix) and not in_use[name]}
-    ours = options.keys() - users
-    for chosen, bound in BOUND_TO_TYPE.items():
-        if chosen in users:
-            ours -= bound
-    if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
-        ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
-    for name in ours:
-        database.setValue(prefix + name, options[name] or None)
-    names = {prefix + name for name in ours}
-    in_use.update(names)
-    return names
-
-
 def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
     """Options that PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
 
@@ -229,9 +202,8 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
 
     A tolerance that is held to what a step needs stands in a comment: given, it would be held to as it is.
     """
-    ours = {prefix: set_defaults(preset, prefix, budget) for prefix, (preset, budget) in solvers.items()}
-    adapting = {f"{prefix}ksp_rtol" for prefix, (preset, _) in solvers.items() if preset.inexact}
-    adapting &= set().union(*ours.values())
+    ours = [SolverOptions(preset, prefix, budget) for prefix, (preset, budget) in solvers.items()]
+    adapting = {f"{each.prefix}ksp_rtol" for each in ours if each.preset.inexact and each.is_default("ksp_rtol")}
     lines = []
     for name, value in sorted(PETSc.Options().getAll().items()):
         quoted = f'"{value}"' if value and " " in value else value or ""
@@ -239,29 +211,37 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
         if name in adapting:
             line = f"# {line}    the tightest that a step may need; given, it is the one"
         lines.append(line)
-    for names in ours.values():
-        forget_defaults(names)
+    for each in ours:
+        each.withdraw()
     return lines
 
 
-def forget_defaults(names: set[str]) -> None:
-    """Take options out again: another preset may follow, and -options_left is to show the user's own."""
-    in_use.subtract(names)
-    for name in names:
-        if not in_use[name]:
-            PETSc.Options().delValue(name)
-
-
 class SolverOptions:
-    """A preset's options in PETSc's database while its solver lives.
+    """A preset's options in PETSc's database while its solver lives, where the user has set none.
+
+    SNES then does not give up before the ``budget`` of iterations is spent.
 
     prefix : of the solver's options
     names  : of those that are the preset's own, prefix included
     """
 
     def __init__(self, preset: Preset, prefix: str, budget: int):
-        self.prefix, self.names = prefix, set_defaults(preset, prefix, budget)
+        self.preset, self.prefix = preset, prefix
         self.hidden: dict[str, str | None] = {}
+        options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
+        database = PETSc.Options()
+        given = [name for name in database.getAll() if name.startswith(prefix) and not in_use[name]]
+        users = {name.removeprefix(prefix) for name in given}
+        ours = options.keys() - users
+        for chosen, bound in BOUND_TO_TYPE.items():
+            if chosen in users:
+                ours -= bound
+        if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
+            ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
+        for name in ours:
+            database.setValue(prefix + name, options[name] or None)
+        self.names = {prefix + name for name in ours}
+        in_use.update(self.names)
 
     def hide(self, name: str) -> None:
         """Keep an option of the user's from all objects that are made from now on."""
@@ -288,8 +268,11 @@ class SolverOptions:
         return str(PETSc.Options().getString(self.prefix + name, ""))
 
     def withdraw(self) -> None:
-        """Leave the database as the user has it."""
+        """Leave the database as the user has it: other presets follow, -options_left shows his own."""
         for name, value in self.hidden.items():
             PETSc.Options().setValue(name, value)
             PETSc.Options().getString(name)  # it has been of use
-        forget_defaults(self.names)
+        in_use.subtract(self.names)
+        for name in self.names:
+            if not in_use[name]:
+                PETSc.Options().delValue(name)

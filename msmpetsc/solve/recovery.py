@@ -52,7 +52,7 @@ class Recovery:
         return (PREFIX,) if self.on_failure == "fallback" else ()
 
     def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time``, after a ``failure`` of it if any. Raises StepFailed."""
+        """Take the step that ends at ``time``, after its ``failure`` if any. Raises StepFailed."""
         if failure and self.on_failure == "stop":
             raise failure
         if not self.recovered:
@@ -75,9 +75,10 @@ class Recovery:
     def _in_pieces(self, state: State, time: float, level: int) -> tuple[StepResult, State]:
         """Take a step in 2^level pieces, and again halved where that fails; then one level up for the next."""
         self.deepest = level
-        pieces, start, cost = 2**level, time - self.time_step, Work()
+        pieces = 2**level
+        cost = Work()
         for piece in range(1, pieces + 1):
-            result, state = self._piece(state, start + piece * self.time_step / pieces, level)
+            result, state = self._piece(state, time - self.time_step + piece * self.time_step / pieces, level)
             cost += result.cost
         self.level = self.deepest if self.deepest > level else level - 1
         self.destroy()  # a resumed run has not seen what the spare solvers did in this step
@@ -109,7 +110,7 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Another integrator: implicit Euler's, or the scene's own where it is static, or Verlet's."""
+        """Another integrator: implicit Euler's, or the scene's where it is static or Verlet's."""
         is_fallback = self.on_failure == "fallback"
         kept = ("static",) if is_fallback else ("static", "verlet")
         name = self.time.integrator if self.time.integrator in kept else "implicit-euler"

@@ -6,14 +6,14 @@ PETSc keeps no list of the options that it knows: what no object has looked at i
 import ctypes
 import difflib
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.solve.petsc.library import Integer, petsc_errors, petsc_library
-from msmpetsc.solve.presets import PRESETS, Preset, forget_defaults, set_defaults
+from msmpetsc.solve.presets import PRESETS, Preset, SolverOptions
 
 READ_AT_THE_END = re.compile(
     r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$"
@@ -57,15 +57,9 @@ def refuse_early(comm: MPI.Comm, ours: Collection[str]) -> None:
 
     ours : the command's own options, "--preset"
     """
-    database = PETSc.Options().getAll()
-    message = None
-    if comm.rank == 0:
-        lines = [_no_use(name, value) for name, value in database.items()]
-        lines += [f"-{name}: {NO_PART}{_ours(name, ours)}" for name in _left() if _ours(name, ours)]
-        message = "\n".join(filter(None, lines))
-    message = comm.bcast(message)
-    if message:
-        raise InputError(message)
+    lines = [_no_use(name, value) for name, value in PETSc.Options().getAll().items()]
+    lines += [f"-{name}: {NO_PART}{_ours(name, ours)}" for name in _left() if _ours(name, ours)]
+    _refuse(comm, filter(None, lines))
 
 
 def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
@@ -76,11 +70,10 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
     if "help" in PETSc.Options().getAll():  # once is enough
         return
     for prefix, (preset, budget) in solvers.items():
-        names, objects = set_defaults(preset, prefix, budget), []
+        options = SolverOptions(preset, prefix, budget)
+        objects: list[PETSc.Object] = []
         try:
-            with petsc_errors(
-                "PETSc refuses its options", further=Exception
-            ):  # of what it is to load, a Python file maybe
+            with petsc_errors("PETSc refuses its options", further=Exception):
                 for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):
                     objects.append(kind().create(PETSc.COMM_SELF))
                     objects[-1].setOptionsPrefix(prefix)
@@ -88,7 +81,7 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
         finally:
             for owned in objects:
                 owned.destroy()
-            forget_defaults(names)
+            options.withdraw()
 
 
 def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
@@ -107,8 +100,12 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited:
         and not name.startswith(awaited)
     ]
     lines = (f"-{name}: {NO_PART}" + (did_you_mean(name, USUAL) if name not in USUAL else "") for name in unused)
-    message = "\n".join(lines)
-    message = comm.bcast(message)
+    _refuse(comm, lines)
+
+
+def _refuse(comm: MPI.Comm, lines: Iterable[str]) -> None:
+    """Raise InputError with rank 0's lines, if there are any (collective)."""
+    message = comm.bcast("\n".join(lines))
     if message:
         raise InputError(message)
 
@@ -130,7 +127,7 @@ def _ours(name: str, ours: Collection[str]) -> str:
 
 
 def _left() -> list[str]:
-    """Names of the options that have not been looked at (PetscOptionsLeftGet, which petsc4py lacks)."""
+    """Names of the options not looked at (PetscOptionsLeftGet, which petsc4py lacks)."""
     library = petsc_library()
     strings = ctypes.POINTER(ctypes.c_char_p)
     count, names, values = Integer(), strings(), strings()

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.backend.arrays import Rows
 from msmpetsc.build import Model
 from msmpetsc.checkpoint import COUNT, LENGTH, Range
 from msmpetsc.comm import log
@@ -81,30 +81,17 @@ class Rest:
         preset = find_preset(PRESET)
         stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=PREFIX)
         try:
-            sides = self.environment.no_sides if state.sides is None else state.sides
-            contact = self.environment.contact(state.q, state.q, time, self.time_step, sides)
+            contact = self.environment.contact(state.q, state.q, time, self.time_step, state.sides, None)
             stepper.functional.begin(StepProblem(state.q, state.q, self.environment.load(time), contact))
-            if not distance(stepper, state.q, limit) <= limit:
+            functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
+            stepper.unknowns.from_nodes(state.q, stepper.x)
+            iterate = functional.evaluate(stepper.x, f)
+            if not estimate(iterate, functional.dual_norm(f), limit) <= limit:
                 return False
-            return amplitude(stepper, state.q, state.velocity(self.time_step)) <= limit
+            stepper.unknowns.from_nodes(state.velocity(self.time_step), f)
+            functional.memory.write(f)[:] *= functional.t2 * functional.mass
+            if not np.isfinite(estimate(Iterate(state.q, f), functional.dual_norm(f), np.inf)):
+                return False
+            return bool(np.sqrt(max(estimate.correction.dot(f), 0.0) / functional.t2) <= limit)
         finally:
             stepper.destroy()
-
-
-def distance(stepper: Stepper, q: Positions, enough: float) -> float:
-    """|e|_M of the problem that the functional has begun, at its q (l, 3) [m]; infinite where there
-    is no minimum (collective)."""
-    functional = stepper.functional
-    stepper.unknowns.from_nodes(q, stepper.x)
-    iterate = functional.evaluate(stepper.x, stepper.work)
-    return stepper.control.estimate(iterate, functional.dual_norm(iterate.f), enough)
-
-
-def amplitude(stepper: Stepper, q: Positions, v: Rows) -> float:
-    """How far velocities v (l, 3) [m/s] would carry a body from its equilibrium at q (l, 3) [m], in
-    the norm of M; infinite where there is none (collective)."""
-    functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
-    stepper.unknowns.from_nodes(v, f)
-    functional.memory.write(f)[:] *= functional.t2 * functional.mass
-    length = estimate(Iterate(q, f), functional.dual_norm(f), np.inf)
-    return float(np.sqrt(max(estimate.correction.dot(f), 0.0) / functional.t2)) if np.isfinite(length) else np.inf

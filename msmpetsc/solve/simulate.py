@@ -6,15 +6,14 @@ from functools import partial
 from time import perf_counter
 from typing import ClassVar
 
-import numba
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
+from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, on_host, to_host
+from msmpetsc.backend.arrays import Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
-from msmpetsc.comm import on_root
+from msmpetsc.comm import Route, on_root
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
@@ -154,7 +153,7 @@ class TimeLoop:
             self.adaptive.sum_up()
 
     def _advance(self, index: int) -> Frame | None:
-        """The next step (collective), as a frame if that is stored. Raises StepFailed, naming the step."""
+        """The next step (collective), as a frame if stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
         if index == self.probes.trace:
             self.integrator.follow()
@@ -232,8 +231,10 @@ class TimeLoop:
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
-        time, energies = index * self.time_step, self.balance.energies
-        effort, gained = self.effort, self.state.budget.since_frame
+        time = index * self.time_step
+        energies = self.balance.energies
+        effort = self.effort
+        gained = self.state.budget.since_frame
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
             self.effort = Effort()
             self.state = replace(self.state, budget=replace(self.state.budget, since_frame=0.0))
@@ -244,11 +245,7 @@ class TimeLoop:
             time=time,
             position=position,
             surface=self.surface(position) if self.surface else None,
-            kinetic=energies.kinetic,
-            elastic=energies.elastic,
-            potential=energies.potential,
-            contact=energies.contact,
-            momentum=energies.momentum,
+            **{name: getattr(energies, name) for name in ("kinetic", "elastic", "potential", "contact", "momentum")},
             inverted=self.monitors.inverted(index, time, q) if self.balance.checks else -1,
             energy_gained=max(gained, 0.0) if self.balance.checks else np.nan,
             self_contacts=energies.touch.contacts,
@@ -270,7 +267,7 @@ class TimeLoop:
         if self.probe:
             rows["probe"] = len(self.probe.corners)
         if self.surface:
-            rows["surface"] = len(self.surface.starts) - 1
+            rows["surface"] = self.surface.weights.shape[0]
         if self.stress:
             rows |= {name: lattice.cells_owned if "c" in FRAME_FIELDS[name].shape else lattice.owned for name in STRESS}
         return rows
@@ -290,44 +287,18 @@ class TimeLoop:
     def destroy(self) -> None:
         self.recovery.destroy()
         self.integrator.destroy()
-        if self.surface:
-            self.surface.destroy()
 
 
 class SurfaceMotion:
-    """The surface of a frame, W @ positions: this rank's rows of W; a PETSc scatter brings the nodes they need."""
+    """The surface of a frame, W @ positions: this rank's rows of W, and a way to the nodes that they need."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: Embedding):
         columns, local = np.unique(embedding.indices, return_inverse=True)
-        self.starts, self.columns, self.weights = embedding.indptr, local.ravel(), embedding.weights
-        self.nodes = PETSc.Vec().createMPI((3 * lattice.owned, 3 * lattice.table.total), comm=comm)
-        self.needed = PETSc.Vec().createSeq(3 * len(columns), comm=PETSc.COMM_SELF)
-        index = PETSc.IS().createBlock(3, columns.astype(PETSc.IntType), comm=comm)
-        self.scatter = PETSc.Scatter().create(self.nodes, index, self.needed, None)
-        index.destroy()
+        shape = embedding.points, len(columns)
+        self.weights = csr_array((embedding.weights, local.ravel(), embedding.indptr), shape=shape)
+        self.to_owner = Route(comm, lattice.table.owner_of_index(columns))
+        self.asked = self.to_owner.send(columns) - lattice.table.first  # own nodes that ranks need
 
     def __call__(self, position: Positions) -> Rows:
         """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
-        self.nodes.array[:] = position.ravel()
-        self.scatter.scatter(self.nodes, self.needed)
-        nodes = np.asarray(self.needed.array_r).reshape(-1, 3)
-        points = np.empty((len(self.starts) - 1, 3))
-        _weighted_sums(points, self.starts, self.columns, self.weights, nodes)
-        return points
-
-    def destroy(self) -> None:
-        for owner in (self.scatter, self.nodes, self.needed):
-            owner.destroy()
-
-
-@numba.njit(cache=True)
-def _weighted_sums(points: Positions, starts: Indices, columns: Indices, weights: Floats, nodes: Positions) -> None:
-    """Write W (in CSR form) times nodes (k, 3) into points (v, 3): as SciPy does, in three fifths of the time."""
-    for i in range(len(points)):
-        x = y = z = 0.0
-        for k in range(starts[i], starts[i + 1]):
-            weight, node = weights[k], columns[k]
-            x += weight * nodes[node, 0]
-            y += weight * nodes[node, 1]
-            z += weight * nodes[node, 2]
-        points[i, 0], points[i, 1], points[i, 2] = x, y, z
+        return self.weights @ self.to_owner.answer(position[self.asked])

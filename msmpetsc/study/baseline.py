@@ -118,7 +118,7 @@ def allowed(steps: int, unit: str) -> float:
 
 
 def differences(found: Numbers, stored: Numbers) -> Iterator[tuple[str, float, float]]:
-    """Yield of each number what it is called, how far it is off, relative, and how much is allowed."""
+    """Yield of each number its name, how far it is off, relative, and how much is allowed."""
     for name in found.numbers.keys() | stored.numbers.keys():
         one, other = found.numbers.get(name), stored.numbers.get(name)
         if one is None or other is None or one.unit != other.unit or np.shape(one.value) != np.shape(other.value):

@@ -90,9 +90,6 @@ class Case:
         return replace(self, set=(*self.set, *changes))
 
 
-# Commands
-
-
 def run_arguments(case: Case) -> list[str]:
     """Return what follows ``msmpetsc``, outputs aside."""
     changes = [word for change in case.set for word in ("--set", change)]
@@ -117,9 +114,6 @@ def command(case: Case, result: Path, measure: Path) -> list[str]:
 def shown_command(case: Case) -> str:
     """Return the line that repeats the case by hand."""
     return shlex.join([*launcher(case.ranks), "msmpetsc", *run_arguments(case)])
-
-
-# Overrides of the scene
 
 
 def digest(file: Path, scene: Scene) -> str:
@@ -164,11 +158,8 @@ def inline(table: Mapping[str, Any]) -> str:
     return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None) + "}"
 
 
-# All cases
-
-
 def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str] | None = None) -> list[Case]:
-    """Return all cases, each once, in the order of the file, whose folder is given. Raises InputError."""
+    """Return all cases, each once, in the order of the file in this folder. Raises InputError."""
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:
@@ -186,9 +177,6 @@ def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str]
 def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
     """Yield every choice from each list, by the name of the list; the last one changes fastest."""
     return (dict(zip(lists, values, strict=True)) for values in product(*lists.values()))
-
-
-# Sweeps
 
 
 def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
@@ -292,9 +280,6 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
     solver = inline({"preset": reference.preset, "error": reference.error})
     return with_time(case.changed(f"solver={solver}"), duration, every, as_given, surface)
-
-
-# Maps
 
 
 def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | None = None) -> Iterator[Case]:

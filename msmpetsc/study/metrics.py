@@ -63,11 +63,8 @@ def costs(record: dict[str, Any]) -> Row:
     return row | {"machine": ", ".join(str(part) for part in parts if part), "versions": versions}
 
 
-# The result file
-
-
 def of_frames(result: Path, time_step: float) -> Row:
-    """Return figures of a result: times and iterations are means a step, the first frame left out."""
+    """Return figures of a result: times and iterations are means a step without the first frame."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
@@ -111,9 +108,6 @@ def _errors(series: dict[str, np.ndarray]) -> Row:
 def _rms(values: np.ndarray) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.sqrt((values**2).mean())) if len(values) else None
-
-
-# Repeats
 
 
 def together(runs: Sequence[Row]) -> Row:
@@ -209,9 +203,9 @@ def trajectory_error(result: Path, reference: Path) -> float:
 
         sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
 
-    Sums over the times that both files have; x_ref stands for the limit of the time step to zero. A body that flies as
-    a whole counts its flight as motion. Raises InputError if the files have fewer than two times in common or different
-    lattices, or nothing moves.
+    Sums over the times that both files have; x_ref stands for the limit of the time step to zero. A
+    body that flies as a whole counts its flight as motion. Raises InputError if the files have
+    fewer than two times in common or different lattices, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         refuse_different_lattices(run, true)

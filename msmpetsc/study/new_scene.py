@@ -39,9 +39,6 @@ TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"  # y upwards becomes z 
 GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 
-# The mesh
-
-
 @dataclass(frozen=True)
 class MeshMeasures:
     """What a first scene rests on, lengths in the file's unit."""
@@ -60,7 +57,7 @@ class MeshMeasures:
 
 
 def measured(surface: Surface, suffix: str = "") -> MeshMeasures:
-    """Measure a surface as its file has it; ``suffix`` of the file: the axes of glTF are defined."""
+    """Measure a surface as its file has it; ``suffix`` of that: glTF defines its axes."""
     sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
     areas = np.bincount(part_labels(surface), trimesh.triangles.area(surface.points[surface.triangles]))
     return MeshMeasures(
@@ -110,9 +107,6 @@ def stands(surface: Surface, axis: int, way: int) -> float:
     return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
 
 
-# The scene
-
-
 @dataclass(frozen=True)
 class Dimensions:
     """The body as it will lie, z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
@@ -138,14 +132,13 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
         "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
         f"title = {json.dumps(title, ensure_ascii=False)}",
     ]
-    mesh_lines, cages = _mesh(source, mesh, body), _cages(body)
     moved = _clamped(body, body.axis) if body.axis is not None else _falling(body)
-    return "\n".join([*head, "", *mesh_lines, "", *cages, "", *moved]) + "\n"
+    return "\n".join([*head, "", *_mesh(source, mesh, body), "", *_cages(body), "", *moved]) + "\n"
 
 
 def _mesh(source: str, mesh: MeshMeasures, body: Dimensions) -> list[str]:
     """Return the table of the mesh, and what is wrong with it."""
-    report, longest = mesh.report, float(body.sides.max())
+    report = mesh.report
     parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
     state = "closed" if report.closed else f"open ({report.boundary_edges} boundary edges)"
     name = json.dumps(source, ensure_ascii=False)
@@ -168,7 +161,9 @@ def _mesh(source: str, mesh: MeshMeasures, body: Dimensions) -> list[str]:
     if len(mesh.parts) > 1 and '"largest_part"' not in steps:
         lines.append('# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap')
     guess = {1.0: "as in the file, taken as metres", None: "unit of the file unknown: what is it?"}
-    lines.append(line(f"size = {plain(longest, 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}"))
+    lines.append(
+        line(f"size = {plain(body.sides.max(), 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}")
+    )
     if body.axis is None:
         drop = plain(DROP * body.sides[2], 2)
         lines.append(

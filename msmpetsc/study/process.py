@@ -71,7 +71,8 @@ class Processes:
                 self._running.discard(process)
         return Ended(status, reason, perf_counter() - begin)
 
-    def stop(self) -> None:
+    def close(self) -> None:
+        """End those under way."""
         with self._lock:
             self.stopped, running = True, list(self._running)
         for process in running:

@@ -43,38 +43,31 @@ def write_report(folder: Path) -> Path:
     table = read_table(folder)
     file = folder / "study.toml"
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    charts = draw_charts(table, read_traces(folder), study)
-    for chart in charts:
-        save_png(chart, folder)
-    names = [name for name in table["study"] if name]
-    title = str(study.get("title") or next(iter(names), "") or folder.resolve().name)
-    path, written = folder / "report.html", datetime.fromtimestamp((folder / "table.csv").stat().st_mtime)
-    write_whole(path, page(title, f"{written.astimezone():%d %B %Y, %H:%M %z}", table, charts))
-    return path
-
-
-def draw_charts(table: DataFrame, traces: dict[str, dict], study: dict) -> list[Chart]:
-    """Return all charts that there are numbers for; ``study``: the tables of the study file."""
-    styles = curve_styles(table["label"])
-    sweeps = swept(table)
-    return [
+    styles, sweeps = curve_styles(table["label"]), swept(table)
+    charts = [
         *stability_charts(table, study),
         *size_charts(sweeps, styles),
         *pareto_charts(sweeps, styles),
         *growth_charts(sweeps, styles),
         *order_charts(sweeps, styles, study),
-        *convergence_charts(sweeps, styles, traces),
+        *convergence_charts(sweeps, styles, read_traces(folder)),
     ]
-
-
-# The page
+    for chart in charts:
+        save_png(chart, folder)
+    names = [name for name in table["study"] if name]
+    title = str(study.get("title") or next(iter(names), "") or folder.resolve().name)
+    written = datetime.fromtimestamp((folder / "table.csv").stat().st_mtime).astimezone()
+    write_whole(folder / "report.html", page(title, f"{written:%d %B %Y, %H:%M %z}", table, charts))
+    return folder / "report.html"
 
 
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     """Return the whole page; it needs nothing beside itself."""
     environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
     environment.filters |= {"svg": lambda chart: Markup(svg_text(chart)), "html": html}
-    tables = {"table": whole_table(table), "failures": failed(swept(table))[OF_FAILURES]}
+    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]
+    filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
+    tables = {"table": table[[*FIRST, *filled, "command"]], "failures": failed(swept(table))[OF_FAILURES]}
     template = environment.get_template("report.html.j2")
     return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
 
@@ -85,22 +78,12 @@ def facts(table: DataFrame) -> dict[str, Any]:
     maps = {name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()}
     platforms = {name.capitalize(): [text for text in table[name].unique() if text] for name in ("machine", "versions")}
     counts = {"cases": len(plain), "failed": len(failed(plain)), "empty": table.empty}
-    return counts | {"maps": maps, "platforms": platforms, "repeats": repeats_note(timed(plain))}
-
-
-def repeats_note(rows: DataFrame) -> str:
-    """Say how often cases were run, and what follows for their times; empty without cases."""
-    counts = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))
-    if rows.empty or not is_repeated(rows):
-        return counts and f"{counts}. {ONCE_NOTE}"
-    return f"{counts}: times are medians, ranges and whiskers from the least to the greatest"
-
-
-def whole_table(table: DataFrame) -> DataFrame:
-    """Return all columns that some case fills, but for those that stand above all; numbers before texts."""
-    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]
-    filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
-    return table[[*FIRST, *filled, "command"]]
+    rows = timed(plain)
+    often = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))  # nothing without cases
+    note = often and f"{often}. {ONCE_NOTE}"
+    if not rows.empty and is_repeated(rows):
+        note = f"{often}: times are medians, ranges and whiskers from the least to the greatest"
+    return counts | {"maps": maps, "platforms": platforms, "repeats": note}
 
 
 def html(table: DataFrame) -> Markup:

@@ -17,15 +17,7 @@ from tqdm import tqdm
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
-from msmpetsc.study.metrics import (
-    costs,
-    of_frames,
-    outcome,
-    read_record,
-    surface_error,
-    together,
-    trajectory_error,
-)
+from msmpetsc.study.metrics import costs, of_frames, outcome, read_record, surface_error, together, trajectory_error
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
@@ -35,9 +27,6 @@ TOLD = (  # of a case that is done
     "cells", "time_step", "substep", "error", "max_iterations", "time_frame", "true_error", "trajectory_error",
     "surface_error",
 )  # fmt: skip
-
-
-# One case
 
 
 @dataclass(frozen=True)
@@ -64,7 +53,7 @@ class Bench:
         return self.folder / "runs" / f"{case.id}.h5"
 
     def measure(self, case: Case, keep: bool = False) -> CaseResult:
-        """Run a case as often as it says; what goes wrong is in its row. ``keep``: its result stays."""
+        """Run a case as often as it says; its row tells what goes wrong. ``keep``: its result stays."""
         runs: list[Row] = []
         path, trace = self.result_of(case), None
         known = case.columns | {"study": self.study, "command": shown_command(case)}
@@ -147,9 +136,6 @@ def _remove_files(path: Path, log: bool) -> None:
     """Remove a run's files, large as they are; its log only if ``log``."""
     for suffix in (".h5", ".xdmf", ".json", *((".log",) if log else ())):
         path.with_suffix(suffix).unlink(missing_ok=True)
-
-
-# All cases
 
 
 @dataclass
@@ -257,7 +243,7 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
                 bar.write(f"case {count}/{bar.total}  {described(result.row)}", file=sys.stderr)
                 bar.update()
     finally:  # what ends this early ends the runs under way
-        bench.processes.stop()
+        bench.processes.close()
         pool.shutdown(cancel_futures=True)
         with suppress(OSError):  # logs of cases that failed are in it
             (bench.folder / "runs").rmdir()

@@ -66,7 +66,7 @@ class ReferenceRun(Table):
 
 
 class Length(Table):
-    """The length of a run: time steps, or simulated time [s]; the scene's own if both are absent."""
+    """The length of a run: time steps, or simulated time [s]; the scene's if both are absent."""
 
     steps: Count | None = None
     duration: Positive | None = None
@@ -93,7 +93,7 @@ class StudyScene(Length):
 
 
 class Sweep(Table):
-    """Cases of every choice from each list, for every scene. An empty list leaves what the scene has."""
+    """Cases of every choice from each list, for every scene; of an empty list as the scene has it."""
 
     scenes: ListOf[str] = ()  # names; all if absent
     integrators: ListOf[IntegratorName] = ("implicit-euler",)

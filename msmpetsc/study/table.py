@@ -104,13 +104,10 @@ ONCE_NOTE = (
 
 
 def require_extra() -> None:
-    """Raise InputError where a package of a study is missing: before hours of runs, not after them."""
+    """Raise InputError where a package of a study is missing: before hours of runs."""
     for name in EXTRAS["study"]:
         if find_spec(name) is None:
             raise missing_package(name)
-
-
-# Writing and reading
 
 
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
@@ -125,7 +122,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def read_table(folder: Path) -> "DataFrame":
-    """Return the rows of table.csv, see ``typed``. Raises InputError where there is no such table."""
+    """Return the rows of table.csv, see ``typed``. Raises InputError without such a table."""
     import pandas
 
     path = folder / "table.csv"
@@ -194,9 +191,6 @@ def _fill(file: h5py.File, table: "DataFrame") -> None:
         file.create_dataset(name, data=table[name].to_numpy(), dtype=kinds[column.kind], shape=(len(table),))
         file[name].dims[0].attach_scale(file["row"])
         file[name].attrs.update({"units": column.unit, "long_name": column.about})
-
-
-# Choosing rows
 
 
 def succeeded(table: "DataFrame") -> "DataFrame":

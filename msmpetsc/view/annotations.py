@@ -4,18 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
+from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
-
-if TYPE_CHECKING:
-    from msmpetsc.view.composition import Composition, Still
-
 
 CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its lines, size and middle
 LABEL = 11  # [px]
@@ -55,9 +51,6 @@ def rounded(low: float, high: float) -> tuple[str, str]:
     return first, last
 
 
-# The legend
-
-
 LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
 FINE = 3  # a legend is drawn so many times larger, and shrunk
 NICE = (1, 2, 5)  # lengths of a scale bar, times powers of ten
@@ -80,7 +73,7 @@ class Entry:
     high: str = ""
 
 
-def entries_of(composition: "Composition", stills: Sequence["Still"]) -> list[Entry]:
+def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]:
     """Return the entries of the legend of what is drawn."""
     scene, colouring, entries = composition.subject.scene, composition.colouring, []
     if colouring is not None and colouring.classes:

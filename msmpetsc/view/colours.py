@@ -207,7 +207,7 @@ def _contact(subject: Drawable, _: Result | None) -> Colouring:
 
 
 def plain_colouring(subject: Drawable) -> Colouring | None:
-    """Return the colours of bodies that no field colours: each its own; None where there is but one."""
+    """Return colours of bodies that no field colours: each its own; None of one alone."""
     number = subject.rest.body_of_point % len(CLASSES)
     return Colouring("body", "", lambda _: number, 1.0, ("",) * len(CLASSES)) if number.any() else None
 

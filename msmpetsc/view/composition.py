@@ -115,7 +115,11 @@ def composition_of(
     reference : result that the colour "error" is counted from
     """
     colouring = colouring_of(subject, style.colour, reference) if style.colour else plain_colouring(subject)
-    directions = _directions()
+    number = np.arange(DIRECTIONS) + 0.5  # spread over the sphere, those of the axes first (Fibonacci's spiral)
+    height, angle = 1 - 2 * number / DIRECTIONS, np.pi * (1 + 5**0.5) * number
+    flat = np.sqrt(1 - height**2)
+    spiral = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
+    directions = np.concatenate([np.eye(3), -np.eye(3), spiral])
     extremes = []
     distinct = sorted(set(frames))
     for index in counted(distinct, "frames read"):
@@ -131,12 +135,3 @@ def composition_of(
     camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
     fixed = any(subject.fixed(index).any() for index in (distinct[0], distinct[-1]))
     return Composition(subject, style, everywhere, camera, colouring, fixed)
-
-
-def _directions() -> np.ndarray:
-    """Return unit vectors (d, 3) spread over the sphere, those of the axes first (Fibonacci's spiral)."""
-    number = np.arange(DIRECTIONS) + 0.5
-    height, angle = 1 - 2 * number / DIRECTIONS, np.pi * (1 + 5**0.5) * number
-    flat = np.sqrt(1 - height**2)
-    spiral = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
-    return np.concatenate([np.eye(3), -np.eye(3), spiral])

@@ -45,15 +45,12 @@ class BodiesAtRest:
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
     def find(self, table: OfBody) -> np.ndarray:
-        """Tell which nodes (n,) the region of a scene's table means; none if it is painted in a file."""
+        """Tell which nodes (n,) a table's region means; none if it is painted in a file."""
         region = table.table.region
-        if region.painted is None:
-            low, high = np.moveaxis(self.bounds[self.body_of_node], 1, 0)  # what sticks out is where its body is
-            nodes = np.clip(self.nodes, low, high)
-            return inside_bodies(region, nodes, self.bounds, self.body_of_node, table.body)
-        where = np.zeros(len(self.nodes), bool)
-        where[self.cells[self._painted_cells(table)]] = True
-        return where
+        if region.painted is not None:
+            return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
+        low, high = np.moveaxis(self.bounds[self.body_of_node], 1, 0)  # what sticks out is where its body is
+        return inside_bodies(region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body)
 
     @property
     def middles(self) -> np.ndarray:
@@ -63,11 +60,9 @@ class BodiesAtRest:
     def find_cells(self, table: OfBody) -> np.ndarray:
         """Tell which cells (c,) the region of a table means, by their centres; none if it is painted in a file."""
         region = table.table.region
-        if region.painted is None:
-            return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
-        where = np.zeros(len(self.cells), bool)
-        where[self._painted_cells(table)] = True
-        return where
+        if region.painted is not None:
+            return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
+        return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
 
     def _painted_cells(self, table: OfBody) -> np.ndarray:
         """Return the numbers of the cells of the table's body around its painted points."""
@@ -135,9 +130,9 @@ class Drawable:
 
     def fixed(self, index: int) -> np.ndarray:
         """Return how far each surface point is pinned or led at a frame, (v,) in [0, 1]."""
-        fixed, time = self.pinned.copy(), float(self.times[index])
+        fixed = self.pinned.copy()
         for anchor in self.scene.tables("anchor") if self.scene else ():
-            if within(time, 0.0, anchor.table.stop):
+            if within(float(self.times[index]), 0.0, anchor.table.stop):
                 fixed |= self.rest.find(anchor)
         return self.on_surface(fixed.astype(float), 1.0)
 
@@ -151,17 +146,20 @@ class Drawable:
 def drawable_of_result(run: Result) -> Drawable:
     """Return what a result shows. Raises InputError where it cannot be drawn."""
     scene = read_scene(run)
-    refuse_what_cannot_be_drawn(run)
-    nodes, of_points = run.lattice.nodes[:], run.body_of("surface")
+    if "embedding/weights" not in run:
+        raise InputError(f"{run.path} has no surface to draw: its scene says output.surface = false")
+    for name in DRAWN:
+        if len(run[name]) == 0:
+            raise InputError(f"{run.path} is damaged, or has no finished frame: {name} is empty")
+    nodes = run.lattice.nodes[:]
+    bodies = run.body_of("lattice"), run.body_of("surface")
     pinned = np.zeros(len(nodes), bool)
     if "lattice/pinned" in run:
         pinned[run.indices("lattice/pinned")] = True
     return Drawable(
         name=str(run.path),
         scene=scene,
-        rest=BodiesAtRest(
-            nodes, run.indices("lattice/cells"), run.surface.points[:], run.body_of("lattice"), of_points
-        ),
+        rest=BodiesAtRest(nodes, run.indices("lattice/cells"), run.surface.points[:], *bodies),
         pinned=pinned,
         triangles=run.indices("surface/triangles"),
         times=run.frames.time[:],
@@ -176,11 +174,12 @@ def drawable_of_result(run: Result) -> Drawable:
 
 def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     """Return what a scene is before its first step, from the model that one process built of it."""
-    lattice, surface, embedding = model.lattice, model.surface, model.embedding
+    lattice, surface, embedding, owned = model.lattice, model.surface, model.embedding, model.lattice.owned
     if surface is None or embedding is None:
         raise InputError(f"{path} has no surface to draw: it says output.surface = false")
-    W = csr_array((embedding.weights, embedding.indices, embedding.indptr), shape=(embedding.points, lattice.owned))
-    start = np.asarray(model.start[0])[: lattice.owned]
+    W = csr_array((embedding.weights, embedding.indices, embedding.indptr), shape=(embedding.points, owned))
+    start = np.asarray(model.start[0])[:owned]
+    bodies = lattice.body[:owned], model.body_of_point
     arrays = {
         "lattice/cell_kind": lattice.cell_kind,
         "lattice/springs": lattice.global_numbers[lattice.springs],
@@ -189,14 +188,8 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     return Drawable(
         name=str(path),
         scene=scene,
-        rest=BodiesAtRest(
-            lattice.nodes[: lattice.owned],
-            lattice.cells,
-            surface.points,
-            lattice.body[: lattice.owned],
-            model.body_of_point,
-        ),
-        pinned=lattice.pinned[: lattice.owned],
+        rest=BodiesAtRest(lattice.nodes[:owned], lattice.cells, surface.points, *bodies),
+        pinned=lattice.pinned[:owned],
         triangles=surface.triangles,
         times=np.zeros(1),
         nodes=lambda _: start,
@@ -225,17 +218,8 @@ def drawable_of_surface(path: Path, surface: Surface) -> Drawable:
     )
 
 
-def refuse_what_cannot_be_drawn(run: Result) -> None:
-    """Raise InputError unless what is drawn is there."""
-    if "embedding/weights" not in run:
-        raise InputError(f"{run.path} has no surface to draw: its scene says output.surface = false")
-    for name in DRAWN:
-        if len(run[name]) == 0:
-            raise InputError(f"{run.path} is damaged, or has no finished frame: {name} is empty")
-
-
 def solids_of(run: Result) -> dict[int, Surface]:
-    """Return the surfaces of obstacles that a result holds. Raises InputError where they are damaged."""
+    """Return surfaces of obstacles that a result holds. Raises InputError for damaged ones."""
     if "obstacle/points" not in run:
         return {}
     points, triangles, numbers = run["obstacle/points"][:], run.indices("obstacle/triangles"), run["obstacle/number"][:]

@@ -44,17 +44,14 @@ def write_film(
     if playback.speed:
         seconds = len(played) / playback.fps
         log.info("the film lasts %.2g s, %s", seconds, playback.words or "in real time")
-    size = style.size or _fitting(composition, stills)
+    size = style.size
+    if size is None:  # what is seen fills it; both sides are even
+        low, high, _ = composition.room(stills)
+        width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
+        size = 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
     with written(path, size, playback.fps) as add:
         for picture in _pictures(composition, stills, size):
             add(picture)
-
-
-def _fitting(composition: Composition, stills: list[Still]) -> tuple[int, int]:
-    """Return width and height [px], both even, of a film that what is seen fills."""
-    low, high, _ = composition.room(stills)
-    width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
-    return 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
 
 
 def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[np.ndarray]:
@@ -81,7 +78,7 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
 
 @contextmanager
 def written(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Yield what adds a picture (height, width, 3) to a film, which has its name when it is whole."""
+    """Yield what adds a picture (height, width, 3) to a film, named when it is whole."""
     write = _video if path.suffix.lower() == ".mp4" else _images
     with whole_file(path) as part, write(part, size, fps) as add:
         yield add

@@ -17,9 +17,6 @@ from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
-# The surface
-
-
 SHARP = 30.0  # [degrees] between the normals of two triangles: beyond it their edge is sharp
 HELD = 0.5  # share of a point that is fixed: a triangle is whose corners all have more
 MOST = 30_000  # triangles, roughly: however small the cells, edges are not divided into more
@@ -83,7 +80,7 @@ def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_a
 
 
 def _split(subject: Drawable) -> Drawable:
-    """Return the subject with a copy of each point for every smooth piece of the surface around it."""
+    """Return the subject with a copy of each point for every smooth piece of surface there."""
     rest, W = subject.rest, subject.embedding
     _, first, equal = np.unique(
         np.column_stack([rest.body_of_point, rest.points]), axis=0, return_index=True, return_inverse=True
@@ -109,9 +106,6 @@ def split_at_edges(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarra
     options: dict[str, Any] = dict(consistent_normals=False, non_manifold_traversal=False, cell_normals=False)
     split = surface.compute_normals(split_vertices=True, feature_angle=SHARP, **options)
     return split["pyvistaOriginalPointIds"], split.regular_faces
-
-
-# The lattice
 
 
 SHOWN = ("cells", "springs")

@@ -41,7 +41,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class MeshObstacle:
-    """A mesh: number of its obstacle, how far it has moved (3,) [m], and corners (8, 3) as of a Ball."""
+    """A mesh: number of its obstacle, how far it moved (3,) [m], corners (8, 3) as of a Ball."""
 
     number: int
     by: np.ndarray
@@ -88,7 +88,11 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
         if obstacle.shape == "box":
             shown.glass.extend(_box(np.array(obstacle.box) + by, bodies))
         elif obstacle.shape == "sphere":
-            shown.balls.extend(_ball(np.array(obstacle.center) + by, obstacle.radius or 0.0, bodies))
+            center, radius = np.array(obstacle.center) + by, obstacle.radius or 0.0
+            seen = _box(np.array([center - radius, center + radius]), bodies)
+            gap = np.linalg.norm(center - np.clip(center, bodies.min(axis=0), bodies.max(axis=0))) - radius
+            if gap <= NEAR * _reach(bodies):
+                shown.balls.extend(Ball(center, radius, corners) for corners in seen)
         elif obstacle.shape == "plane":
             _add_plane(shown, np.array(obstacle.point) + by, np.array(obstacle.normal), bodies, camera)
         elif number in solids and len(solids[number].points):
@@ -98,13 +102,20 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
 
 
 def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, camera: Camera) -> None:
-    """Add a plane as ground, or as a plate of glass where it would hide the body; far from it, none."""
+    """Add a plane as ground, or as a plate of glass where it hides the body; far from it, none."""
     if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
         return
-    if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:
-        shown.grounds.append(_ground(point, normal, bodies))
-    else:
-        shown.glass.append(_plate(point, normal, bodies))
+    sides = _sides(normal)
+    if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:  # alike from anywhere
+        middle = (bodies.min(axis=0) + bodies.max(axis=0)) / 2
+        middle = middle - ((middle - point) @ normal) * normal
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ sides
+        shown.grounds.append(Ground(middle + GROUND * _reach(bodies) * corners, normal))
+    else:  # a plate where the bodies stand before the plane, with a margin
+        reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
+        front = corners_of(np.array([reached.min(axis=0) - margin, reached.max(axis=0) + margin])) @ sides
+        front = front + (point @ normal) * normal
+        shown.glass.append(np.concatenate([front, front - THICKNESS * _reach(bodies) * normal]))
 
 
 def _reach(bodies: np.ndarray) -> float:
@@ -116,24 +127,6 @@ def _sides(normal: np.ndarray) -> np.ndarray:
     across = min(np.eye(3), key=lambda axis: abs(axis @ normal))
     first = unit(across - (across @ normal) * normal)
     return np.array([first, np.cross(normal, first)])
-
-
-def _ground(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray) -> Ground:
-    """Return what is drawn of a plane below bodies: wherever the eye is, the same."""
-    middle = (bodies.min(axis=0) + bodies.max(axis=0)) / 2
-    middle = middle - ((middle - point) @ normal) * normal
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ _sides(normal)
-    return Ground(middle + GROUND * _reach(bodies) * corners, normal)
-
-
-def _plate(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-    """Return the corners (8, 3) of a plate behind a plane, where the bodies stand before it, with a margin."""
-    sides = _sides(normal)
-    reached = bodies @ sides.T
-    margin = MARGIN * _reach(bodies)
-    ends = np.array([reached.min(axis=0) - margin, reached.max(axis=0) + margin])
-    front = corners_of(ends) @ sides + (point @ normal) * normal
-    return np.concatenate([front, front - THICKNESS * _reach(bodies) * normal])
 
 
 def corners_of(box: np.ndarray) -> np.ndarray:
@@ -152,13 +145,6 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
     if gap > NEAR * _reach(bodies) or (box[0] >= box[1]).any():
         return []
     return [corners_of(box)]
-
-
-def _ball(center: np.ndarray, radius: float, bodies: np.ndarray) -> list[Ball]:
-    """Return a sphere, of which no more is shown than of a box; none if it is far from the bodies."""
-    gap = np.linalg.norm(center - np.clip(center, bodies.min(axis=0), bodies.max(axis=0))) - radius
-    seen = _box(np.array([center - radius, center + radius]), bodies)
-    return [Ball(center, radius, seen[0])] if seen and gap <= NEAR * _reach(bodies) else []
 
 
 def _arrows(scene: SceneFile, time: float, rest: BodiesAtRest, position: np.ndarray) -> list[np.ndarray]:

@@ -57,7 +57,10 @@ def write_page(
         chosen = [*chosen[:-1:step], chosen[-1]]
     if len(chosen) < len(frames):
         log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
-    streams["fixed"], numbers = fixed_states(composition.subject, chosen)
+    states: dict[bytes, int] = {}  # which points are pinned or led (255, or 0), each state once
+    fixed = (np.where(composition.subject.fixed(index) > HELD, 255, 0).astype(np.uint8) for index in chosen)
+    numbers = [states.setdefault(mask.tobytes(), len(states)) for mask in fixed]
+    streams["fixed"] = zlib.compress(b"".join(states))
     facts = page_facts(composition, composition.stills(chosen)) | {"fixed": numbers}
     write_whole(path, page_text(composition.subject.title, facts, streams))
 
@@ -143,14 +146,6 @@ def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
     for frame in frames:
         yield (frame if before is None else frame - before).tobytes()
         before = frame
-
-
-def fixed_states(subject: Drawable, frames: Iterable[int]) -> tuple[bytes, list[int]]:
-    """Return which points are pinned or led (255, or 0), each state once, deflated, and that of each frame."""
-    states: dict[bytes, int] = {}
-    masks = (np.where(subject.fixed(index) > HELD, 255, 0).astype(np.uint8).tobytes() for index in frames)
-    numbers = [states.setdefault(mask, len(states)) for mask in masks]
-    return zlib.compress(b"".join(states)), numbers
 
 
 def deflated(parts: Iterable[bytes]) -> bytes:

@@ -120,8 +120,9 @@ class Renderer:
             _draw_arrow(self._plotter, tail + 2 * self._depth * still.camera.to_eye, tip - tail)
 
     def _draw_obstacles(self, overlays: Overlays) -> None:
-        for corners in overlays.glass:
-            _draw_glass(self._plotter, _hexahedron(corners))
+        for box in map(_hexahedron, overlays.glass):
+            self._plotter.add_mesh(box, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
+            self._plotter.add_mesh(box.extract_all_edges(), color=GLASS_EDGE, line_width=2, lighting=False)
         for ball in overlays.balls:
             sphere = pv.Sphere(radius=ball.radius, center=ball.center, theta_resolution=96, phi_resolution=96)
             look: dict[str, Any] = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
@@ -170,11 +171,6 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     lift = 2e-3 * np.ptp(body.points, axis=0).max()  # or the two surfaces would flicker into each other
     shadow.points = ground.below(body.points) + lift * ground.normal
     plotter.add_mesh(shadow, color=SHADOW, lighting=False)
-
-
-def _draw_glass(plotter: pv.Plotter, solid: pv.StructuredGrid) -> None:
-    plotter.add_mesh(solid, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
-    plotter.add_mesh(solid.extract_all_edges(), color=GLASS_EDGE, line_width=2, lighting=False)
 
 
 def _draw_arrow(plotter: pv.Plotter, tail: np.ndarray, along: np.ndarray) -> None:

@@ -97,9 +97,10 @@ def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int |
     if frames:
         return dict.fromkeys(frames_of(subject.name, frames, len(subject.times)), "")
     assert isinstance(subject.scene, SceneFile)
-    if count is None and subject.scene.picture.times:
-        return moments_at(run, subject.scene.picture.times)
-    return choose_moments(run, count or COUNT)
+    if count is not None or not subject.scene.picture.times:
+        return choose_moments(run, count or COUNT)
+    nearest = {0, *(int(np.argmin(abs(subject.times - wanted))) for wanted in subject.scene.picture.times)}
+    return {index: "" if index else "start" for index in sorted(nearest)}
 
 
 def _rows_of(panels: int, size: tuple[int, int]) -> int:
@@ -113,16 +114,6 @@ def _rows_of(panels: int, size: tuple[int, int]) -> int:
             f"at most {HIGHEST // height * in_row} fit into {in_row * width} by {HIGHEST}"
         )
     return rows
-
-
-# The moments, where none are asked for
-
-
-def moments_at(run: Result, times: Sequence[float]) -> dict[int, str]:
-    """Return the start, and the finished frames nearest to these times [s], in order of time."""
-    time = run.frames.time[:]
-    nearest = {0, *(int(np.argmin(abs(time - wanted))) for wanted in times)}
-    return {index: "" if index else "start" for index in sorted(nearest)}
 
 
 def choose_moments(run: Result, count: int) -> dict[int, str]:

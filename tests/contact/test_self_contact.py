@@ -123,11 +123,11 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     through, apart, carried = q.copy(), q.copy(), q + np.array([5.0, 0, 0])
     through[q[:, 0] < 0, 0] += 2 * GAP
     apart[q[:, 0] < 0, 0] -= 2 * GAP
-    assert 0.3 < term.free_share(q, through) < 0.5  # they meet halfway
-    assert term.free_share(q, apart) == term.free_share(q, carried) == 1.0
+    assert 0.3 < term.contacts.free_share(q, through) < 0.5  # they meet halfway
+    assert term.contacts.free_share(q, apart) == term.contacts.free_share(q, carried) == 1.0
     far = q.copy()
     far[q[:, 0] < 0, 0] += 500 * GAP  # many edges, and the ends are apart again
-    assert 0 < term.free_share(q, far) < 1 / 500
+    assert 0 < term.contacts.free_share(q, far) < 1 / 500
 
 
 STIFFENING = {"young_modulus": 1e5, "density": 1000, "law": "stiffening"}  # or the arms' ends turn inside out

@@ -18,8 +18,7 @@ from vtk.util.numpy_support import vtk_to_numpy
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export
-from msmpetsc.export.gltf import normals
-from msmpetsc.export.moments import green_strain
+from msmpetsc.export.moments import green_strain, normals
 from msmpetsc.results.reader import Result
 from msmpetsc.results.xdmf import write_xdmf
 

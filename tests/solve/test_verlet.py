@@ -146,7 +146,7 @@ def test_the_limit_is_that_of_the_greatest_eigenvalue(stiffening: float, held: b
     stepper = integrator(lattice)
     stepper.position.values[:] = q
     stepper._hold(0.0)
-    found, exact = stepper._elastic_squared(), greatest(lattice, q)
+    found, exact = stepper.highest.squared_at(stepper.position.values), greatest(lattice, q)
     stepper.destroy()
     assert 0.97 * exact < found <= greatest(lattice, q, projected=True) * (1 + 1e-12)
 

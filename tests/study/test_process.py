@@ -22,7 +22,7 @@ TIME = {"step": 0.01, "duration": 0.1}
 def processes():
     found = Processes()
     yield found
-    found.stop()
+    found.close()
 
 
 def carry_out(

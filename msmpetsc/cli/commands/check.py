@@ -64,9 +64,6 @@ def run(args: argparse.Namespace) -> int:
     return SAME
 
 
-# Storing
-
-
 def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
     """Run a scene and store its numbers, as those stored before were made if nothing else is asked for."""
     recipe = asked or Recipe(cells=None, steps=STEPS)
@@ -96,9 +93,6 @@ def found(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
         except RuntimeError as error:
             raise InputError(f"{scene}: the run failed: {error}") from None
         return baseline.summary(path, recipe)
-
-
-# Comparing
 
 
 def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> list[Checked]:

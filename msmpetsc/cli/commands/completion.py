@@ -1,7 +1,6 @@
 """``msmpetsc completion``: the script by which a shell completes the command line."""
 
 import argparse
-from typing import Any
 
 from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.cli.arguments import command_parser
@@ -16,16 +15,10 @@ def run(args: argparse.Namespace) -> int:
     if args.shell not in shtab.SUPPORTED_SHELLS:
         raise InputError(f"shtab {shtab.__version__} knows no {args.shell}: pip install --upgrade shtab")
     parser = command_parser()
-    for action in parser._actions:
-        for command in (action.choices or {}).values() if isinstance(action.choices, dict) else ():
-            complete_files(command, shtab.FILE)
+    (commands,) = (action.choices for action in parser._actions if isinstance(action.choices, dict))
+    for argument in (each for command in commands.values() for each in command._actions):
+        if argument.type in (checked_path, checked_file):  # completed by files
+            argument.complete = shtab.FILE
     if world().rank == 0:
         print(shtab.complete(parser, args.shell))
     return 0
-
-
-def complete_files(parser: argparse.ArgumentParser, by: dict[str, Any]) -> None:
-    """Complete each argument that is a path by the files that there are."""
-    for action in parser._actions:
-        if action.type in (checked_path, checked_file):
-            action.complete = by  # type: ignore[attr-defined]  # where shtab looks for it

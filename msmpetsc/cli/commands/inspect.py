@@ -6,20 +6,20 @@ memory of a rank  =  PROGRAM + FACTOR (bytes of its arrays while A is assembled)
 import argparse
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.app.profile import peak_memory
+from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.lattice.lattice import lattice_bytes
+from msmpetsc.lattice.partition import Partition, partition_of
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.petsc.initialise import initialise
-
-if TYPE_CHECKING:
-    from msmpetsc.geometry.surface import Surface
-    from msmpetsc.lattice.partition import Partition
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
@@ -35,8 +35,6 @@ def run(args: argparse.Namespace) -> int:
     if args.ranks > MOST_RANKS:
         raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     initialise(MPI.COMM_WORLD, [])
-    from msmpetsc.build import read_bodies
-    from msmpetsc.lattice.partition import partition_of
     from msmpetsc.solve.presets import preset_names
 
     scene = load_scene(args.scene, args.set, preset_names())
@@ -59,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def counts_of(scene: Scene, partition: "Partition") -> dict[str, dict[str, float]]:
+def counts_of(scene: Scene, partition: Partition) -> dict[str, dict[str, float]]:
     """Return how many there are of each thing in all, and of a rank in the mean and at the most."""
     rows = {
         "cells": partition.cells,
@@ -96,13 +94,12 @@ def print_counts(report: dict[str, Any]) -> None:
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
 
 
-def memory_of(partition: "Partition", surfaces: Sequence["Surface"], mesh: float) -> np.ndarray:
+def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) -> np.ndarray:
     """Return the memory (R,) of each rank [byte].
 
     surfaces : that are stored
     mesh     : bytes that reading and preparing them took, on rank 0
     """
-    from msmpetsc.lattice.lattice import lattice_bytes
     from msmpetsc.solve.linear.system import assembly_bytes
     from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
 

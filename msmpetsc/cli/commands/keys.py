@@ -1,15 +1,19 @@
-"""``msmpetsc keys``: the keys of a scene, each with its unit, default, range and meaning."""
+"""``msmpetsc keys``, ``msmpetsc schema``: the keys of a scene, as a table or a JSON schema."""
 
 import argparse
+import json
 from dataclasses import astuple
 
-from msmpetsc.scene.key_table import keys
+from msmpetsc.scene.key_table import json_schema, keys
 
 HEAD = ("key", "unit", "default", "range", "meaning")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a line a key; return the exit status."""
+    """Print a line a key, or the schema; return the exit status."""
+    if args.command == "schema":
+        print(json.dumps(json_schema(), indent=1))
+        return 0
     rows = [HEAD, *(astuple(key) for key in keys(args.table or ""))]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
     for *columns, meaning in rows:

@@ -14,7 +14,7 @@ from msmpetsc.results.disk import whole_file, write_whole
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
-from msmpetsc.study.new_scene import MeshMeasures, draft, measured, upwards
+from msmpetsc.study.new_scene import draft, measured, upwards
 
 SHIPPED = Path(msmpetsc.__file__).parent / "shipped"  # the scenes that a wheel holds, too; in a clone a link to scenes/
 
@@ -49,13 +49,6 @@ def drafted(mesh: Path, scene: Path) -> str:
     surface = load(source, scene.parent)
     warnings = check_encloses(surface, examine(surface))
     measures = measured(surface, suffix)
-    log_findings(mesh, measures, warnings)
-    log.info("%s", upwards(measures))
-    return draft(source, scene.stem, measures)
-
-
-def log_findings(mesh: Path, measures: MeshMeasures, warnings: list[str]) -> None:
-    """Log what was found of a mesh; what the scene does about it stands in its comments."""
     count, state = len(measures.parts), "closed" if measures.report.closed else "open"
     parts = f"{count} parts, the largest of {measures.parts[0]:.0%} of the area" if count > 1 else "1 part"
     log.info("%s: %d triangles, %s, %s", mesh, measures.triangles, state, parts)
@@ -63,10 +56,12 @@ def log_findings(mesh: Path, measures: MeshMeasures, warnings: list[str]) -> Non
         log.warning("%s: %s", mesh, warning)
     if warnings or count > 1:
         log.info("what the scene does about that stands in its comments")
+    log.info("%s", upwards(measures))
+    return draft(source, scene.stem, measures)
 
 
 def beside(mesh: Path, scene: Path) -> str:
-    """Return the path of a mesh from the folder of its scene. Raises InputError for one elsewhere."""
+    """Return the path of a mesh from its scene's folder. Raises InputError for one elsewhere."""
     folder = scene.parent
     if not mesh.exists():
         locate(str(mesh), Path())  # says what it is not

@@ -5,20 +5,19 @@ import json
 import shlex
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import closing, nullcontext, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from msmpetsc.app.checks import PICTURE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.scene.statics import STATIC
-
-if TYPE_CHECKING:
-    from msmpetsc.study.runner import Bench
-    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables
-    from msmpetsc.study.sizing.choice import Choice
+from msmpetsc.study.cases import launcher
+from msmpetsc.study.process import Processes
+from msmpetsc.study.runner import Bench
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables, lines, overrides, put_into, tables
+from msmpetsc.study.sizing.choice import Choice
+from msmpetsc.study.sizing.trials import Asked, Sizer
 
 NOTHING_MEETS = 3
 HEAD = f"{'integrator':16} {'time step [s]':>13} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
@@ -33,7 +32,10 @@ def run(args: argparse.Namespace) -> int:
     with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
         plan = size_all(args, target)
         if args.chart:
-            draw(plan, args.chart, target)
+            from msmpetsc.study.charts.pareto import plan_picture
+
+            plan_picture(plan, target, args.chart)
+            print(f"drawn: {args.chart}")
         print_size(plan, target)
         command = print_command(args, plan.choice, target) if plan.met else None
     record = {
@@ -45,25 +47,8 @@ def run(args: argparse.Namespace) -> int:
     return 0 if plan.met else NOTHING_MEETS
 
 
-@contextmanager
-def bench() -> Iterator["Bench"]:
-    """Give a bench in a folder of its own; afterwards none of its runs is left."""
-    from msmpetsc.study.process import Processes
-    from msmpetsc.study.runner import Bench
-
-    processes = Processes()
-    with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder:
-        try:
-            yield Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
-        finally:
-            processes.stop()
-
-
-def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> str:
-    """Print lines to paste and a command that says the same, or change the file; return the command."""
-    from msmpetsc.study.cases import launcher
-    from msmpetsc.study.sizing.answer import lines, overrides, put_into, tables
-
+def print_command(args: argparse.Namespace, choice: Choice, target: float) -> str:
+    """Print lines to paste and a command that says the same, which is returned; write them."""
     errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
     budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
     answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
@@ -77,19 +62,19 @@ def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> 
     return command
 
 
-def size_all(args: argparse.Namespace, target: float) -> "SizePlan":
-    """Make the trials, and print each when it is done."""
+def size_all(args: argparse.Namespace, target: float) -> SizePlan:
+    """Make the trials, and print each when it is done; afterwards none of their runs is left."""
     from msmpetsc.solve.presets import preset_names
-    from msmpetsc.study.sizing.trials import Asked, Sizer
 
-    with bench() as runs:
-        asked = Asked(target, args.frames, args.cells, args.ranks)
+    asked = Asked(target, args.frames, args.cells, args.ranks)
+    with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder, closing(Processes()) as processes:
+        runs = Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
         sizer = Sizer(args.scene, runs, asked, preset_names(), print_size_trial)
         print(HEAD, flush=True)
         return sizer.plan()
 
 
-def print_size_trial(trial: "SizeTrial | str") -> None:
+def print_size_trial(trial: SizeTrial | str) -> None:
     """Print one line of what was tried, or a note."""
     if isinstance(trial, str):
         print(trial, flush=True)
@@ -101,24 +86,16 @@ def print_size_trial(trial: "SizeTrial | str") -> None:
     )
 
 
-def print_size(plan: "SizePlan", target: float) -> None:
+def print_size(plan: SizePlan, target: float) -> None:
     """Print the choice with its error, the parts of that, and what bounds it."""
-    choice, budget, shares = plan.choice, plan.choice.budget, plan.choice.shares
+    choice = plan.choice
     print("\ncheapest:" if plan.met else f"\nnothing meets {target:g}; the smallest error within reach:")
     cost = f"{choice.cost:.3g} computing seconds a simulated second"
     if choice.method.integrator == STATIC:
         cost = f"{choice.cost * choice.method.time_step:.3g} computing seconds a state"
-    print(f"{cost}, surface error {budget.total:.1e}")
+    print(f"{cost}, surface error {choice.budget.total:.1e}")
     print(f"{'part':16} {'error':>9} {'of the cost':>11}")
-    for name in vars(budget):
-        print(f"{name:16} {getattr(budget, name):9.1e} {100 * getattr(shares, name):10.0f}%")
+    for name, error in vars(choice.budget).items():
+        print(f"{name:16} {error:9.1e} {100 * getattr(choice.shares, name):10.0f}%")
     for bound in plan.bounds:
         print(f"what bounds it: {bound}")
-
-
-def draw(plan: "SizePlan", path: Path, target: float) -> None:
-    """Draw the expected error of each trial over its cost, and ring the choice."""
-    from msmpetsc.study.charts.pareto import plan_picture
-
-    plan_picture(plan, target, path)
-    print(f"drawn: {path}")

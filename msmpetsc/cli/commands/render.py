@@ -7,17 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from msmpetsc.app.checks import (
-    MOVIE_NAMES,
-    PAGE_NAMES,
-    PICTURE_NAMES,
-    RESULT_NAMES,
-    SCENE_NAMES,
-    refuse_other_format,
-)
+from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES, RESULT_NAMES, SCENE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
@@ -123,12 +115,13 @@ def _draw_motion(
 
 
 def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
-    """Return what a scene or a mesh shows, with its size and its cells in words. Raises InputError."""
+    """Return what a scene or a mesh shows, with size and cells in words. Raises InputError."""
     if path.suffix.lower() not in SCENE_NAMES:
         if changes:
             raise InputError(f"--set changes a scene, and {path} is a mesh")
         surface = read_surface(path)
-        return drawable_of_surface(path, surface), (f"{_sides(surface.points)} m, {_counted(surface)}", "")
+        counts = f"{len(surface.points)} points, {len(surface.triangles)} triangles"
+        return drawable_of_surface(path, surface), (f"{_sides(surface.points)} m, {counts}", "")
     from mpi4py import MPI
 
     from msmpetsc.build import build_model  # compiled kernels, which drawing a result needs not
@@ -144,10 +137,6 @@ def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[st
 def _sides(points: np.ndarray) -> str:
     """Return "0.3 x 0.2325 x 0.2974" of the box around points (v, 3)."""
     return " x ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
-
-
-def _counted(surface: Surface) -> str:
-    return f"{len(surface.points)} points, {len(surface.triangles)} triangles"
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -5,19 +5,26 @@ from pathlib import Path
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
+from msmpetsc.study.cases import shown_command
+from msmpetsc.study.metrics import counted
+from msmpetsc.study.runner import StudyPart, list_study, run_study
+from msmpetsc.study.table import as_table, failed, mapped, swept, timed
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; return the exit status."""
     part = part_of(args.part)
     from msmpetsc.solve.presets import preset_names
-    from msmpetsc.study.runner import run_study
 
     folder = args.output or Path("out") / args.study.stem
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
-        print_cases(args.study, folder, args.full)
+        listed = list_study(args.study, folder, preset_names(), args.full)
+        for number, (case, done) in enumerate(listed, 1):  # the I of --part I/N, where N is the number of cases
+            state = "done" if done else "open"
+            print(f"{number:4} {state}  {case.scene}: {case.label}  {shown_command(case)}")
+        print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
         return 0
     rows = run_study(
         args.study, folder, preset_names(), full=args.full, jobs=args.jobs, restart=args.restart, part=part
@@ -32,10 +39,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def part_of(text: str | None):
+def part_of(text: str | None) -> StudyPart | None:
     """Return "3/16" as the third of 16 parts. Raises InputError."""
-    from msmpetsc.study.runner import StudyPart
-
     if text is None:
         return None
     index, _, count = text.partition("/")
@@ -45,23 +50,8 @@ def part_of(text: str | None):
     return StudyPart(int(index), int(count))
 
 
-def print_cases(study: Path, folder: Path, full: bool) -> None:
-    """Print a line a case; its number is the I of --part I/N, where N is the number of cases."""
-    from msmpetsc.solve.presets import preset_names
-    from msmpetsc.study.cases import shown_command
-    from msmpetsc.study.runner import list_study
-
-    listed = list_study(study, folder, preset_names(), full)
-    for number, (case, done) in enumerate(listed, 1):
-        print(f"{number:4} {'done' if done else 'open'}  {case.scene}: {case.label}  {shown_command(case)}")
-    print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
-
-
 def log_failures(rows: list[dict]) -> None:
     """Log what deserves a look: cases that failed; and of each map how it went, for there failing is an answer."""
-    from msmpetsc.study.metrics import counted
-    from msmpetsc.study.table import as_table, failed, mapped, swept, timed
-
     table = as_table(rows)
     lost = len(failed(swept(table)))
     if lost:

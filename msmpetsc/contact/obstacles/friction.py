@@ -59,7 +59,7 @@ class Friction:
         return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add the friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
+        """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
         u, length = self.slip(q)
         gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
 
@@ -115,7 +115,7 @@ def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: floa
     pressed : of the nodes, the rows (a,) inside, how deep (a,) [m] and the normals (a, 3) there
     impulse : mu k dt [kg/s], times the depth the impulse
     """
-    v, per_mass = nodes.v, nodes.per_mass
+    v = nodes.v
     moves = np.zeros(len(v), bool, like=v)
     moves[nodes.rows] = True
     rows, depth, normal = pressed
@@ -124,4 +124,4 @@ def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: floa
     slip = v[rows] - carried
     slip -= (slip * normal).sum(axis=1)[:, None] * normal
     speed = np.maximum(np.linalg.norm(slip, axis=1), TINY)
-    v[rows] -= np.minimum(1.0, impulse * depth * per_mass[rows] / speed)[:, None] * slip
+    v[rows] -= np.minimum(1.0, impulse * depth * nodes.per_mass[rows] / speed)[:, None] * slip

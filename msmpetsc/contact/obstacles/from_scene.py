@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.backend.arrays import Floats, Rows
 from msmpetsc.comm import log, on_root, together
 from msmpetsc.constraints.loads import Motion
 from msmpetsc.contact.obstacles.distance import DistanceSolid, FunctionSolid
@@ -36,7 +36,13 @@ def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Flo
         path, solid = Motion.through(table.path), _solid(comm, table, key, scene.folder)
         if isinstance(solid, FunctionSolid):
             with together(comm):
-                _check_is_distance(solid, lattice.nodes[: lattice.owned])
+                length = 1.0  # of the gradients at most nodes, as a distance's are
+                if lattice.owned:
+                    _, gradient = solid.distances(lattice.nodes[: lattice.owned])
+                    length = float(np.median(np.linalg.norm(gradient, axis=1)))
+                if abs(length - 1) > MOST_OFF:
+                    wrong = f"its gradient is {length:.3g} long at most nodes, not 1"
+                    raise InputError(f"{key}.function: no signed distance: {wrong}")
         obstacles.append(Obstacle(solid, path, table.start, table.stop, key, outside))
     return obstacles
 
@@ -84,15 +90,3 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path) -> Soli
     if table.center is not None:
         return BallSolid(np.array(table.center), table.radius or 0.0)
     return Faces(np.array([table.point]), np.array([table.normal]))
-
-
-def _check_is_distance(solid: FunctionSolid, points: Positions) -> None:
-    """Raise InputError unless the gradients at most of the points (n, 3) [m] are of length 1, as a distance's are."""
-    if not len(points):
-        return
-    _, gradient = solid.distances(points)
-    length = float(np.median(np.linalg.norm(gradient, axis=1)))
-    if abs(length - 1) > MOST_OFF:
-        raise InputError(
-            f"{solid.key}.function: no signed distance: its gradient is {length:.3g} long at most nodes, not 1"
-        )

@@ -46,7 +46,7 @@ class Obstacle(Timed):
         return depths if self.outside is None else depths - self.outside[: len(q)], face
 
     def normals_at(self, q: Positions, time: float, face: Indices) -> Rows:
-        """Return the unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within, at a time [s]."""
+        """Return unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within, at a time [s]."""
         return self.solid.normals(self.seen_from(q, time), face)
 
     def sides(

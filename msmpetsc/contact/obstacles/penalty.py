@@ -12,16 +12,13 @@ also beyond the far face: a plate that a node passes within a step pushes it bac
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.contact.obstacles.friction import Friction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-
-if TYPE_CHECKING:
-    from msmpetsc.contact.surface.term import SurfaceContact
+from msmpetsc.contact.surface.term import SurfaceContact
 
 Secants = list[Mask | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
@@ -40,21 +37,16 @@ class Penalty:
     restitution: float | None = None
 
     def state_at(self, time: float, sides: Indices | None = None) -> "ContactState":
-        """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
+        """Return the obstacle at a time [s] without friction; ``sides`` (owned or more,) of nodes."""
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
     def during(
-        self,
-        q: Positions,
-        time: float,
-        time_step: float,
-        sides: Indices | None = None,
-        before: Positions | None = None,
+        self, q: Positions, time: float, time_step: float, sides: Indices | None = None, last: Positions | None = None
     ) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m].
 
-        before : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
-            that it ends with, under the push that is to be expected then
+        last : (owned or more, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the
+            velocity that it ends with, under the push that is to be expected then
         """
         state = self.state_at(time, sides)
         if self.friction == 0:
@@ -63,20 +55,12 @@ class Penalty:
         nodes, depth, normal = self.state_at(start, sides).pressed(q)
         way, stick = like(q, path.displacement_between(start, time)), self.stick * time_step
         carried = q[nodes] + way
-        if before is not None:
-            carried += (q[nodes] - before[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
+        if last is not None:
+            carried += (q[nodes] - last[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
             stick *= 2 / 3
-            depth = self._depth_to_come(2 * q - before, time, sides, nodes, depth)
+            coming, _ = self.obstacle.depths(2 * q - last[: len(q)], time, sides)
+            depth = np.clip(coming[nodes], 0, 2 * depth)  # what just came in tells little
         return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
-
-    def _depth_to_come(self, q: Positions, time: float, sides: Indices | None, nodes: Indices, depth: Floats) -> Floats:
-        """Return how deep ``nodes`` (a,) will be that go straight on to q (owned, 3) [m], (a,) [m].
-
-        Not less than nothing and not more than twice their ``depth`` (a,) now: of what has just
-        come in the way there says nothing of how far it goes.
-        """
-        coming, _ = self.obstacle.depths(q, time, sides)
-        return np.clip(coming[nodes], 0, 2 * depth)
 
 
 @dataclass(frozen=True)
@@ -132,7 +116,7 @@ class Contact:
     surface : self-contact, if the scene has it; all that asks it is collective
     """
 
-    def __init__(self, states: list[ContactState], owned: int, surface: "SurfaceContact | None" = None):
+    def __init__(self, states: list[ContactState], owned: int, surface: SurfaceContact | None = None):
         self.states, self.owned, self.surface = states, owned, surface
 
     def energy(self, q: Positions) -> float:

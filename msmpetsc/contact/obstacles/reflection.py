@@ -19,8 +19,8 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 @dataclass(frozen=True)
 class StepTaken:
-    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in contact
-    (Obstacle.sides), of several obstacles (o, n); None: by none."""
+    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in
+    contact (Obstacle.sides), of several obstacles (o, n); None: by none."""
 
     time: float
     length: float

@@ -40,21 +40,13 @@ def collision_surface(
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
     sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)
     distance = table.distance or max(NEAR * float(np.linalg.norm(sides)), comm.bcast(off))
-    stiffness = _stiffness(comm, lattice, distance, scene.time.step)
-    law = BarrierLaw(distance, stiffness, table.friction, STICK * float(sides.max()))
-    return CollisionSurface(joined(surfaces), SurfacePoints(comm, lattice, embedding), law)
-
-
-def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: float) -> float:
-    """Return kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells,
-    E / h, and what its inertia adds in a step, rho h / t^2.
-
-    Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness) takes both of each contact; with those of
-    the stiffest cell it is the same at all times, and so is the energy of a given state.
-    """
+    # kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells, E / h, and what its
+    # inertia adds in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness)
+    # takes both of each contact; with those of the stiffest cell it, and the energy of a state, is always the same.
     mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
-    layer = (PER_EDGE * lattice.stiffest(comm) + mass / time_step**2) / lattice.cell_size**2
-    return float(distance**2 * layer)
+    layer = (PER_EDGE * lattice.stiffest(comm) + mass / scene.time.step**2) / lattice.cell_size**2
+    law = BarrierLaw(distance, float(distance**2 * layer), table.friction, STICK * float(sides.max()))
+    return CollisionSurface(joined(surfaces), SurfacePoints(comm, lattice, embedding), law)
 
 
 def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float]:

@@ -29,7 +29,8 @@ def neighbours(
 ) -> Mapping[tuple[int, int], bool]:
     """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than
     ``distance`` [m] at rest."""
-    pairs = [_cross_pairs(kind, mesh, points, distance, split) for kind, split in _kinds(candidates)]
+    kinds = (candidates.fv_candidates, 1), (candidates.ee_candidates, 2)
+    pairs = [_cross_pairs(kind, mesh, points, distance, split) for kind, split in kinds]
     groups = np.concatenate([np.empty((0, 4, 2), np.int64), *pairs])
     if len(groups) == 0:
         return {}
@@ -42,11 +43,6 @@ def neighbours(
     near = np.asarray(within.tocsr()[first, second]).reshape(-1, 4) > 0
     local = np.sort(groups[near.any(axis=1)].reshape(-1, 2), axis=1)
     return {(int(i), int(j)): False for i, j in np.unique(local, axis=0) if i < j}
-
-
-def _kinds(candidates: "ipctk.Candidates") -> list[tuple[list[Any], int]]:
-    """Return the pairs of a point and a triangle and those of two edges, and of how many points the first part is."""
-    return [(candidates.fv_candidates, 1), (candidates.ee_candidates, 2)]
 
 
 def _cross_pairs(kind: list[Any], mesh: Any, points: Positions, distance: float, split: int) -> Indices:
@@ -95,17 +91,12 @@ def _left_out(
         return []
     ends = np.array(list(apart)).T
     met = coo_array((np.ones(2 * ends.shape[1]), np.hstack([ends, ends[::-1]])), shape=(points, points)).tocsr()
-    faces, edges = (_corners(part, points) for part in (mesh.faces, mesh.edges))
+    corners = []  # (k, points): which of the points are corners of triangles, and of edges
+    for part in (mesh.faces, mesh.edges):
+        rows = np.repeat(np.arange(len(part)), part.shape[1])
+        corners.append(coo_array((np.ones(part.size), (rows, part.ravel())), shape=(len(part), points)).tocsr())
+    faces, edges = corners
     of_point, of_edge = (faces @ met).tocoo(), (edges @ met @ edges.T).tocoo()
     all_three, all_four = of_point.data == 3, (of_edge.data == 4) & (of_edge.row < of_edge.col)
-    face_points = zip(of_point.row[all_three].tolist(), of_point.col[all_three].tolist(), strict=True)
-    edge_edges = zip(of_edge.row[all_four].tolist(), of_edge.col[all_four].tolist(), strict=True)
-    return [ipctk.FaceVertexCandidate(*pair) for pair in face_points] + [
-        ipctk.EdgeEdgeCandidate(*pair) for pair in edge_edges
-    ]
-
-
-def _corners(parts: Indices, points: int) -> coo_array:
-    """Return which of the points are corners of parts (k, c), (k, points)."""
-    rows = np.repeat(np.arange(len(parts)), parts.shape[1])
-    return coo_array((np.ones(parts.size), (rows, parts.ravel())), shape=(len(parts), points)).tocsr()
+    of_points = map(ipctk.FaceVertexCandidate, of_point.row[all_three].tolist(), of_point.col[all_three].tolist())
+    return [*of_points, *map(ipctk.EdgeEdgeCandidate, of_edge.row[all_four].tolist(), of_edge.col[all_four].tolist())]

@@ -9,11 +9,10 @@ are known for as long as it lasts (``Contacts``).
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs
 from msmpetsc.contact.surface.creases import NEAREST
@@ -133,17 +132,14 @@ class NearPairs:
         return self._newest
 
     def moved(self, q: Positions, pairs: Pairs) -> float:
-        """Return no less than how far any point at q is from where the pairs were looked for [m]."""
+        """Return no less than how far points at q are from where the pairs were looked for [m]."""
         return self._farthest(q, pairs.q)
 
     def _farthest(self, end: Positions, start: Positions) -> float:
         """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
-        ends = np.full(6, -np.inf)
-        _extend(end[: self.owned], start, ends)
-        if self.comm.size > 1:
-            most = np.empty_like(ends)
-            self.comm.Allreduce(ends, most, MPI.MAX)
-            ends = most
+        moved = end[: self.owned] - start[: self.owned]
+        ends = np.concatenate([np.fmax.reduce(moved, initial=-np.inf), -np.fmin.reduce(moved, initial=np.inf)])
+        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)  # the greatest along the axes and against them
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
@@ -171,7 +167,7 @@ class Contacts:
         if bound < pairs.clear:
             return ContactsAt(q)
         for moment in self._moments:
-            if self._is_same(q, moment.q):
+            if self.comm.allreduce(bool(np.array_equal(q, moment.q)), MPI.LAND):
                 return moment
         points = self.points(q)
         near = self._pairs_near(q, points, pairs, bound)
@@ -204,22 +200,14 @@ class Contacts:
         near = self.comm.allreduce(aside, MPI.MAX) <= ASIDE * self.law.distance / np.sqrt(3)
         return share if near and -ASIDE < share < 1 + ASIDE else None
 
-    def _is_same(self, a: Positions, b: Positions) -> bool:
-        same = bool(np.array_equal(a, b))
-        return self.comm.allreduce(same, MPI.LAND) if self.comm.size > 1 else same
-
     def _serve(self, pairs: Pairs, points: Positions) -> bool:
-        """Return whether points S (p, 3) are within the pairs' reach, by what these themselves moved."""
+        """Return whether points S (p, 3) are within the pairs' reach, by their own moves."""
         serve = True
         if self.barrier:
             moved = points - pairs.points
             moved -= 0.5 * (moved.max(axis=0) + moved.min(axis=0))
             serve = bool((moved**2).sum(axis=1).max() <= pairs.reach**2)
         return bool(self.comm.bcast(serve))
-
-    def with_points(self, moment: ContactsAt) -> ContactsAt:
-        """Return the same with the points, which friction asks for."""
-        return ContactsAt(moment.q, moment.count, self.points(moment.q), moment.contacts)
 
     def touch(self, q: Positions) -> Touch:
         """Return what there is of contacts at q."""
@@ -256,15 +244,6 @@ class Contacts:
         square = self.comm.allreduce(float(np.vdot(way, way)))
         self._ways = [Way(q.copy(), way, square, sweep), *self._ways[: REMEMBERED - 1]]
         return share
-
-
-@numba.njit(cache=True)
-def _extend(end: Positions, start: Positions, ends: Floats) -> None:
-    """Extend the greatest displacements along the axes and against them, ends (6,)."""
-    for i in range(len(end)):
-        for c in range(3):
-            moved = end[i, c] - start[i, c]
-            ends[c], ends[3 + c] = max(ends[c], moved), max(ends[3 + c], -moved)
 
 
 def _barrier(surface: Surface, law: BarrierLaw) -> Barrier:

@@ -34,11 +34,11 @@ class SurfacePoints:
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: Embedding):
         counts = comm.allgather(embedding.points)
         self.comm, self.total = comm, sum(counts)
-        first, per_point = sum(counts[: comm.rank]), np.diff(embedding.indptr)
         sizes = np.add.reduceat(np.abs(embedding.weights), embedding.indptr[:-1]) if embedding.points else np.zeros(1)
         self.spread = comm.allreduce(float(sizes.max()), MPI.MAX)
         to_owner = Route(comm, lattice.table.owner_of_index(embedding.indices))
-        points = to_owner.send(first + np.repeat(np.arange(embedding.points), per_point))
+        numbers = sum(counts[: comm.rank]) + np.arange(embedding.points)
+        points = to_owner.send(np.repeat(numbers, np.diff(embedding.indptr)))
         nodes = to_owner.send(embedding.indices) - lattice.table.first
         self.rows, row = np.unique(points, return_inverse=True)
         shape = (len(self.rows), lattice.owned)

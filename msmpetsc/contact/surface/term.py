@@ -4,7 +4,7 @@ Rank 0 computes what is of points; ranks send it what their nodes make of S = W 
 not zero. The Hessian is never formed on nodes: W^T (H_c (W v)) over the points in contact takes a hundredth of that.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,14 +33,11 @@ class SurfaceHessian:
     points: csr_array
 
     def add_product(self, v: Rows, product: Rows) -> None:
-        """Add the Hessian times v (owned or more, 3) to the owned rows of ``product`` (collective)."""
+        """Add the Hessian times v (owned or more, 3) to owned rows of ``product`` (collective)."""
         at, weights = self.carried
         moved = np.zeros((self.points.shape[0] // 3, 3))
         moved[at] = weights @ v[: weights.shape[1]]
-        if self.comm.size > 1:
-            total = np.empty_like(moved)
-            self.comm.Allreduce(moved, total)
-            moved = total
+        self.comm.Allreduce(MPI.IN_PLACE, moved)
         forces = (self.points @ moved.ravel()).reshape(-1, 3)
         product[: weights.shape[1]] += weights.T @ forces[at]
 
@@ -65,26 +62,24 @@ class SurfaceContact:
     friction : of the step, on rank 0
     """
 
-    def __init__(self, contacts: Contacts, start: Positions | None = None, time_step: float = 0.0):
-        """Without a ``start`` of the step there is no friction."""
+    def __init__(self, contacts: Contacts, start: Positions, time_step: float):
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
         self.friction: SurfaceFriction | None = None
         self._hessians: dict[bool, tuple[ContactsAt, SurfaceHessian]] = {}  # with and without their negative parts
-        if start is not None and contacts.law.friction > 0:
-            self._start_friction(contacts.find(start), contacts.law.stick * time_step)
-
-    def _start_friction(self, moment: ContactsAt, stick: float) -> None:
-        self.rubs, barrier = moment.count > 0, self.contacts.barrier
-        if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
-            self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
+        if contacts.law.friction > 0:
+            moment, barrier = contacts.find(start), contacts.barrier
+            self.rubs = moment.count > 0
+            if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
+                stick = contacts.law.stick * time_step
+                self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
 
     def _acting(self, q: Positions) -> ContactsAt | None:
-        """Return the contacts at q, with the points where there is friction; None where nothing acts."""
+        """Return the contacts at q, with the points for friction; None where nothing acts."""
         moment = self.contacts.find(q)
         if moment.count == 0 and not self.rubs:
             return None
-        return moment if moment.points is not None else self.contacts.with_points(moment)
+        return moment if moment.points is not None else replace(moment, points=self.contacts.points(moment.q))
 
     def presses(self, q: Positions) -> bool:
         """Return whether it acts at q."""
@@ -100,19 +95,13 @@ class SurfaceContact:
             return 0.0
         moved = self.contacts.points(q - base)
         if moved.size and np.abs(moved).max() < SMALL * self.contacts.law.distance:
-            return sum(0.5 * self._work(moment, moved) for moment in (before, after))
+            forces = filter(None, (self._forces(moment) for moment in (before, after) if moment))  # on rank 0
+            return sum(0.5 * float(np.vdot(gradient, moved[touched])) for touched, gradient in forces)
         return self._energy(after) - self._energy(before)
 
-    def _work(self, moment: ContactsAt | None, moved: Rows) -> float:
-        """Return the gradient times a move of the points (p, 3) [m], on rank 0 [J]."""
-        forces = self._forces(moment) if moment else None
-        if forces is None:
-            return 0.0
-        touched, gradient = forces
-        return float(np.vdot(gradient, moved[touched]))
-
     def _energy(self, moment: ContactsAt | None) -> float:
-        barrier, energy = self.contacts.barrier, 0.0
+        barrier = self.contacts.barrier
+        energy = 0.0
         if moment is None or barrier is None or moment.points is None:
             return 0.0
         if moment.contacts is not None:
@@ -129,7 +118,7 @@ class SurfaceContact:
         gradient[: weights.shape[1]] += weights.T @ forces[at]
 
     def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
-        """Return on rank 0 the points (k,) that anything pushes, and the gradient there (k, 3) [N]."""
+        """Return on rank 0 the points (k,) that are pushed, and the gradient there (k, 3) [N]."""
         barrier = self.contacts.barrier
         if barrier is None or moment.points is None:
             return None
@@ -182,14 +171,7 @@ class SurfaceContact:
     def bound(self, q: Positions) -> Floats:
         """Return (owned,) [N/m] no less than each block of the projected Hessian: powers of 4, which change seldom."""
         hessian = self.hessian(q, True)
-        return np.zeros(self.contacts.owned) if hessian is None else block_bound(hessian.blocks)
-
-    def free_share(self, q: Positions, end: Positions) -> float:
-        """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
-        return self.contacts.free_share(q, end)
-
-
-def block_bound(blocks: Rows) -> Floats:
-    """Return (n,) no less than each block (n, 9): powers of 4, which change seldom."""
-    norms = np.abs(blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
-    return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)
+        if hessian is None:
+            return np.zeros(self.contacts.owned)
+        norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
+        return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)

@@ -37,7 +37,7 @@ from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
-from msmpetsc.solve.linear.ghosted import Ghosted
+from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
@@ -61,10 +61,10 @@ METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order
 
 
 class NeighbourMean:
-    """Means over a node and all that springs join it to, ``SWEEPS`` times. All methods are collective."""
+    """Means over a node and its neighbours by springs, ``SWEEPS`` times. All methods are collective."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        self.owned, self.field = lattice.owned, Ghosted(comm, lattice)
+        self.comm, self.lattice = comm, lattice
         ends, nodes = to_host(lattice.springs), np.arange(len(lattice.nodes))
         rows, columns = np.r_[ends[:, 0], ends[:, 1], nodes], np.r_[ends[:, 1], ends[:, 0], nodes]
         own = rows < lattice.owned  # all springs at them are known here
@@ -74,14 +74,10 @@ class NeighbourMean:
 
     def __call__(self, vectors: Rows) -> Rows:
         """Return the means of vectors (owned, 3)."""
+        means = to_host(vectors)
         for _ in range(SWEEPS):
-            self.field.values[: self.owned] = vectors
-            self.field.update()
-            vectors = like(vectors, self.weights @ to_host(self.field.values))
-        return vectors
-
-    def destroy(self) -> None:
-        self.field.destroy()
+            means = self.weights @ with_ghosts(self.comm, self.lattice, means)
+        return like(vectors, means)
 
 
 def refuse_bad_steps(time: Time) -> None:
@@ -94,13 +90,6 @@ def refuse_bad_steps(time: Time) -> None:
         raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
     if not (time.shortest or time.step) <= time.step <= (time.longest or time.step):
         raise InputError(f"time.step = {time.step:g} s must lie between time.shortest and time.longest")
-
-
-def levels_of(time: Time) -> tuple[int, int]:
-    """The lowest and the highest level of a scene's steps."""
-    lowest = LOWEST if time.shortest is None else math.ceil(math.log2(time.shortest / time.step) - 1e-9)
-    highest = HIGHEST if time.longest is None else math.floor(math.log2(time.longest / time.step) + 1e-9)
-    return max(lowest, -40), min(highest, 40)
 
 
 def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
@@ -132,7 +121,14 @@ class Adaptive(Integrator):
         self.lattice, self.environment = balance.lattice, balance.environment
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
         self.order, self.local_error = METHODS[scene.time.integrator]
-        self.levels, steps = levels_of(scene.time), scene.time.steps
+        steps = scene.time.steps
+        lowest = LOWEST
+        if scene.time.shortest is not None:
+            lowest = math.ceil(math.log2(scene.time.shortest / scene.time.step) - 1e-9)
+        highest = HIGHEST
+        if scene.time.longest is not None:
+            highest = math.floor(math.log2(scene.time.longest / scene.time.step) + 1e-9)
+        self.levels = max(lowest, -40), min(highest, 40)  # of its steps
         self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.mean = NeighbourMean(self.comm, self.lattice)
@@ -197,7 +193,10 @@ class Adaptive(Integrator):
         restarts = self.ticks.is_event(self.tick)
         cost = Work()
         while True:
-            level = self._next_level(state)
+            longest = self.control.level
+            if state.history is not None:  # the step needs it: no more than twice as long
+                longest = min(longest, self.last + 1)
+            level = self.ticks.fitting(self.tick, longest)
             before, end = self._begun(state, level, restarts), self._reached(self.tick + self.ticks.length(level))
             try:
                 result, after = self.balance.step(self._integrator(level), before, end, self._length(level))
@@ -214,17 +213,12 @@ class Adaptive(Integrator):
                 result = replace(result, cost=replace(cost, steps=1, step_error=result.cost.step_error))
                 return self._taken(result, before, after, level)
 
-    def _next_level(self, state: State) -> int:
-        """Of the next step: no more than twice as long as the last, whose history it needs."""
-        most = self.control.level if state.history is None else min(self.control.level, self.last + 1)
-        return self.ticks.fitting(self.tick, most)
-
     def _begun(self, state: State, level: int, restarts: bool) -> State:
-        length, v = self._length(level), state.velocity(self.time_step)
+        v = state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
             history = between(*history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last))
-        return replace(state, q_previous=state.q - length * v, history=history)
+        return replace(state, q_previous=state.q - self._length(level) * v, history=history)
 
     def _reached(self, tick: int) -> float:
         """Time of a step that ends at a tick [s]: just before what begins or ends there."""
@@ -288,6 +282,5 @@ class Adaptive(Integrator):
         log.info("the motion is some %.2g of its size off (time.error = %g)", self.control.estimate, self.control.asked)
 
     def destroy(self) -> None:
-        self.mean.destroy()
         for integrator in self.kept.values():
             integrator.destroy()

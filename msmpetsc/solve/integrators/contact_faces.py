@@ -54,12 +54,16 @@ class ContactFaces:
         return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
 
     def compare(self, x: Positions) -> None:
-        """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where they do not settle."""
+        """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
         crossed, pressing = self._crossed(x), self.environment.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1
-        self.is_settled = not self._differs(x, sides)
-        if not self.is_settled:
+        environment, differs = self.environment, False
+        if environment.has_sides and environment.penalties:  # which may press otherwise
+            alike = environment.same_push(x, self.time, self.sides, sides)
+            differs = self.comm.allreduce(not alike, MPI.LOR)
+        self.is_settled = not differs
+        if differs:
             self.sides = sides
             if self.solves == MOST_SOLVES:
                 raise StepFailed(
@@ -71,10 +75,3 @@ class ContactFaces:
         if self.environment.penalties:  # what reflects goes by the way to x alone
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
         self.sides = crossed
-
-    def _differs(self, x: Positions, sides: Indices) -> bool:
-        """Whether penalties press on any node at x otherwise with ``sides``."""
-        if not (self.environment.has_sides and self.environment.penalties):
-            return False
-        alike = self.environment.same_push(x, self.time, self.sides, sides)
-        return self.comm.allreduce(not alike, MPI.LOR)

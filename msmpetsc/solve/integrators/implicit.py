@@ -85,7 +85,7 @@ class ImplicitEuler(Integrator):
         return self.stepper.unknowns.size
 
     def set_up(self) -> None:
-        """Raises InputError for a preconditioner that this PETSc or matrix does not have (collective)."""
+        """Raises InputError for a preconditioner that PETSc or the matrix lacks (collective)."""
         self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
@@ -143,7 +143,11 @@ class ImplicitEuler(Integrator):
         assert self.problem is not None, "no step was taken"
         positions = [*(trace.positions if trace else []), result.position]
         errors = self.reference.errors(self.problem, positions)
-        return errors[-1], trace.as_lists(index, errors[:-1]) if trace else None
+        if trace is None:
+            return errors[-1], None
+        lists = {"iteration": trace.iteration, "ksp_its": trace.ksp_its, "seconds": trace.seconds}
+        of_positions, of_energies = errors[:-1].T.tolist()
+        return errors[-1], {"frame": index, **lists, "position_error": of_positions, "energy_error": of_energies}
 
     def _new_stepper(self, time: float) -> Stepper:
         """The solver while the same nodes are fixed as at ``time``: these are no unknowns."""

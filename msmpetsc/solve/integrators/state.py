@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Indices, Positions, Rows
+from msmpetsc.backend.arrays import Indices, Positions, Rows, like
 from msmpetsc.checkpoint import FINITE, Checkpoint
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.solve.linear.ghosted import with_ghosts
+from msmpetsc.solve.linear.unknowns import with_ghosts
 
 HISTORY, SIDES = ("history_q", "history_v"), "sides"
 
@@ -73,21 +73,12 @@ class State:
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
         """The state that a checkpoint holds (collective)."""
         names = ("q", "q_previous", *HISTORY) if checkpoint.number("history", 0, 0, 1) else ("q", "q_previous")
-        q, q_previous, *last = (with_ghosts(comm, lattice, checkpoint.row(name)) for name in names)
+        rows = [with_ghosts(comm, lattice, checkpoint.row(name)) for name in names]
+        q, q_previous, *last = (like(lattice.nodes, each) for each in rows)
         history = (last[0], last[1]) if last else None
-        sides = _sides(comm, lattice, checkpoint.rows[SIDES]) if SIDES in checkpoint.rows else None
+        sides = None
+        if SIDES in checkpoint.rows:
+            sides = with_ghosts(comm, lattice, checkpoint.rows[SIDES].astype(np.int8))
+            sides = like(lattice.nodes, np.ascontiguousarray(sides.T))
         numbers = {name: checkpoint.number(name, 0.0, *FINITE) for name in vars(NO_ENERGY)}
         return State(q, q_previous, history, sides, EnergyBudget(**numbers))
-
-
-def _sides(comm: MPI.Comm, lattice: Lattice, rows: Rows) -> Indices:
-    """(o, l) from the owned ones (owned, o), three at a time (collective)."""
-    count = rows.shape[1]
-    sides = np.zeros((count, len(lattice.nodes)), np.int8, like=lattice.nodes)
-    for first in range(0, count, 3):
-        three = np.zeros((lattice.owned, 3))
-        three[:, : min(3, count - first)] = rows[:, first : first + 3]
-        whole = with_ghosts(comm, lattice, three)
-        for row in range(first, min(first + 3, count)):
-            sides[row] = whole[:, row - first]
-    return sides

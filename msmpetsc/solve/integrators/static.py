@@ -28,7 +28,6 @@ from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.state import State
@@ -100,16 +99,16 @@ class LoadPath:
         self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
         self.sides = self.state.sides
         self.inverted = worst_inverted(self.comm, self.stepper.lattice, self.base)[0]
-        self.holding: Rows | None = None  # r (owned, 3) [N], once it is asked for
+        self.holding: Rows | None = None  # r (owned, 3) [N], which keeps free nodes where they are; once asked for
         self.problem: StepProblem | None = None
 
     def try_share(self, steps: LoadSteps) -> StepResult:
         """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one
         with cells turned inside out, which smaller steps may avoid."""
-        share, q = steps.share, self.known[-1][1]
-        fixed, time_step = self.stepper.lattice.pinned, self.time_step
-        if len(self.known) > 1:  # obstacles move in the first load step alone
-            time_step = 0.0
+        share = steps.share
+        q = self.known[-1][1]
+        time_step = 0.0 if len(self.known) > 1 else self.time_step  # obstacles move in the first load step alone
+        fixed = self.stepper.lattice.pinned
         faces = ContactFaces(self.comm, self.environment, q, q, self.time, time_step, self.sides, fixed)
         while not faces.is_settled:
             problem = self._problem(faces.problem(), share)
@@ -126,27 +125,23 @@ class LoadPath:
         load, prescribed = whole.load, self.target
         if share < 1:
             if self.holding is None:
-                self.holding = self._holding(whole)
+                stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
+                functional.begin(replace(whole, y=self.base, prescribed=None))
+                stepper.unknowns.from_nodes(self.base, stepper.x)
+                f = functional.evaluate(stepper.x, stepper.work).f
+                self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
+                self.holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
             load = load + (1 - share) * self.holding
             prescribed = None if prescribed is None else self.base + share * (prescribed - self.base)
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
-
-    def _holding(self, whole: StepProblem) -> Rows:
-        """The force (owned, 3) [N] that would keep the free nodes where they are."""
-        stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
-        functional.begin(replace(whole, y=self.base, prescribed=None))
-        stepper.unknowns.from_nodes(self.base, stepper.x)
-        f = functional.evaluate(stepper.x, stepper.work).f
-        holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
-        holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
-        return holding
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:
         """Positions (l, 3) [m] to start from: the last ones, or the line through the last two gone on, by their g."""
         (share_before, before), (reached, q) = self.known[0], self.known[-1]
         if reached == share_before:
             return q
-        pinned, functional = self.stepper.lattice.pinned[:, None], self.stepper.functional
+        functional = self.stepper.functional
+        pinned = self.stepper.lattice.pinned[:, None]
         ahead = q + (share - reached) / (reached - share_before) * (q - before)
         functional.begin(problem)
         values = [functional.value(np.where(pinned, problem.fixed, guess)) for guess in (q, ahead)]
@@ -167,7 +162,14 @@ class Static(ImplicitEuler):
     error = made_for = 0.0
 
     def _first_tau(self) -> float:
-        return SLENDER * transit_time(self.comm, self.environment.lattice)
+        """SLENDER times how long sound takes along the longest side of the lattice, roughly [s]."""
+        lattice = self.environment.lattice
+        low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
+        low, high = (np.array(self.comm.allgather([float(x) for x in corner])) for corner in (low, high))
+        cells = (high.max(axis=0) - low.min(axis=0)).max() / lattice.cell_size
+        sums = np.array([float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())])
+        mass, stiffness = self.comm.allreduce(sums)
+        return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
     def _new_stepper(self, time: float) -> Stepper:
         self.made_for = time
@@ -232,16 +234,6 @@ class Static(ImplicitEuler):
             yield
         finally:
             snes.setTolerances(max_it=most)
-
-
-def transit_time(comm: MPI.Comm, lattice: Lattice) -> float:
-    """How long sound takes along the longest side of a lattice, roughly [s] (collective)."""
-    low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
-    low, high = (np.array(comm.allgather([float(x) for x in corner])) for corner in (low, high))
-    cells = (high.max(axis=0) - low.min(axis=0)).max() / lattice.cell_size
-    sums = np.array([float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())])
-    mass, stiffness = comm.allreduce(sums)
-    return float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

@@ -69,14 +69,12 @@ class StepControl:
         allowed = self.allowed(level, measure)
         if level == self.lowest or measure.error <= EXCESS * allowed:
             return True
-        self.shorten(level, self._levels_down(measure.error / max(allowed, sys.float_info.min)))
+        halvings = 1
+        excess = measure.error / max(allowed, sys.float_info.min)
+        if 1 < excess < math.inf:
+            halvings = max(1, round(math.log2(excess) / (self.order + 1)))
+        self.shorten(level, halvings)
         return False
-
-    def _levels_down(self, excess: float) -> int:
-        """Halvings that bring an error down by so much; one at the least, as where it is not finite."""
-        if not 1 < excess < math.inf:
-            return 1
-        return max(1, round(math.log2(excess) / (self.order + 1)))
 
     def shorten(self, level: int, by: int = 1) -> bool:
         """Want a level lower than this one, whose step failed; whether there is any."""

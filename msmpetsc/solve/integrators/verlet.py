@@ -37,7 +37,7 @@ from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.linear.ghosted import Ghosted
+from msmpetsc.solve.linear.unknowns import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
@@ -119,7 +119,7 @@ class Verlet(Integrator):
         self.environment.begin_step(state.q, state.velocity(self.time_step), start)
         self._begin(state, start)
         pushed = self._pushed(start, time)
-        squared = pushed + (self.highest.squared or self._elastic_squared())
+        squared = pushed + (self.highest.squared or self.highest.squared_at(self.position.values))
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
             begun = self._squared_acceleration(start)
@@ -127,7 +127,7 @@ class Verlet(Integrator):
                 self._take(count, start, time)
             energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
             dt = self.time_step / count
-            after = pushed + self._elastic_squared() if energy <= self.most else np.inf
+            after = pushed + self.highest.squared_at(self.position.values) if energy <= self.most else np.inf
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
                 return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
@@ -195,9 +195,8 @@ class Verlet(Integrator):
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        result = StepResult(
-            self.known, previous, Work(iterations=count, steps=1), self.work, explicit=True, swing=swing
-        )
+        cost = Work(iterations=count, steps=1)
+        result = StepResult(self.known, previous, cost, self.work, explicit=True, swing=swing)
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:
@@ -210,7 +209,7 @@ class Verlet(Integrator):
             contact.add_gradient(self.q, self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
-        """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
+        """Change v by the forces at ``time``; obstacles move as in the substep from begin to end."""
         self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
         load, before = self.environment.load(time), None if beyond is None else self.v.copy()
@@ -231,21 +230,17 @@ class Verlet(Integrator):
         """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
         self._hold(end)
         drift(len(self.free), self.free, self.v, end - begin, self.q)
-        if self.anchors:
-            self._lead(begin, end)
+        prescribed = self.environment.prescribed(self.position.values, end)
+        if prescribed is not None:
+            anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
+            self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
+            self.q[anchored] = prescribed[anchored]
         if self.environment.strikes or self.environment.has_sides:
             self._strike(begin, end)
         self.position.update()
 
-    def _lead(self, begin: float, end: float) -> None:
-        prescribed = self.environment.prescribed(self.position.values, end)
-        anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
-        if prescribed is not None:
-            self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
-            self.q[anchored] = prescribed[anchored]
-
     def _strike(self, begin: float, end: float) -> None:
-        """Know the faces of contact. The velocity of a node that bounces off is what then led it there."""
+        """Find faces of contact; the velocity of a node that bounces off is what then led it there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
         self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)
@@ -272,11 +267,8 @@ class Verlet(Integrator):
         fall = self.environment.load(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
-        pushed = (
-            self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)[self.free]
-            * self.per_mass[self.free]
-        )
-        return self.comm.allreduce(greatest(pushed), MPI.MAX)
+        stiffness = self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)
+        return self.comm.allreduce(greatest(stiffness[self.free] * self.per_mass[self.free]), MPI.MAX)
 
     def _count(self, squared: float) -> int:
         """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""
@@ -291,9 +283,6 @@ class Verlet(Integrator):
         if not count < MOST_SUBSTEPS:
             raise StepFailed(f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler", "unstable")
         return max(1, int(np.ceil(count * (1 - 1e-12))))
-
-    def _elastic_squared(self) -> float:
-        return self.highest.squared_at(self.position.values)
 
     def destroy(self) -> None:
         for field in (self.position, self.velocity, self.highest):
@@ -325,7 +314,8 @@ class HighestMode:
         Without the negative curvature across pressed springs, which is no oscillation and has no bound.
         """
         x, owned = self.mode.values, self.lattice.owned
-        hessian, product = self.elasticity.hessian_at(q, projected=True), np.empty_like(q)
+        hessian = self.elasticity.hessian_at(q, projected=True)
+        product = np.empty_like(q)
         for _ in range(MOST_ITERATIONS):
             before = self.squared
             product[:] = 0

@@ -33,7 +33,7 @@ class Block:
 
 
 class ContactBlocks:
-    """t^2 (Hessian of contact): a 3 x 3 block for each node in contact, added to either operator below."""
+    """t^2 (Hessian of contact): a 3 x 3 block a node in contact, added to either operator below."""
 
     def __init__(self, unknowns: Unknowns, time_step: float):
         self.t2, self.unknowns = time_step**2, unknowns

@@ -14,7 +14,7 @@ DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 
 
 class Preconditioner:
-    """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
+    """Any PETSc preconditioner of A, applied to the three columns.
 
     It is this inner one that the options -pc_... set, for every preset: A is also what the true
     Hessian is preconditioned with.
@@ -34,30 +34,19 @@ class Preconditioner:
         """Make ready for positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         return self.contact is not None and self.contact.follow(contact, q)
 
-    def setFromOptions(self, _: PETSc.PC) -> None:
-        self.pc.setFromOptions()
-
-    def setUp(self, _: PETSc.PC) -> None:
-        self.pc.setUp()
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         if x.getSize() == self.matrix.getSize()[0]:  # A (x) I_3
             self.pc.apply(x, y)
             return
-        right, solution = self.blocks = self.blocks or self._create_blocks()
+        if not self.blocks:  # where the inner preconditioner works: a direct solver does on the CPU
+            memory = HOST if self.pc.getType() in DIRECT else self.memory
+            self.blocks = [Block(self.matrix, memory), Block(self.matrix, memory)]
+        right, solution = self.blocks
         values = right.values
         values[:] = like(values, self.memory.read(x))
         self.pc.matApply(right.mat, solution.mat)
         columns = self.memory.write(y)
         columns[:] = like(columns, solution.values)
-
-    def _create_blocks(self) -> list[Block]:
-        """Blocks where the inner preconditioner works: a direct solver does on the CPU."""
-        memory = HOST if self.pc.getType() in DIRECT else self.memory
-        return [Block(self.matrix, memory), Block(self.matrix, memory)]
-
-    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        self.pc.view(viewer)
 
     def destroy(self) -> None:
         for part in (*self.blocks, self.pc, *([self.contact] if self.contact else [])):

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
-from msmpetsc.backend.arrays import Array, Floats, like, to_host
+from msmpetsc.backend.arrays import Array, to_host
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
@@ -26,7 +26,9 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     row[free] = np.arange(unknowns.size)
     weight = time_step**2 * lattice.stiffness
     ends = np.concatenate([lattice.springs, lattice.springs[:, ::-1]])
-    diagonal = to_host(diagonal_of(unknowns, time_step))
+    stiffness = np.bincount(lattice.springs[:, 0], lattice.stiffness, len(row))
+    stiffness += np.bincount(lattice.springs[:, 1], lattice.stiffness, len(row))
+    diagonal = to_host(unknowns.inertia)[free] + time_step**2 * stiffness[free]
     kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
     refuse_nonzeros(comm, columns * (unknowns.size + int(kept.sum())))
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
@@ -44,18 +46,12 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     matrix.setOption(PETSc.Mat.Option.SPD, True)
     matrix.setFromOptions()
     matrix.setName("A" if columns == 1 else "A (x) I_3")
-    _check_memory(matrix, unknowns)
+    on_gpu = "cusparse" in unknowns.memory.mat_type
+    if ("cusparse" in matrix.getType()) != on_gpu:
+        computes = f"the run computes on the {'GPU' if on_gpu else 'CPU'}"
+        raise InputError(f"-{prefix}mat_type {matrix.getType()}: {computes}")
     matrix.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data))
     return matrix
-
-
-def diagonal_of(unknowns: Unknowns, time_step: float) -> Floats:
-    """Return the diagonal of A (m,), of this rank's free nodes [kg], where the lattice's arrays are."""
-    lattice, free = unknowns.lattice, to_host(unknowns.free)
-    stiffness = np.zeros(len(lattice.nodes))
-    for end in (0, 1):
-        stiffness += np.bincount(lattice.springs[:, end], lattice.stiffness, len(stiffness))
-    return like(unknowns.free, to_host(unknowns.inertia)[free] + time_step**2 * stiffness[free])
 
 
 def assembly_bytes(nodes: float | Array, springs: float | Array, nonzeros: float | Array) -> float | Array:
@@ -65,10 +61,3 @@ def assembly_bytes(nodes: float | Array, springs: float | Array, nonzeros: float
     nodes, values, the last two again, COO's two indices, then CSR's index and value.
     """
     return 8 * nodes + (8 + 4 * 4 + 2) * springs + (5 * 8 + 2 * 4 + 4 + 8) * nonzeros
-
-
-def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:
-    mat_type, on_gpu = matrix.getType(), "cusparse" in unknowns.memory.mat_type
-    if ("cusparse" in mat_type) != on_gpu:
-        prefix = matrix.getOptionsPrefix() or ""
-        raise InputError(f"-{prefix}mat_type {mat_type}: the run computes on the {'GPU' if on_gpu else 'CPU'}")

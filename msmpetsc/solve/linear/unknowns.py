@@ -1,4 +1,4 @@
-"""Which PETSc unknown is which coordinate of which node.
+"""Which PETSc unknown is which coordinate of which node; and values of nodes whose ghosts follow their owners.
 
 Pinned nodes are no unknowns. A vector of unknowns holds, on each rank, the x of its free nodes,
 then their y, then their z: so its local array is an m x 3 dense block, which a scalar m x m matrix
@@ -47,11 +47,9 @@ class Unknowns:
         refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)
         own[to_host(self.free)] = first + np.arange(self.size)
-        to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
-        asked = to_owner.send(lattice.ghosts) - lattice.table.first
-        self.numbers = np.concatenate([own, to_owner.answer(own[asked])])
+        self.numbers = with_ghosts(comm, lattice, own)
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
-        self.indices = np.concatenate([index, to_owner.answer(index[asked])])
+        self.indices = with_ghosts(comm, lattice, index)
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
@@ -102,6 +100,36 @@ class Unknowns:
         """Collective."""
         self.scatter.destroy()
         self.ghost_values.destroy()
+
+
+class Ghosted:
+    """values (l, 3): the owned nodes, then the ghosts, in the memory of two PETSc vectors."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        refuse_unknowns(lattice.table.total)
+        self.values, memory = np.zeros_like(lattice.nodes), memory_of(lattice.nodes)
+        numbers = self.values.reshape(-1)
+        self.owned = memory.over(numbers[: 3 * lattice.owned], comm)
+        self.ghosts = memory.over(numbers[3 * lattice.owned :], PETSc.COMM_SELF)
+        index = PETSc.IS().createBlock(3, lattice.ghosts.astype(PETSc.IntType), comm=comm)
+        self.scatter = PETSc.Scatter().create(self.owned, index, self.ghosts, None)
+        index.destroy()
+
+    def update(self) -> None:
+        """Bring the ghosts their owners' values (collective)."""
+        with GHOSTS:
+            self.scatter.scatter(self.owned, self.ghosts)
+
+    def destroy(self) -> None:
+        for owner in (self.scatter, self.owned, self.ghosts):
+            owner.destroy()
+
+
+def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
+    """Rows (l, ...) of local nodes from those of the owned ones, both on the host (collective)."""
+    to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
+    asked = to_owner.send(lattice.ghosts) - lattice.table.first
+    return np.concatenate([rows, to_owner.answer(rows[asked])])
 
 
 @kernel

@@ -19,8 +19,8 @@ class Chebyshev:
 
     def __init__(self) -> None:
         self.last: PETSc.Vec | None = None  # x_k - x_(k-1)
-        self.count, self.length, self.least, self.limit = 0, 0.0, float("inf"), 1.0
         self.rho = self.w = 0.0
+        self._begin(1.0)
 
     def step(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = w z - (w - 1) (x_k - x_(k-1))."""

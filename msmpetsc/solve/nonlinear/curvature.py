@@ -79,10 +79,6 @@ class Compression:
         """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
         return max(1 - self.greatest, 0.0) if self.inertia and not self.resists else 0.0
 
-    def exceeds(self, searched: "Compression") -> bool:
-        """Whether modes may have come since another compression was searched."""
-        return self.greatest > MORE * searched.greatest or self.total > MORE * searched.total
-
 
 NONE = Compression(0.0, 0.0, False)
 
@@ -114,23 +110,21 @@ class LowestCurvature:
 
     def compression(self, q: Positions) -> Compression:
         """Compression at positions q (l, 3) [m] in the functional's problem."""
-        problem, at, known = self.known
-        same = problem is self.functional.problem and bool(np.array_equal(at, q))
-        if not self.comm.allreduce(same, MPI.LAND):
-            known = self._compression(q)
-            self.known = self.functional.problem, q, known
-        return known
-
-    def _compression(self, q: Positions) -> Compression:
+        problem, (known_problem, at, known) = self.functional.problem, self.known
+        same = known_problem is problem and bool(np.array_equal(at, q))
+        if self.comm.allreduce(same, MPI.LAND):
+            return known
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
-        concavity, contact = elasticity.concavity(q)[free], functional.problem.contact
-        if contact and contact.surface:
-            concavity = concavity + contact.surface.concavity(q)[free]
+        concavity = elasticity.concavity(q)[free]
+        if functional.surface:
+            concavity = concavity + functional.surface.concavity(q)[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
         gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)
-        return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
+        known = Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
+        self.known = problem, q, known
+        return known
 
     def lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
@@ -140,8 +134,9 @@ class LowestCurvature:
         q       : positions (l, 3) [m] that H was linearised at last
         hint    : a direction that may have part in it
         """
-        found = None
-        if not (alarm or compression.resists or compression.exceeds(self.searched)):
+        found, before = None, self.searched
+        more = compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
+        if not (alarm or compression.resists or more):  # in which case modes may have come
             found = self._followed()
         if found is None:
             self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too
@@ -153,7 +148,11 @@ class LowestCurvature:
             return -np.inf, self._random(1)[0]
         self.mode, self.value = modes[0].copy(), float(values[0])
         if values[0] < 0:
-            return values[0], self._way_down(modes[: int((values <= ALIKE * values[0]).sum())])
+            # A random direction's projection on all that lead down as well: where a body may buckle to many sides, it
+            # goes the same way on any ranks, no matter which of them rounding has made the first.
+            down = modes[: int((values <= ALIKE * values[0]).sum())]
+            parts = self.comm.allreduce(to_host((down * self.functional.mass) @ self._random(1)[0]))
+            return values[0], like(down, parts / max(np.linalg.norm(parts), TINY)) @ down
         return values[0], self.mode
 
     def _followed(self) -> tuple[Floats, Rows] | None:
@@ -164,12 +163,6 @@ class LowestCurvature:
         its = self.effort.followed
         values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)
-
-    def _way_down(self, modes: Rows) -> Floats:
-        """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter
-        which of them rounding has made the first, so that it goes the same way on any ranks."""
-        direction = self.comm.allreduce(to_host((modes * self.functional.mass) @ self._random(1)[0]))
-        return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
     def _search_at_length(self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort) -> tuple[Floats, Rows]:
         """Search from something of each mode, for near a mode that is known a lower one comes up
@@ -202,7 +195,9 @@ class LowestCurvature:
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
             residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
-            residuals /= self._greatest(residuals)  # which single precision can hold
+            sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
+            self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
+            residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])  # so that float32 holds them
             w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
             blocks = [x, (w, self._of_each(self.hessian.mult, w)), *([] if last is None else [last])]
             span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
@@ -273,13 +268,6 @@ class LowestCurvature:
     def _unit(self, directions: Rows) -> Rows:
         """Directions scaled to unit length in the norm of M; those of no length stay so."""
         return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
-
-    def _greatest(self, directions: Rows) -> Rows:
-        """Greatest number (k, 1) of each of some directions (k, n)."""
-        own = np.array([greatest(np.abs(direction)) for direction in directions])
-        most = np.empty_like(own)
-        self.comm.Allreduce(own, most, MPI.MAX)
-        return like(directions, np.maximum(most, TINY)[:, None])
 
     def _lengths(self, directions: Rows) -> Floats:
         return np.sqrt(self.comm.allreduce(to_host(directions**2 @ self.functional.mass)))

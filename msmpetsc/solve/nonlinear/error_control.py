@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Positions
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
@@ -61,11 +60,6 @@ class Outcome:
         """Whether the error is below the goal, or nothing but rounding is left."""
         return self.at_rounding or self.error <= self.goal
 
-    @property
-    def is_flat(self) -> bool:
-        """Whether g falls by less than its rounding near the iterate: any move is then called a fall."""
-        return self.bound < FULL_STEP_ERROR and (self.corrected or not self.doubts)
-
 
 @dataclass(eq=False)
 class ErrorControl:
@@ -93,9 +87,9 @@ class ErrorControl:
             lowest = self.curvature.compression(iterate.q).least_curvature
             if lowest > 0 and now.bound <= now.goal * lowest:
                 return replace(now, error=now.bound / lowest)
-        return self._estimated(iterate, distance, now, now.goal)
+        return self.estimated(iterate, distance, now, now.goal)
 
-    def _estimated(self, iterate: Iterate, distance: float, now: Outcome, goal: float) -> Outcome:
+    def estimated(self, iterate: Iterate, distance: float, now: Outcome, goal: float) -> Outcome:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
         enough = EARLY * goal * distance if goal else np.inf
         length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance)
@@ -105,10 +99,6 @@ class ErrorControl:
             self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
         error = self.rounding.relative(length, self.functional.distance(iterate.q, self.estimate.correction))
         return replace(now, error=error, early=1.0, corrected=True)
-
-    def estimate_last(self, iterate: Iterate, now: Outcome) -> Outcome:
-        """Estimate the error of the iterate that a budget ends at, unless that was done."""
-        return now if now.corrected else self._estimated(iterate, self.functional.distance(iterate.q), now, 0.0)
 
     def relative_tolerance(self, now: Outcome) -> float:
         """ksp_rtol of the next linear solve: it need not gain more digits than are missing."""
@@ -125,10 +115,6 @@ class ErrorControl:
         if not has_moved and goal < CLOSEST * self.target and np.isfinite(now.error):
             return None
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
-
-    def final_error(self, error: float, at_rounding: bool, q: Positions) -> float:
-        """Relative error of the step that came to q (l, 3) [m], rounding included. Raises StepFailed."""
-        return self.rounding.added_to(error, self.functional.distance(q), at_rounding)
 
     def forget(self) -> None:
         self.ratio = FIRST_RATIO

@@ -29,7 +29,7 @@ MOST = 512
 
 
 class ErrorEstimate:
-    """Estimates |x - x*|_M of a step; of the last estimate ``correction`` is e, ``residual`` F - H e."""
+    """Estimates |x - x*|_M of a step; of the last one ``correction`` is e, ``residual`` F - H e."""
 
     def __init__(
         self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner, prefix: str

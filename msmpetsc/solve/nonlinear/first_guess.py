@@ -17,8 +17,7 @@ class FirstGuess:
 
     def __init__(self, functional: StepFunctional, extrapolate: bool):
         self.functional, self.extrapolate = functional, extrapolate
-        lattice, unknowns = functional.lattice, functional.unknowns
-        self.holds = unknowns.total < lattice.table.total  # some nodes are no unknowns
+        self.holds = functional.unknowns.total < functional.lattice.table.total  # some nodes are no unknowns
         self.corrections: list[Positions] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
 
     def best(self) -> Positions:
@@ -38,7 +37,8 @@ class FirstGuess:
         guesses = [y, flight, q + self._drift(flight - q)]
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
-        met = self.functional.starts_in_contact
+        surface = self.functional.surface
+        met = surface is not None and surface.presses(q)  # parts of it push each other
         if met:  # a free flight cut short, deep in a barrier, is far from where contact holds: q_n is mostly nearer
             guesses = [self._without_crossing(guess) for guess in guesses]
         values = [self.functional.value(self._held(guess), met) for guess in guesses]

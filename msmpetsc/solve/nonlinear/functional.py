@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest
 from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT, count_flops
@@ -122,23 +123,16 @@ class StepFunctional:
         return change, squared
 
     @property
-    def meets_itself(self) -> bool:
-        """Whether the surface meets itself in this step."""
-        return self.problem.contact is not None and self.problem.contact.surface is not None
-
-    @property
-    def starts_in_contact(self) -> bool:
-        """Whether parts of the surface push each other where the step begins (collective)."""
-        contact = self.problem.contact
-        return contact is not None and contact.surface is not None and contact.surface.presses(self.problem.q)
+    def surface(self) -> SurfaceContact | None:
+        """What keeps the surface from crossing itself in this step, if anything does."""
+        return self.problem.contact.surface if self.problem.contact else None
 
     def free_share(self, base: Positions, q: Positions) -> float:
         """Share, up to 1, of the straight way from base to q (l, 3) on which the surface does not meet itself."""
-        contact = self.problem.contact
-        if contact is None or contact.surface is None:
+        if self.surface is None:
             return 1.0
         with CONTACT:
-            return contact.surface.free_share(base, q)
+            return self.surface.contacts.free_share(base, q)
 
     def _inner(self, a: Rows, b: Rows) -> float:
         """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""

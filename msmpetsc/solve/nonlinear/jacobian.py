@@ -54,7 +54,9 @@ class Jacobian:
         context = self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)
         self.operator = self._python_matrix(context)
         of_lattice = partial(LatticePreconditioner, self.unknowns, elasticity, functional.time_step, options.prefix)
-        ratio, is_held = self._stiffness_ratio(), self.unknowns.total < self.unknowns.lattice.table.total
+        mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
+        ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
+        is_held = self.unknowns.total < self.unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
         self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio, self.unknowns.total)
         self.pmat = self._python_matrix(Preconditioned(self.preconditioner))
@@ -97,11 +99,6 @@ class Jacobian:
         stiffness = blocks[unknowns.free][:, [0, 4, 8]].sum(axis=1)
         return unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
 
-    def _stiffness_ratio(self) -> float:
-        """Return the greatest t^2 k / m of a free node (collective)."""
-        mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
-        return self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
-
     def linearise(
         self, q: Positions, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False
     ) -> None:
@@ -133,6 +130,7 @@ class FrictionKinks:
 
     contact : of the step; None where there is none
     secants : of the next Hessian; None where there is no contact
+    is_awaited : a full step comes next, from where the Hessian was taken
     """
 
     def __init__(self) -> None:
@@ -145,12 +143,8 @@ class FrictionKinks:
         self.contact, self.is_awaited = contact, False
         self.secants = contact.all_secant() if contact else None
 
-    def await_step(self) -> None:
-        """A full step comes next: the Hessian was taken where it begins."""
-        self.is_awaited = True
-
     def see(self, q: Positions, base: Positions) -> None:
-        """Look at the full step from base to q (l, 3) [m], the first that is seen since it was awaited."""
+        """Look at the full step from base to q (l, 3) [m], the first seen since it was awaited."""
         if self.is_awaited and self.contact:
             self.secants = self.contact.passes_kinks(q, base)
         self.is_awaited = False

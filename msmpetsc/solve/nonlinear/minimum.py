@@ -65,7 +65,8 @@ class Minimum:
             corrected = False
         nearer = functional.evaluate(self.nearer, self.f)
         estimate.linearise(nearer.q)
-        bent = self._bent()
+        estimate.residual.aypx(-1.0, self.f)
+        bent = functional.dual_norm(estimate.residual)  # what H at x did not know
         hint = estimate.correction if alarm else None
         value, direction = self.curvature.lowest(nearer.q, compression, alarm, hint)
         if value < 0:
@@ -75,25 +76,17 @@ class Minimum:
         if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
             return Verdict(self.rounding.relative(first + rest, functional.distance(nearer.q)))
         if corrected and estimate.missing is not None and value <= CONVEX:
-            return self.examine(x, self._estimate_closely(x), compression, alarm, enough)
+            iterate = functional.evaluate(x, self.f)
+            closely = bool(np.isfinite(estimate(iterate, functional.dual_norm(self.f), np.inf)))
+            return self.examine(x, closely, compression, alarm, enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
             return Verdict(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
         return Verdict(self._second_estimate(nearer, first, rest, enough, value))
 
-    def _estimate_closely(self, x: PETSc.Vec) -> bool:
-        """Estimate the error of x, where g is hardly convex, without an early end; whether it could be."""
-        iterate = self.functional.evaluate(x, self.f)
-        return bool(np.isfinite(self.estimate(iterate, self.functional.dual_norm(self.f), np.inf)))
-
     def _is_free(self, x: PETSc.Vec, nearer: PETSc.Vec) -> bool:
         """Whether the surface meets itself nowhere on the way from one to the other."""
         positions = self.functional.positions
-        return not self.functional.meets_itself or self.functional.free_share(positions(x), positions(nearer)) == 1.0
-
-    def _bent(self) -> float:
-        """|F(x - e) - (F - H e)|_(M^-1): what the Hessian at x did not know of F at x - e."""
-        self.estimate.residual.aypx(-1.0, self.f)
-        return self.functional.dual_norm(self.estimate.residual)
+        return self.functional.surface is None or self.functional.free_share(positions(x), positions(nearer)) == 1.0
 
     def _second_estimate(self, nearer: Iterate, first: float, bound: float, enough: float, lowest: float) -> float:
         """Estimate the error of x by both corrections, of which the first has the length ``first``.

@@ -34,7 +34,7 @@ MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says whe
 
 
 class LatticePreconditioner:
-    """The cycle (a PCPYTHON context), and how its hierarchy serves. All methods are collective.
+    """The cycle, and how its hierarchy serves. All methods are collective.
 
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
     is_first : there is none yet
@@ -58,6 +58,11 @@ class LatticePreconditioner:
     def matrix(self) -> PETSc.Mat:
         """The projected Hessian."""
         return self.multigrid.operator
+
+    @property
+    def pc(self) -> PETSc.PC:
+        """PETSc's, which has read its options when its levels are there."""
+        return self.multigrid.pc
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
@@ -105,7 +110,7 @@ class LatticePreconditioner:
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) where there is none."""
+        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) without it."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
         for nodes, added in contact.hessian(q, False) if contact else ():
@@ -113,21 +118,12 @@ class LatticePreconditioner:
         surface = contact.surface.hessian(q, True) if contact and contact.surface else None
         return blocks + surface.blocks if surface else blocks
 
-    def setFromOptions(self, _: PETSc.PC) -> None:
-        """The options are read when the levels are there."""
-
-    def setUp(self, _: PETSc.PC) -> None:
-        self.multigrid.pc.setUp()
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         with CYCLE:
             if self.translations and self.is_free:
                 self.translations.around(self.multigrid.pc, x, y)
             else:
                 self.multigrid.pc.apply(x, y)
-
-    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        self.multigrid.pc.view(viewer)
 
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""
@@ -225,15 +221,12 @@ class StepPreconditioner:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
         return self.in_use.prepare(q, contact)
 
-    def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies as wholes to where their forces balance, where linear solves would not."""
-        if self.multigrid and self.is_chosen:
-            self.multigrid.balance(q, contact, f, x)
-
     @property
-    def has_to_balance(self) -> bool:
-        """Whether ``balance`` does anything."""
-        return self.is_chosen and self.multigrid is not None and self.multigrid.translations is not None
+    def to_balance(self) -> LatticePreconditioner | None:
+        """What moves bodies as wholes to where their forces balance, which linear solves would not;
+        None where nothing has to."""
+        multigrid = self.multigrid if self.is_chosen else None
+        return multigrid if multigrid and multigrid.translations else None
 
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""
@@ -242,18 +235,19 @@ class StepPreconditioner:
         elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / rtol):
             self._choose(f"Jacobi's took {its} iterations")
 
-    def setFromOptions(self, pc: PETSc.PC) -> None:
-        self.in_use.setFromOptions(pc)
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        if not self.is_chosen:
+            self.in_use.pc.setFromOptions()
 
-    def setUp(self, pc: PETSc.PC) -> None:
-        self.in_use.setUp(pc)
+    def setUp(self, _: PETSc.PC) -> None:
+        self.in_use.pc.setUp()
 
-    def apply(self, pc: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def apply(self, _: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
         chosen = self.for_searches if self.is_searching and self.for_searches else self.in_use
-        chosen.apply(pc, x, y)
+        chosen.apply(x, y)
 
-    def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        self.in_use.view(pc, viewer)
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        self.in_use.pc.view(viewer)
 
     def forget(self) -> None:
         """Forget what earlier steps showed: a preconditioner that was chosen by its iterations is chosen anew."""

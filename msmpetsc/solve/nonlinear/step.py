@@ -18,6 +18,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import (
     DEFAULT_ERROR,
+    FULL_STEP_ERROR,
     NOT_FINITE,
     ErrorControl,
     Outcome,
@@ -30,6 +31,7 @@ from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
+from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
@@ -181,7 +183,7 @@ class Stepper:
                 verdict = self.examine(outcome)
             q = self.functional.positions(self.x)
             self.first_guess.learn(q)
-            error = self.control.final_error(verdict.error, outcome.at_rounding, q)
+            error = self.control.rounding.added_to(verdict.error, self.functional.distance(q), outcome.at_rounding)
             return StepResult(q, problem.q, replace(self.work_so_far() - before, step_error=error))
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:
@@ -189,14 +191,15 @@ class Stepper:
         self.base[:] = problem.fixed
         self.kinks.begin(problem.contact)
         self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
-        if start is None and self.jacobian.preconditioner.has_to_balance:
-            self._balance()
+        multigrid = self.jacobian.preconditioner.to_balance
+        if start is None and multigrid:
+            self._balance(multigrid)
 
-    def _balance(self) -> None:
+    def _balance(self, multigrid: LatticePreconditioner) -> None:
         """Move bodies as wholes to where their forces balance, as far as they do not meet."""
         iterate = self._evaluate(self.x)
-        self.jacobian.preconditioner.balance(iterate.q, self.functional.problem.contact, iterate.f, self.x)
-        if not self.functional.meets_itself:
+        multigrid.balance(iterate.q, self.functional.problem.contact, iterate.f, self.x)
+        if self.functional.surface is None:
             return
         balanced = self.functional.positions(self.x)
         share = self.functional.free_share(iterate.q, balanced)
@@ -212,9 +215,9 @@ class Stepper:
 
     def work_so_far(self) -> Work:
         """Work of all steps so far, of their estimates and searches for negative curvature."""
-        estimate, curvature, jacobian = self.control.estimate, self.minimum.curvature, self.jacobian
-        ksp_its = total_iterations(self.ksp) + total_iterations(estimate.ksp) + curvature.its
-        products = jacobian.hessian.products + jacobian.preconditioner.products
+        of_estimates = total_iterations(self.control.estimate.ksp)
+        ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.its
+        products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
         return Work(iterations=self.iterations, ksp_its=ksp_its, products=products)
 
     def solve_once(self, outcome: Outcome) -> Outcome:
@@ -228,7 +231,10 @@ class Stepper:
         if self._is_solved():
             return self.outcome
         self.projected = self.preset.projected > 0
-        self._forget_pairs()
+        if self.snes.getType() == PETSc.SNES.Type.QN:  # alone it keeps what it has learnt; set anew it has nothing
+            self.snes.setType(PETSc.SNES.Type.KSPONLY)
+            self.snes.setType(PETSc.SNES.Type.QN)
+            self.snes.setFromOptions()
         climbs = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         iterations, most = self._run_snes(), self.snes.getTolerances()[3]
         while self.preset.true_hessian and self.snes.reason == climbs and iterations < most:
@@ -269,7 +275,7 @@ class Stepper:
         return doubted
 
     def _is_solved(self) -> bool:
-        """Whether the first guess will do: an NPC would solve with A before SNES looks at its start."""
+        """Whether the first guess will do: an NPC solves with A before SNES looks at its start."""
         if not self.has_npc:
             return False
         iterate = self._evaluate(self.x)
@@ -280,13 +286,6 @@ class Stepper:
         elif self.observer:
             self.observer(iterate.q)
         return solved
-
-    def _forget_pairs(self) -> None:
-        """SNESQN alone keeps what it has learnt, its pairs of the last step; a type set anew has none."""
-        if self.snes.getType() == PETSc.SNES.Type.QN:
-            self.snes.setType(PETSc.SNES.Type.KSPONLY)
-            self.snes.setType(PETSc.SNES.Type.QN)
-            self.snes.setFromOptions()
 
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
         with LOCAL:
@@ -308,11 +307,13 @@ class Stepper:
             q = self.functional.positions(x)
             self.kinks.see(q, self.base)
             change, distance = self.functional.change(q, self.base)
-        return -1.0 if self.outcome.is_flat and distance > 0 else change
+        outcome = self.outcome
+        is_flat = outcome.bound < FULL_STEP_ERROR and (outcome.corrected or not outcome.doubts)
+        return -1.0 if is_flat and distance > 0 else change
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Shorten the way from x to x - y, which a line search is to try, where the surface would meet itself on it."""
-        if not self.functional.meets_itself:
+        if self.functional.surface is None:
             return False
         with LOCAL:
             end = x.copy()
@@ -334,21 +335,17 @@ class Stepper:
             self.jacobian.linearise(
                 self.base, self.functional.problem.contact, self.projected, self.kinks.secants, known
             )
-            self.kinks.await_step()
+            self.kinks.is_awaited = True
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
-        if self.preset.start_from_b:
-            self._start_from_b(snes, x)
-
-    def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:
-        """CG solves A z = F for z = x - x_new; x_new = b = A x - F (Algorithm 1) is z = x - A x + F."""
-        z, f = snes.getSolutionUpdate(), snes.getFunction()[0]
-        self.jacobian.operator.mult(x, z)
-        z.aypx(-1.0, x)
-        z.axpy(1.0, f)
+        if self.preset.start_from_b:  # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
+            z = snes.getSolutionUpdate()
+            self.jacobian.operator.mult(x, z)
+            z.aypx(-1.0, x)
+            z.axpy(1.0, snes.getFunction()[0])
 
     def _start_from_estimate(self, snes: PETSc.SNES, known: bool) -> None:
-        """CG goes on from what the estimate at this x, if there was one, has of the same correction."""
+        """CG goes on from what an estimate at this x, if any, has of the same correction."""
         if self.options.is_given("ksp_initial_guess_nonzero"):
             return
         known = known and self.ksp.getType() != PETSc.KSP.Type.PREONLY  # that starts from nothing
@@ -357,7 +354,7 @@ class Stepper:
         self.ksp.setInitialGuessNonzero(known)
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
-        """Whether SNES is done (its convergence test): by the error of its iterate, or by the budget."""
+        """Whether SNES is done (its convergence test), by its iterate's error or by the budget."""
         reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
@@ -375,7 +372,8 @@ class Stepper:
                 return reasons.CONVERGED_FNORM_ABS
             return reasons.CONVERGED_SNORM_RELATIVE if outcome.corrected else reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
-            self.outcome = self.control.estimate_last(iterate, outcome)
+            if not outcome.corrected:
+                self.outcome = self.control.estimated(iterate, self.functional.distance(iterate.q), outcome, 0.0)
             return reasons.CONVERGED_ITS
         self._adapt()
         return reasons.ITERATING
@@ -393,7 +391,7 @@ class Stepper:
             self.ksp.setTolerances(rtol=self.control.relative_tolerance(self.outcome))
 
     def _abandon(self) -> None:
-        """Keep PETSc's objects for ever: after an error within it they may crash when they are destroyed."""
+        """Keep PETSc's objects for ever: after an error they may crash when they are destroyed."""
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
         self.owned = ExitStack()
 

@@ -58,7 +58,7 @@ def what_is_missing() -> str | None:
 
 
 def _mpi_knows_gpus() -> bool:
-    """Whether MPI takes pointers to a GPU's memory, as Open MPI or MPICH tell; not if neither is asked."""
+    """Whether MPI takes pointers to a GPU's memory, as Open MPI or MPICH tell; not of others."""
     library, answer = petsc_library(), ctypes.c_int(0)
     if hasattr(library, "MPIX_Query_cuda_support"):
         return bool(library.MPIX_Query_cuda_support())

@@ -33,7 +33,7 @@ count_flops = PETSc.Log.logFlops
 
 
 def begun(stage: PETSc.Log.Stage) -> ExitStack:
-    """Begin a stage, which ends when the stack is closed, and which -log_view shows from then on."""
+    """Begin a stage, which ends when the stack is closed; -log_view shows it from then on."""
     stage.visible = True
     stack = ExitStack()
     stack.enter_context(stage)

@@ -41,7 +41,9 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
         except RuntimeError as error:  # PETSc.Error, which has no name before PETSc is there
             failed = error
     if failed is not None:
-        raise InputError(f"PETSc cannot start with its options: {_message(text[0]) or failed}")
+        told = text[0].partition("PETSC ERROR: See ")[0]  # before where to find help
+        lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", told, re.MULTILINE) or [str(failed)]
+        raise InputError(f"PETSc cannot start with its options: {printable(lines[-1].strip(), 200)}")
     if text[0]:
         sys.stderr.write(text[0])
 
@@ -70,12 +72,6 @@ def _check_lines(where: str, lines: list[str]) -> None:
         is_option = len(tokens) <= 2 and all(map(OPTION.match, tokens[:1])) and not re.match("-[A-Za-z]", value)
         if not is_alias and not is_option:
             raise InputError(f"{where}: line {number} is no option with its value: {printable(line.strip(), 60)}")
-
-
-def _message(text: str) -> str:
-    """Subject of an error that PETSc printed: its last line before that on where to find help."""
-    lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", text.partition("PETSC ERROR: See ")[0], re.MULTILINE)
-    return printable(lines[-1].strip(), 200) if lines else ""
 
 
 @contextmanager

@@ -31,7 +31,7 @@ def total_iterations(ksp: PETSc.KSP) -> int:
 
 
 def dense_pointer(matrix: PETSc.Mat) -> int:
-    """Address of a rank's numbers of a dense matrix, maybe on a GPU (MatDenseGetArrayAndMemType)."""
+    """Address of a rank's part of a dense matrix, maybe on a GPU (MatDenseGetArrayAndMemType)."""
     library, handle, array, kind = petsc_library(), ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
     library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))
     pointer = array.value or 0
@@ -57,7 +57,7 @@ def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
 
 
 def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
-    """Set those entries to values (n,), on a GPU if the matrix is there (MatSetValuesCOO) (collective)."""
+    """Set those entries to values (n,), on a GPU if the matrix is there (MatSetValuesCOO)."""
     _check(petsc_library().MatSetValuesCOO(ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)))
 
 
@@ -133,17 +133,12 @@ def petsc_errors(
 
 
 def last_words(error: BaseException) -> str:
-    """Message of a PETSc error, without the calls it came through."""
+    """Message of a PETSc error without the calls it came through; of an unknown type the nearest."""
     lines = str(error).splitlines()
     said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
     words = said[-1] if said else lines[0]
-    return words + _nearest_type(words)
-
-
-def _nearest_type(words: str) -> str:
-    """Return the nearest type of solver where there is none: ", did you mean 'pipecg'?"."""
     wanted = re.search(r"requested (KSP|PC|SNES) type (\w+)", words)
     if wanted is None:
-        return ""
-    types = getattr(PETSc, wanted[1]).Type
-    return did_you_mean(wanted[2], [name for name in vars(types).values() if isinstance(name, str)])
+        return words
+    types = vars(getattr(PETSc, wanted[1]).Type).values()
+    return words + did_you_mean(wanted[2], [name for name in types if isinstance(name, str)])

@@ -6,29 +6,20 @@ from petsc4py import PETSc
 
 from msmpetsc.errors import InputError
 
-BITS = 8 * np.dtype(PETSc.IntType).itemsize
 LARGEST = int(np.iinfo(PETSc.IntType).max)
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
 
 
 def refuse_unknowns(nodes: int) -> None:
-    """Raises InputError for more ``nodes`` than PETSc can give three coordinates a number each.
-
-    nodes : of all ranks, so that all of them raise it
-    """
+    """Raise InputError for more ``nodes`` than PETSc can number three coordinates of."""
     if 3 * nodes > LARGEST:
-        raise InputError(
-            f"cages: the three coordinates of {nodes} nodes are more than the {LARGEST} unknowns that PETSc can number "
-            f"here; {ADVICE}"
-        )
+        most = f"the {LARGEST} unknowns that PETSc can number here"
+        raise InputError(f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}")
 
 
 def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
-    """Raises InputError where a rank has more nonzeros of a matrix than PETSc can count; ``own`` of
-    this one (collective)."""
+    """Raise InputError where a rank has more nonzeros, ``own`` of this one, than PETSc can count."""
     most = comm.allreduce(own, MPI.MAX)
     if most > LARGEST:
-        raise InputError(
-            f"cages: {most} nonzeros of the system matrix on one rank are more than the {LARGEST} that PETSc can count "
-            f"here; more ranks have fewer each, or {ADVICE}"
-        )
+        many = f"{most} nonzeros of the system matrix on one rank are more than the {LARGEST} that PETSc can count here"
+        raise InputError(f"cages: {many}; more ranks have fewer each, or {ADVICE}")

@@ -35,7 +35,7 @@ def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 
 
 def with_curves(rows: DataFrame) -> DataFrame:
-    """Return the rows with a column ``curve``: the method, what varied in it, and its step error."""
+    """Return the rows with a column ``curve``: method, what varied in it, and its step error."""
     varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
     words = ([row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows))
     rows = rows.assign(curve=[", ".join(filter(None, text)) for text in words])

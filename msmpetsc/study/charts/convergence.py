@@ -21,8 +21,6 @@ from msmpetsc.study.charts.plot import (
 )
 from msmpetsc.study.table import Row, grouped, measured, records, succeeded
 
-# Within one step
-
 KIND = "Convergence within one step"
 CAPTION = (
     "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second "
@@ -57,7 +55,7 @@ def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict]
 
 
 def furthest(curves: list[DataFrame]) -> list[DataFrame]:
-    """Return the trace of each method that ends with the least error: looser targets are parts of it."""
+    """Return each method's trace that ends with the least error: looser targets are parts of it."""
     known = sorted((curve for curve in curves if len(curve)), key=lambda rows: -rows["position_error"].iloc[-1])
     best = {rows["label"].iloc[0]: rows for rows in known}
     return [best[label] for label in dict.fromkeys(rows["label"].iloc[0] for rows in curves if len(rows))]
@@ -129,7 +127,7 @@ def order_chart(scene: str, rows: DataFrame, styles: Styles, frequency: float | 
 
 
 def draw_energy(chart: Chart, rows: DataFrame, frequency: float | None) -> None:
-    """Draw the energy that is left over the step, and implicit Euler's closed form if it is known."""
+    """Draw the energy left over the step, and implicit Euler's closed form if it is known."""
     top = 1.15 * min(2, max(1, rows["energy_left"].max()))
     y = channel("energy left / energy at the start", PLAIN, np.arange(0, top, 0.2), domain=[0, top])
     panel = chart.panel("energy left at the end", log_axis("time step", rows["step"], SECONDS), y)

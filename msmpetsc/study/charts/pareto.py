@@ -30,17 +30,7 @@ from msmpetsc.study.charts.plot import (
     save_png,
 )
 from msmpetsc.study.sizing.answer import SizePlan
-from msmpetsc.study.table import (
-    ONCE_NOTE,
-    Row,
-    grouped,
-    is_repeated,
-    measured,
-    reach,
-    records,
-    spread,
-    succeeded,
-)
+from msmpetsc.study.table import ONCE_NOTE, Row, grouped, is_repeated, measured, reach, records, spread, succeeded
 
 KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
@@ -87,9 +77,6 @@ TRAJECTORY = ErrorMeasure(
 )
 
 
-# What is best
-
-
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
     """Return the points that no other beats: none is at most as great in both and smaller in one.
 
@@ -125,9 +112,6 @@ def winners(rows: DataFrame, measure: ErrorMeasure, level: float) -> list[Row]:
     ends = reach(reached, measure.cost)
     near = reached[ends["least"] <= ends["greatest"].iloc[0]]
     return records(near.drop_duplicates("label"))
-
-
-# The charts
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -180,9 +164,6 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel.rings(front, measure.columns)
 
 
-# In words
-
-
 def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
     """Say which method is the cheapest that reached this level, and which may be just as cheap."""
     start = f"{formatting.error(level)} or less:"
@@ -201,7 +182,7 @@ def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
 
 
 def stepping(row: Row) -> str:
-    """Return how a case steps; an explicit one has substeps within its time step, that between frames."""
+    """Return how a case steps; an explicit one has substeps within the time between frames."""
     if row["integrator"] != "verlet":
         return formatting.entry(row, "time_step")
     if row["substep"]:

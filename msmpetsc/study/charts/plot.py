@@ -80,13 +80,10 @@ def curve_styles(labels: Iterable[str]) -> Styles:
 
 
 def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:
-    """Return what the point of each row tells: its curve, its numbers, the command that repeats it."""
+    """Return what the point of each row tells: curve, numbers, the command that repeats it."""
     told = list(dict.fromkeys(told))
     lines = ([row[curve], *(formatting.entry(row, name) for name in told), row["command"]] for row in records(rows))
     return ["\n".join(filter(None, tip)) for tip in lines]
-
-
-# Axes: channels of Vega-Lite
 
 
 def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dict[str, Any]:
@@ -115,9 +112,6 @@ def axis_from_zero(title: str, values: Iterable[float], words: str) -> dict[str,
     steps = (1, 2, 5) if decades <= 2 else (1,)
     ticks = [0.0, *(first * 10**decade * step for decade in range(decades) for step in steps)]
     return channel(title, words, ticks, type="symlog", constant=first, domain=[0, 1.3 * max(positive)])
-
-
-# Panels and charts
 
 
 @dataclass
@@ -163,7 +157,8 @@ class Axes:
         own = {"fill": color, "size": {"field": "size", "type": "quantitative", "scale": None}}
         look: dict[str, Any] = {"type": "point", "stroke": "white", "strokeWidth": 0.6}
         if hollow:
-            own, look = {"stroke": color}, {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
+            own = {"stroke": color}
+            look = {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
         self.draw(values, look, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own)
 
     def rings(self, rows: DataFrame, columns: Columns) -> None:
@@ -236,9 +231,6 @@ def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> 
     """Return the channel that gives each curve its "color" or its "shape"."""
     scale = {"domain": list(styles), "range": [getattr(style, name) for style in styles.values()]}
     return {"field": "curve", "type": "nominal", "scale": scale, "legend": legend}
-
-
-# Files
 
 
 def save_png(chart: Chart, folder: Path) -> None:

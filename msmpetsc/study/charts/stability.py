@@ -69,7 +69,7 @@ def entry(value: str, unit: str) -> str:
 
 
 def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
-    """Return the values that the rows have on this axis, in the order and the unit of the study file."""
+    """Return the values of the rows on this axis, in the order and the unit of the study file."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]
@@ -87,13 +87,13 @@ def stability_chart(name: str, rows: DataFrame, settings: dict) -> Chart:
     """Return the chart of a map; ``settings``: its table in the study file."""
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")
-    title, height = settings.get("title") or name, CELL * len(y.values)
     legend = {
         f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(COLORS[outcome], "square")
         for outcome in reversed(OUTCOMES)
         if outcome in set(rows["outcome"])
     }
-    chart = Chart(f"stability_{name}", KIND, title, CAPTION, legend, columns=COLUMNS, gap=35, height=height)
+    look: dict[str, Any] = {"columns": COLUMNS, "gap": 35, "height": CELL * len(y.values)}
+    chart = Chart(f"stability_{name}", KIND, settings.get("title") or name, CAPTION, legend, **look)
     by_label = grouped(rows, "label")
     if set(x.values) == set(by_label):
         draw_cells(chart.panel("", *axes_of_cases(x, y)), rows, x._replace(name="method"), y._replace(name="case"))

@@ -66,7 +66,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class CostModel:
-    """What the trials told: errors of the cells, the steps and their solution, and what each costs."""
+    """What the trials told: errors of cells, steps and their solution, and what each costs."""
 
     law: ErrorLaw  # of the error over the edge of a cell, cells^(-1/3)
     steppings: Sequence[Stepping]
@@ -78,7 +78,7 @@ class CostModel:
     most: int
 
     def cheapest(self, target: float) -> Choice | None:
-        """Return the cheapest choice whose errors add up to the target at most; None if none does."""
+        """Return the cheapest choice whose errors add up to the target at most, or None."""
         choices = [
             self.choice(stepping, solving, cells)
             for stepping in self.steppings
@@ -105,10 +105,14 @@ class CostModel:
         growth = self.growth(self.cells, cells) * (cells / self.cells) ** (shorter / 3)
         cost = stepping.cost * solving.cost * growth
         method = replace(stepping.method, step_error=solving.step_error)
-        return Choice(method, int(cells), budget, cost, self._shares(stepping, solving, cells))
+        same = [each for each in self.steppings if each.method.integrator == stepping.method.integrator]
+        of_cells = 3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order
+        parts = (of_cells, _steepness(same, stepping), _steepness(self.solvings, solving))
+        total = sum(parts) or 1.0
+        return Choice(method, int(cells), budget, cost, Budget(*(part / total for part in parts)))
 
     def growth(self, before: float, after: float) -> float:
-        """Return how many times the cost is when there are so many cells, read off the lattices tried."""
+        """Return how many times the cost is of so many cells, read off the lattices tried."""
         cells, costs = np.log(self.costs).T
         if len(cells) < 2:
             return after / before
@@ -122,14 +126,6 @@ class CostModel:
     def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
         """Return how its steps may be solved; explicit ones are not."""
         return [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings
-
-    def _shares(self, stepping: Stepping, solving: Solving, cells: float) -> Budget:
-        """Return d log cost / d log error of each part over their sum."""
-        same = [each for each in self.steppings if each.method.integrator == stepping.method.integrator]
-        of_cells = 3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order
-        parts = (of_cells, _steepness(same, stepping), _steepness(self.solvings, solving))
-        total = sum(parts) or 1.0
-        return Budget(*(part / total for part in parts))
 
 
 def _steepness(tried: Sequence[Stepping | Solving], chosen: Stepping | Solving) -> float:

@@ -95,7 +95,8 @@ class Sizer:
         """Return the plan of lattices of ``cells`` and fewer."""
         coarse = self._coarser(1)
         steppings = self._steppings(coarse)
-        method = self._provisional(steppings)
+        fair = [each for each in steppings if each.error <= self.target / 2]
+        method = (min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)).method
         solvings = self._solvings(method, coarse)
         lattices = self._lattices(method)
         costs = [(each.cells, each.cost) for each in lattices]
@@ -128,8 +129,12 @@ class Sizer:
             raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
         finest, left = ladder[-1], self._left(ladder, sizes)
         if left > self.target / PART:
-            integrator, apart = finest.method.integrator, _apart(ladder[-2], finest)
-            self.bounds.append(f"the step: the two shortest of {integrator} are {apart:.1e} apart{self._contact_law()}")
+            integrator, responses = finest.method.integrator, {obstacle.response for obstacle in self.as_given.obstacle}
+            contact = "; contact is stiff" if responses else ""
+            if "exchange" in responses:
+                contact = '; a rebound of response = "exchange" depends on the step, that of "penalty" has a limit'
+            apart = f"{_apart(ladder[-2], finest):.1e} apart"
+            self.bounds.append(f"the step: the two shortest of {integrator} are {apart}{contact}")
         known = [Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]]
         known.append(Stepping(finest.method, left, finest.cost))
         explicit = finest.method.integrator == "verlet"
@@ -139,13 +144,6 @@ class Sizer:
                 chosen_from += self._others(integrator, chosen_from, finest=finest, left=left, cells=cells)
         self.step_errors = {each.method: each.error for each in (*known, *chosen_from)}
         return chosen_from
-
-    def _contact_law(self) -> str:
-        """Return what contact has to do with it, in words; "" for nothing."""
-        responses = {obstacle.response for obstacle in self.as_given.obstacle}
-        if "exchange" in responses:
-            return '; a rebound of response = "exchange" depends on the step, that of "penalty" has a limit'
-        return "; contact is stiff" if responses else ""
 
     def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
         """Return runs of verlet, whose error halved substeps tell, and their substeps; none where it takes too long."""
@@ -183,7 +181,7 @@ class Sizer:
     def _others(
         self, integrator: IntegratorName, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
     ) -> list[Stepping]:
-        """Return what an integrator does with ever shorter steps, while it may still be the cheapest."""
+        """Return what an integrator does with ever shorter steps, while it may be the cheapest."""
         others: list[Stepping] = []
         enough = min((self._at_scale(each) for each in known if each.error <= self.target / 2), default=math.inf)
         for step in self.halved:
@@ -196,13 +194,8 @@ class Sizer:
         return others
 
     def _at_scale(self, stepping: Stepping) -> float:
-        """Return the cost on the finest lattice over its growth: explicit substeps are shorter there."""
+        """Return the cost on the finest lattice over its growth: substeps are shorter there."""
         return stepping.cost * (COARSER if stepping.method.integrator == "verlet" else 1)
-
-    def _provisional(self, steppings: list[Stepping]) -> Candidate:
-        """Return the cheapest way to step that leaves half the error to the cells; the most exact where none does."""
-        fair = [each for each in steppings if each.error <= self.target / 2]
-        return (min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)).method
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
         """Return how loosely the steps may be solved, and what that leaves."""
@@ -372,7 +365,7 @@ class Sizer:
         return trial
 
     def case(self, method: Candidate, cells: int) -> Case:
-        """Return the run of a method on so many cells, with the surface at the scene's own frames."""
+        """Return the run of a method on so many cells, its surface at the scene's own frames."""
         cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
         timeout = TIME if cells < self.cells else LONG_TIME
         case = Case(

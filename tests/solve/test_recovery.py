@@ -133,6 +133,12 @@ def test_it_comes_back_to_its_rest_shape(name: str):
     assert played.last.elastic < 1e-6 * max(frame.elastic for frame in played.frames)
 
 
+def test_a_micrometre_of_rubber_comes_back():
+    """Where CG's way climbs PETSc calls it a minimum in such units; the projected Hessian takes over all the same."""
+    played = play("tiny", "material.law=neo-hookean", "material.poisson_ratio=0.49")
+    assert not played.words and played.shape_error() < 1e-4
+
+
 def test_a_nearly_flat_body_comes_back_to_its_rest_shape_or_the_mirror_image():
     """Both are as near."""
     played = play("nearly flat")

@@ -41,6 +41,10 @@ from msmpetsc.solve.work import Work
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
+CLIMBS = (  # PETSc takes it for a minimum where |H F| / |F| < 1e-4, as any is in small units
+    PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH,
+    PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN,
+)
 
 
 @dataclass(frozen=True)
@@ -235,9 +239,8 @@ class Stepper:
             self.snes.setType(PETSc.SNES.Type.KSPONLY)
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()
-        climbs = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         iterations, most = self._run_snes(), self.snes.getTolerances()[3]
-        while self.preset.true_hessian and self.snes.reason == climbs and iterations < most:
+        while self.preset.true_hessian and self.snes.reason in CLIMBS and iterations < most:
             self.projected = True
             its = self._run_snes()
             iterations += its

@@ -134,19 +134,8 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
     ],
 )
 def test_no_option_is_left_unused_and_the_users_wins(scene: Path, tmp_path: Path, preset: str, options: str, seen: str):
-    done = on(
-        1,
-        scene,
-        "-o",
-        tmp_path / "o.h5",
-        "--preset",
-        preset,
-        "--frames",
-        "1",
-        *options.split(),
-        "-options_left",
-        status=0,
-    )
+    words = f"--preset {preset} --frames 1 {options} -options_left".split()
+    done = on(1, scene, "-o", tmp_path / "o.h5", *words, status=0)
     assert "There are no unused options." in done.stdout
     assert seen in done.stdout
 

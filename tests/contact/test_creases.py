@@ -19,16 +19,8 @@ LAW = BarrierLaw(DISTANCE, 100.0, 0.5, 0.01)
 
 def grooved(half: float = HALF) -> trimesh.Trimesh:
     """A block with a groove across its upper side; all its points are within three rings of each other."""
-    middle = LONG / 2
-    profile = [
-        [middle, BOTTOM],
-        [middle - half, HIGH],
-        [0, HIGH],
-        [0, 0],
-        [LONG, 0],
-        [LONG, HIGH],
-        [middle + half, HIGH],
-    ]
+    low, high = LONG / 2 - half, LONG / 2 + half
+    profile = [[LONG / 2, BOTTOM], [low, HIGH], [0, HIGH], [0, 0], [LONG, 0], [LONG, HIGH], [high, HIGH]]
     near, far = (np.insert(profile, 1, y, axis=1) for y in (0.0, 0.25))
     fan = np.array([[0, i, i + 1] for i in range(1, 6)])
     i, j = np.arange(7), np.roll(np.arange(7), -1)

@@ -96,28 +96,26 @@ class Viscosity:
         self.before, self.state = before, np.empty((len(self.blocks.nodes), STATE * LANES))
         turned_state(self.blocks, self.h4, turned, self.state)
 
-    def _product(self, v: Rows, count: int | None) -> Rows:
-        product = np.zeros_like(v)
-        add_product(self.blocks.nodes[:count], self.blocks.which, self.blocks.constants, self.state, v, product)
-        return product
-
     def energy(self, q: Positions) -> float:
         """Return D [J] of the cells that this rank owns."""
         return self.change(q, self.before)
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return D(q) - D(base) [J] of the cells that this rank owns."""
-        both = (q - self.before) + (base - self.before)
-        return 0.5 * float(np.vdot(q - base, self._product(both, self.owned)))
+        both, product, blocks = (q - self.before) + (base - self.before), np.zeros_like(q), self.blocks
+        add_product(blocks.nodes[: self.owned], blocks.which, blocks.constants, self.state, both, product)
+        return 0.5 * float(np.vdot(q - base, product))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad D [N] to ``gradient`` (l, 3)."""
-        gradient += self._product(q - self.before, None)
+        self.hessian_at(q, True)(q - self.before, gradient)
 
     def hessian_at(self, _: Positions, __: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of D) v [N] to its second argument."""
-        blocks, state = self.blocks, self.state
-        return partial(add_product, blocks.nodes, blocks.which, blocks.constants.astype(dtype), state.astype(dtype))
+        blocks = self.blocks
+        constants: Rows = blocks.constants.astype(dtype, copy=False)
+        state: Rows = self.state.astype(dtype, copy=False)
+        return partial(add_product, blocks.nodes, blocks.which, constants, state)
 
     def add_bound(self, _: Positions, blocks: Rows) -> None:
         """Add the diagonal blocks of the Hessian to ``blocks`` (l, 9) [N/m]."""

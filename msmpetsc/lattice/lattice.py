@@ -138,6 +138,13 @@ class LatticeMaterial(NamedTuple):
     poisson: float | None = None
     of_cells: Callable[[Indices], CellMaterial] | None = None
 
+    @property
+    def spring(self) -> float:
+        """Young's modulus [Pa], or the stiffness [N/m] that is given in its place."""
+        given = self.young_modulus if self.stiffness is None else self.stiffness
+        assert given is not None
+        return given
+
 
 def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology | None" = None) -> Lattice:
     """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
@@ -245,9 +252,8 @@ def _of_springs(net: Topology, h: float, material: LatticeMaterial) -> LawConsta
 def _sums(net: Topology, h: float, material: LatticeMaterial) -> LawConstants:
     """Return the mass, and what the material gives for springs: Young's modulus [Pa] or stiffness [N/m]."""
     if material.of_cells is None and net.share is None:
-        given = material.stiffness or material.young_modulus
-        assert given is not None
-        return LawConstants(material.density * h**3 / 8 * net.octants.sum(axis=1), given, given)
+        mass = material.density * h**3 / 8 * net.octants.sum(axis=1)
+        return LawConstants(mass, material.spring, material.spring)
     owned, cells = len(net.octants), len(net.cells)
     made_of = _made_of(net, material)
     share = np.ones((cells, 8)) if net.share is None else net.share
@@ -262,9 +268,7 @@ def _made_of(net: Topology, material: LatticeMaterial) -> CellMaterial:
     """Return what the cells around a rank's nodes are made of, all alike where no function tells."""
     if material.of_cells:
         return material.of_cells(net.ijk[net.cells[:, 0]])
-    spring = material.stiffness or material.young_modulus
-    assert spring is not None
-    return CellMaterial.uniform(len(net.cells), material.density, spring, material.poisson or 0.0)
+    return CellMaterial.uniform(len(net.cells), material.density, material.spring, material.poisson or 0.0)
 
 
 def _solid(net: Topology, h: float, material: LatticeMaterial, kept: Indices) -> LawConstants:

@@ -10,6 +10,8 @@ import pytest
 import trimesh
 from forked import run_forked, run_ranks
 
+from msmpetsc.study.process import ALONE
+
 ROOT = Path(__file__).parent.parent
 WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
@@ -64,7 +66,7 @@ def run(ranks: int, *arguments: object, timeout: float = 120, status: int | None
     """
     words = [*map(str, arguments)]
     if ranks == 1 and words[:2] in (["-m", "msmpetsc.cli.main"], ["-m", "msmpetsc"]):
-        done = run_forked(words[2:], ENVIRONMENT, timeout)
+        done = run_forked(words[2:], ENVIRONMENT | ALONE, timeout)
     else:
         done = run_ranks(ranks, words, ENVIRONMENT, timeout)
     assert status in (None, done.returncode), done.stdout + done.stderr

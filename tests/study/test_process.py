@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -44,6 +45,15 @@ def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
             frames.append(file["frames/position"][:])
             assert file.attrs["petsc_options"] == " ".join(words) and str(path) in file.attrs["command"]
     np.testing.assert_array_equal(frames[2], frames[0])
+
+
+def test_processes_alone_share_no_folder(tmp_path: Path, processes: Processes, monkeypatch):
+    """Of such a folder one that ends robbed one that began: a case in 300 failed."""
+    (tmp_path / "shared").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "shared"))
+    look = "import os; from mpi4py import MPI; print(os.listdir(os.environ['TMPDIR']))"
+    assert processes.run([sys.executable, "-c", look], tmp_path / "log", 30).status == 0
+    assert (tmp_path / "log").read_text() == "[]\n"
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")

@@ -90,7 +90,11 @@ class Unknowns:
 
     def from_nodes(self, nodes: Positions, vector: PETSc.Vec) -> None:
         """Write the free owned rows of ``nodes`` (>= owned, 3) into the unknowns."""
-        _collect(self.size, nodes, self.free, self.columns_to_write(vector))
+        self.collect(nodes, self.columns_to_write(vector))
+
+    def collect(self, nodes: Rows, columns: Rows) -> None:
+        """Write the free owned rows of ``nodes`` (>= owned, 3) into ``columns`` (3, m)."""
+        _collect(self.size, nodes, self.free, columns)
 
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""

@@ -4,7 +4,8 @@ solve and cycle are set by PETSc's options (-pc_mg_..., -mg_levels_..., -mg_coar
 The hierarchy is that of the projected Hessian H, which is positive definite at any positions, so that CG on the true
 one has a preconditioner that is, too. The finest level is applied spring by spring or cell by cell in single precision,
 and smoothed with a block diagonal D. The first coarse one is summed spring by spring or cell by cell
-(solve.multigrid.galerkin), those below are products P^T H P of PETSc's.
+(solve.multigrid.galerkin), those below are products P^T H P of PETSc's; all but the coarsest are applied in single
+precision, too (solve.multigrid.coarse_operator).
 """
 
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import Viewable, python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
@@ -52,6 +54,7 @@ class Multigrid:
     bodies : that have coarse grids of their own
     pc     : its options have the ``prefix``
     levels : the coarse ones, the finest of them first
+    coarse : products with the matrix of each of them but the last; none on a GPU, where PETSc's serve
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -65,6 +68,7 @@ class Multigrid:
         except InputError:
             self.owned.close()
             raise
+        self.coarse: list[CoarseOperator] = []  # until ``update``
         smoother = PETSc.Options(prefix).getString("mg_levels_pc_type", "")
         self.widened = DIAGONAL if smoother == PETSc.PC.Type.JACOBI else 1.0
         self.bounds = [0.0] * len(self.levels)
@@ -103,6 +107,12 @@ class Multigrid:
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
         is_new = self.pc.getType() is None
+        if is_new and self.unknowns.memory is not memory.CUDA:
+            self.coarse = [CoarseOperator(level.matrix) for level in self.levels[:-1]]
+            for coarse in self.coarse:
+                self.owned.callback(coarse.operator.destroy)
+        for coarse in self.coarse:
+            coarse.update()
         if is_new:
             self._create_cycle()
         self.bounds[0] = self.widened * self._finest_bound()
@@ -155,7 +165,7 @@ class Multigrid:
             pc.setMGInterpolation(top - i, level.interpolation)
             pc.setMGRestriction(top - i, self._restriction(level.interpolation))
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
-            ksp.setOperators(level.matrix, level.matrix)
+            ksp.setOperators(self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
         finest = pc.getMGSmoother(top)
         finest.setOperators(self.operator, self.operator)

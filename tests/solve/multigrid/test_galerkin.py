@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from hierarchies import COMM, LATTICES, SHAPES, Case, build, heavier, hierarchy
 
+from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
+
 RAISED = 1 + 1e-5
 CASES = {  # lattice, shape, contact, more
     "pinned": ("block", "twisted", False, {"pins": True}),
@@ -36,7 +38,21 @@ def check_levels(case: Case) -> None:
         p, found = case.interpolation(level), case.level(level)
         assert_close(found, raised(p.T @ h @ p))
         assert np.linalg.eigvalsh(found).min() > 0
+        if level < len(case.multigrid.coarse):
+            check_operator(case.multigrid.coarse[level])
         h = found
+
+
+def check_operator(coarse: CoarseOperator) -> None:
+    """It is the matrix in single precision, and symmetric; a translation keeps its digits whatever the stiffness."""
+    x, expected = coarse.matrix.createVecs()
+    found, noise = expected.duplicate(), np.random.default_rng(1).standard_normal(x.getLocalSize())
+    translation = np.tile([1.0, 2.0, 3.0], len(noise) // 3)
+    for values in (noise, translation):
+        x.array[:] = values
+        coarse.matrix.mult(x, expected)
+        coarse.operator.mult(x, found)
+        np.testing.assert_allclose(found.array, expected.array, rtol=0, atol=2e-6 * abs(expected.array).max())
 
 
 @pytest.mark.parametrize("name", CASES)

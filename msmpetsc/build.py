@@ -16,7 +16,6 @@ from msmpetsc.constraints.reactions import Holders
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-from msmpetsc.contact.obstacles.outside import distance_outside, nearest_of_body
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
 from msmpetsc.contact.surface.collision_surface import collision_surface
@@ -25,6 +24,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import Embedding, embed
+from msmpetsc.geometry.grid import encode_morton
+from msmpetsc.geometry.nearest import nearest_in_bodies
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
@@ -39,6 +40,7 @@ from msmpetsc.scene.reading import Scene
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
+INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
 USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 
 
@@ -124,7 +126,25 @@ class Geometry:
 
     def outside(self, lattice: Lattice) -> Floats | None:
         """Return how far nodes (l,) stick out of the surfaces [m]; None where cells count whole (collective)."""
-        return None if self.cages.share is None else distance_outside(lattice, self.nearest(lattice))
+        return None if self.cages.share is None else np.linalg.norm(lattice.nodes - self.nearest(lattice), axis=1)
+
+
+def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice) -> Positions:
+    """Return the point (l, 3) [m] of its body that each node is nearest to at rest (collective).
+
+    It is the node itself but where that sticks out of the surface: corners of boundary cells, by up to a diagonal. An
+    obstacle should be met by the surface, not by the lattice that carries it. A node that sticks out by d meets it when
+    it is d deep: there the surface is. Where the surface is flat as far as a cell that is exact, however the body has
+    turned. Where cells count whole there is nothing to correct: the lattice is the body.
+    """
+    owned = lattice.owned
+    springs = np.bincount(lattice.springs.ravel(), minlength=len(lattice.nodes))[:owned]
+    body = lattice.body
+    rows = np.flatnonzero((springs < INNER_SPRINGS) & np.array(cages.fills)[body[:owned]])
+    nearest = lattice.nodes[:owned].copy()
+    nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
+    ghosts = encode_morton(cages.grids.nearest_nodes(lattice.nodes[owned:], body[owned:]))
+    return np.concatenate([nearest, lattice.table.rows_of(ghosts, nearest)])
 
 
 def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> Model:

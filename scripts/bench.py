@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """The cost of a step, `newton` beside what it took the place of. Needs the meshes.
 
-    scripts/bench.py [--only NAME ...] [--frames N] [--repeats N] [--ranks N] [--gpu] [--large] [-o PAGE]
+    scripts/bench.py [--only NAME ...] [--laws LAW ...] [--frames N] [--repeats N] [--ranks N] [--gpu] [--large]
+        [-o PAGE]
 
 Runs the paper's scenes, clamped beams of 9,000 and 96,000 cells and, with --large, of 995,000, each to a step error of
 1e-3 on one core: `newton` with `-pc_type jacobi` and `gamg`, with --ranks `newton` on so many, and `newton`, one after
@@ -11,13 +12,16 @@ alone, on one core, with --ranks on so many, and on the GPU of the machine.
 Figures are of all frames but the first, for what is done once shows in it: the mean time, its median over the repeats
 with the least and the greatest of them in brackets; `slowest tenth` is the mean of those frames. KSP iterations and
 products with the Hessian, which do not depend on the machine, are means; where `/` divides them they are of the methods
-in their order. `times as fast` and what stands behind it is of the last method.
+in their order. `times as fast` and what stands behind it is of the last method: `proof`, the share of its products that
+estimates and searches for a negative curvature take; `coarse`, the share of a cycle's time beside its products at the
+finest level.
 """
 
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -32,7 +36,8 @@ from scene_tables import PAPER, SCENES, slowest_tenth
 from msmpetsc.backend import cuda
 from msmpetsc.solve.petsc import device
 
-NUMBERS = "wall_time", "iterations", "ksp_its", "products", "step_error"
+NUMBERS = "wall_time", "iterations", "ksp_its", "products", "proof_products", "step_error"
+LAWS = "own", "neo-hookean"  # the scene's
 SMALL = 50_000  # nodes: of fewer the memory is mostly Python's
 BEAMS = {  # cells along the beam, Young's modulus [Pa], frames
     "beam 1e4": (40, 5e5, 30),
@@ -78,10 +83,11 @@ def beam(name: str, folder: Path) -> tuple[str, ...]:
     return f'mesh.source="{folder / "beam.obj"}"', size, f"material.young_modulus={young!r}", length
 
 
-def measured(name: str, method: Method, frames: int | None) -> Sample | None:
+def measured(name: str, method: Method, frames: int | None, law: str = LAWS[0]) -> Sample | None:
     """Return what one run of a row measured; None if it failed."""
     folder, is_beam = lab.OUT / "bench", name in BEAMS
-    changes = ("output.surface=false", *(beam(name, folder) if is_beam else ()))
+    of_law = () if law == LAWS[0] else (f'material.law="{law}"',)
+    changes = ("output.surface=false", *of_law, *(beam(name, folder) if is_beam else ()))
     words = ["--error", "1e-3", *method.words, *(["--frames", frames] if frames else [])]
     scene = "studies/beam_soft" if is_beam else name
     run = lab.run(scene, folder / "run.h5", words, changes, method.ranks)
@@ -115,11 +121,14 @@ def of_method(name: str, runs: Sequence[Sample]) -> dict[str, object]:
     cost, paper = runs[0].cost, PAPER.get(name.split("_")[0])
     seconds = median(means(runs, "wall_time"))
     memory = min(run.cost["memory"] for run in runs) / cost["nodes"] / 1e3
+    products, time = means(runs, "products")[0], cost["time"]
     return {
         "cells": cost["cells"],
         "frames": len(runs[0].frames["wall_time"]),
         "iterations": means(runs, "iterations")[0],
         "error": float(runs[0].frames["step_error"].max()),
+        "proof": lab.percent(means(runs, "proof_products")[0] / products).lstrip("+") if products else None,
+        "coarse": lab.percent(1 - time["fine"] / time["cycle"]).lstrip("+") if time.get("cycle") else None,
         "us a cell": 1e6 * seconds / cost["cells"],
         "slowest tenth [ms]": 1e3 * median(slowest_tenth(run.frames["wall_time"][1:]) for run in runs),
         "frames/s (paper's CPU, GPU)": f"{1 / seconds:.3g} ({paper[4]}, {paper[5]})" if paper else 1 / seconds,
@@ -130,13 +139,15 @@ def of_method(name: str, runs: Sequence[Sample]) -> dict[str, object]:
 
 def rows(methods: dict[str, Method], args: Namespace) -> lab.Rows:
     """Yield the rows that are asked for as they are run, the repeats of each method alternating with the others'."""
-    for name in (*SCENES, *BEAMS):
-        if not any(word in name for word in args.only) or (name == LARGE and not args.large):
+    names = [name for name in (*SCENES, *BEAMS) if any(word in name for word in args.only)]
+    laws = args.laws or (LAWS[:1] if args.gpu else LAWS)  # solids run on the CPU alone
+    for name, law in product(names, laws):
+        if name == LARGE and not args.large:
             continue
-        kinds = {kind: partial(measured, name, method, args.frames) for kind, method in methods.items()}
+        kinds = {kind: partial(measured, name, method, args.frames, law) for kind, method in methods.items()}
         runs = lab.alternated(kinds, args.repeats)
         if any(runs.values()):
-            yield row(name, runs)
+            yield {**row(name, runs), "scene": name if law == LAWS[0] else f"{name}, {law}"}
 
 
 def methods_of(args: Namespace) -> dict[str, Method]:
@@ -152,6 +163,9 @@ def main() -> int:
     options = lab.parser(__doc__)
     options.add_argument(
         "--only", nargs="+", default=[""], metavar="NAME", help="rows whose name contains one of these"
+    )
+    options.add_argument(
+        "--laws", nargs="+", metavar="LAW", help="of materials; own, the scene's, and neo-hookean if absent"
     )
     options.add_argument("--frames", type=int, metavar="N", help="steps of each run; all of the scene's if absent")
     options.add_argument("--repeats", type=int, default=5, metavar="N", help="runs of each method (%(default)s)")

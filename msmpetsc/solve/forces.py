@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Indices, Positions, to_host
+from msmpetsc.backend.arrays import Indices, Positions, Rows, to_host
 from msmpetsc.build import Model
 from msmpetsc.constraints.reactions import sums_by
 from msmpetsc.contact.obstacles.penalty import Contact
@@ -34,19 +34,25 @@ class Forces:
         environment, owned = self.environment, self.model.lattice.owned
         problem = step.problem if step else None
         contact = problem.contact if problem else environment.push(time, sides)
-        held, load = np.zeros_like(q), environment.load(time)
-        pushes = self._pushes(q, contact)
+        load = environment.load(time)
+        sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
+        if "reaction" in self.rows:
+            held = self._held(q, contact, step) - load
+            sums["reaction"] = self.model.holders.totals(held * environment.fixed_at(time)[:owned, None])
+        return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
+
+    def _held(self, q: Positions, contact: Contact | None, step: StepResult | None) -> Rows:
+        """Return what would hold this rank's nodes where they are, beside the loads (owned, 3) [N]."""
+        held, owned = np.zeros_like(q), self.model.lattice.owned
         self.elasticity.add_gradient(q, held)
         if contact:
             contact.add_gradient(q, held)
-        held = held[:owned] - load
+        held = held[:owned]
         if step and step.viscous is not None:
             held += step.viscous
-        if step and problem:
-            held += self.model.lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
-        held *= environment.fixed_at(time)[:owned, None]
-        sums = {"reaction": self.model.holders.totals(held), "load": to_host(load.sum(axis=0)), **pushes}
-        return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
+        if step and step.problem:
+            held += self.model.lattice.mass[:, None] * (q[:owned] - step.problem.y[:owned]) / step.tau**2
+        return held
 
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
         """Return the pushes of obstacles (o, 3) and of contact on bodies (b, 3) on this rank's nodes with [N]."""

@@ -10,11 +10,12 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Array, Positions, Rows
 from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.events import GRIDS, HIERARCHY, LOCAL, count, seconds
+from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, count, seconds
 
 INDEX, VALUE = PETSc.IntType().itemsize, PETSc.ScalarType().itemsize
 EVENTS = {
-    "factor": ["PCSetUp"], "local": [LOCAL.name], "ksp": ["KSPSolve"], "hierarchy": [GRIDS.name, HIERARCHY.name]
+    "factor": ["PCSetUp"], "local": [LOCAL.name], "ksp": ["KSPSolve"], "hierarchy": [GRIDS.name, HIERARCHY.name],
+    "cycle": [CYCLE.name], "fine": [FINE.name],
 }  # fmt: skip
 
 
@@ -75,6 +76,7 @@ def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
         arrays: list[Array] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
         arrays += [*total.springs, *total.nodes, *total.cells, *_blocks(multigrid)]
         own = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
+        arrays += [array for coarse in multigrid.coarse for array in (coarse.sums, *coarse.own, *coarse.others)]
         own += sum(array.nbytes for array in arrays)
     return {"builds": count(HIERARCHY.name), "bytes": comm.allreduce(own)}
 

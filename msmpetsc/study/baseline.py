@@ -11,8 +11,6 @@ counted from the start), momentum to that of the whole mass at the largest kinet
 """
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,9 +21,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 import msmpetsc
 from msmpetsc.errors import InputError, printable
 from msmpetsc.results.disk import write_whole
-from msmpetsc.study.process import environment, last_error
+from msmpetsc.study.cases import launcher
+from msmpetsc.study.forkserver import COLD
+from msmpetsc.study.process import Processes
 
 ERROR = 1e-9  # of each step, relative
+LONGEST = 1e6  # [s] of a run
 GROWTH = 10  # of an error, by contact and buckling
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 NODES = 5  # whose places are stored, evenly spread by their numbers
@@ -71,17 +72,14 @@ class Numbers(_Strict):
 
 
 def simulate(scene: Path, recipe: Recipe, path: Path, ranks: int) -> None:
-    """Run a scene by its recipe into a result file. Raises RuntimeError with the last line where the run fails."""
-    launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
+    """Run a scene by its recipe into a result file. Raises InputError with the last line where the run fails."""
     cells = [] if recipe.cells is None else [f"cages.count={recipe.cells}"]
     options = [*cells, "output.surface=false", *recipe.changes]
-    command = [sys.executable, "-m", "msmpetsc", "run", scene, "-o", path, "--overwrite", "--frames", recipe.steps]
-    command += ["--error", ERROR, *(word for option in options for word in ("--set", option))]
-    done = subprocess.run(
-        [*launcher, *map(str, command)], env=environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True
-    )
-    if done.returncode:
-        raise RuntimeError(last_error(done.stderr) or f"exit status {done.returncode}")
+    words = ["run", scene, "-o", path, "--overwrite", "--frames", recipe.steps, "--error", ERROR]
+    words += [word for option in options for word in ("--set", option)]
+    ended = Processes().run([*launcher(ranks), *COLD, *map(str, words)], path.with_suffix(".log"), LONGEST)
+    if ended.reason:
+        raise InputError(f"{scene}: the run failed: {ended.reason}")
 
 
 def summary(path: Path, recipe: Recipe) -> Numbers:

@@ -13,9 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.errors import InputError
-from msmpetsc.results.comparison import common_times, refuse_different_lattices
+from msmpetsc.results.comparison import common_times, compare_surfaces, refuse_different_lattices
 from msmpetsc.results.reader import Result
-from msmpetsc.results.surfaces import compare_surfaces
 from msmpetsc.study.table import Row
 
 COUNTED = ("iterations", "ksp_its", "products")  # of the steps; an older file lacks the last

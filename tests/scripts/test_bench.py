@@ -12,13 +12,13 @@ import pytest
 
 from msmpetsc.solve.petsc import device
 
-COST = {"cells": 1000, "nodes": 100_000, "memory": 2e8, "time": {"setup": 1.5}}
+COST = {"cells": 1000, "nodes": 100_000, "memory": 2e8, "time": {"setup": 1.5, "cycle": 4.0, "fine": 3.0}}
 
 
 def sample(seconds: list[float]) -> bench.Sample:
     """Return what a run of so many seconds a frame measures, with one iteration, 30 its and 60 products each."""
     frames = {"wall_time": np.array(seconds), "step_error": np.linspace(0, 1e-4, len(seconds))}
-    counts = {"iterations": 1, "ksp_its": 30, "products": 60}
+    counts = {"iterations": 1, "ksp_its": 30, "products": 60, "proof_products": 6}
     return bench.Sample(frames | {name: np.full(len(seconds), count) for name, count in counts.items()}, COST)
 
 
@@ -30,6 +30,7 @@ def test_figures_are_of_all_frames_but_the_first_and_of_the_median_repeat():
     assert (
         row["slowest tenth [ms]"] == pytest.approx(1200) and row["frames/s (paper's CPU, GPU)"] == "1.67 (19.9, 53.4)"
     )
+    assert (row["proof"], row["coarse"]) == ("10.0%", "25.0%")
     assert (row["us a cell"], row["kB a node"], row["error"]) == pytest.approx((600, 2, 1e-4))
 
 

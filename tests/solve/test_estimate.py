@@ -66,6 +66,20 @@ def test_the_estimate_is_within_three_of_the_true_error(
     assert estimated.sum() >= 5 and (ratios[estimated] < 3).all() and (ratios > 1 / 3).all()
 
 
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
+def test_with_multigrid_one_cycle_confirms_what_a_step_has_left(tmp_path: Path, law: str):
+    """What is said is then a bound; a share of 0.6 of all products proved these steps when each was estimated by CG."""
+    scene = SCENES["swings"] | {"material": {"young_modulus": 5e5, "density": 1000.0, "law": law}}
+    solver = "solver={preset='newton-multigrid', error=1e-3}"
+    loaded = load_scene(block_scene(tmp_path, gravity=GRAVITY, **scene), [solver, "cages={cell_size=0.05}"])
+    with TimeLoop(MPI.COMM_SELF, loaded, build_model(MPI.COMM_SELF, loaded), Probes(true_error=1)) as simulation:
+        frames = [frame for frame in simulation.frames() if frame.index]
+    assert min(frame.step_error / frame.true_error for frame in frames) > 0.99
+    assert max(frame.step_error for frame in frames) <= 1e-3
+    proof, products = (sum(getattr(frame, name) for frame in frames) for name in ("proof_products", "products"))
+    assert 0 < proof < 0.35 * products
+
+
 def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
     """A mass on a spring along z: x* in closed form, and g is a parabola, so its error is the other's square."""
     m, k, r = 0.3, 40.0, 1.0

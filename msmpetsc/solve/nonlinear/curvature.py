@@ -3,9 +3,9 @@
 F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H
 is positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is
 looked for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev
-2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the
-third. At length when the body is compressed anew or more than it was, or something showed a negative curvature; at all
-other steps the mode found last is followed in a few iterations.
+2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1); with Jacobi's a single direction was seen to settle
+on the third. At length when the body is compressed anew or more than it was, or something showed a negative curvature;
+at all other steps the mode found last is followed in a few iterations, with multigrid only where its curvature changed.
 """
 
 from collections.abc import Callable
@@ -55,7 +55,8 @@ class SearchEffort(NamedTuple):
 EFFORT = SearchEffort(4, 12, 2)
 # With multigrid smooth modes come at once. But not where something is alarming: one bent by 270 degrees had a lowest
 # curvature of 0.04, and seemed to have 0.35.
-UNIFORM_EFFORT = SearchEffort(2, 3, 1)
+UNIFORM_EFFORT = SearchEffort(2, 2, 1)
+UNCHANGED = 0.1  # of its curvature: a mode that is followed by multigrid is taken as it is
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,8 @@ class LowestCurvature:
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
-        self.its = 0  # of all searches so far, one product with H each
+        self.its = 0  # of all searches so far
+        self.products = 0  # of them with H, and at multigrid's finest level
         self.known: tuple[StepProblem | None, Positions, Compression] = (None, np.empty(0), NONE)  # the last asked for
         self.searched = NONE  # the compression that the last long search was at
         self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
@@ -134,15 +136,9 @@ class LowestCurvature:
         q       : positions (l, 3) [m] that H was linearised at last
         hint    : a direction that may have part in it
         """
-        found, before = None, self.searched
-        more = compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
-        if not (alarm or compression.resists or more):  # in which case modes may have come
-            found = self._followed()
-        if found is None:
-            self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too
-            with self.preconditioner.searching(q, self.functional.problem.contact):
-                found = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
-        values, modes = found
+        products = self.hessian.products + self.preconditioner.products
+        values, modes = self._lowest(q, compression, alarm, hint)
+        self.products += self.hessian.products + self.preconditioner.products - products
         if not np.isfinite(values[0]):  # springs of no length: from a cusp any way leads down
             self.mode = None
             return -np.inf, self._random(1)[0]
@@ -155,12 +151,30 @@ class LowestCurvature:
             return values[0], like(down, parts / max(np.linalg.norm(parts), TINY)) @ down
         return values[0], self.mode
 
+    def _lowest(
+        self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
+    ) -> tuple[Floats, Rows]:
+        """The lowest curvatures (k,) and their modes (k, n), followed or searched for at length."""
+        found, before = None, self.searched
+        more = compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
+        if not (alarm or compression.resists or more):  # in which case modes may have come
+            found = self._followed()
+        if found is None:
+            self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too
+            with self.preconditioner.searching(q, self.functional.problem.contact):
+                found = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
+        return found
+
     def _followed(self) -> tuple[Floats, Rows] | None:
         """Lowest curvatures, and their modes, near the mode found last. None where none is known, or where it has
         stiffened so much that another may be the lowest now: one of 0.29 hid behind one that went from 0.87 to 1.57."""
         if self.mode is None:
             return None
         its = self.effort.followed
+        if self.preconditioner.is_uniform:
+            values, modes = self._iterate(self.mode[None], 1, 0, 0)
+            if abs(values[0] - self.value) <= UNCHANGED * self.value:
+                return np.array([self.value]), modes  # as it was, so that slow changes add up
         values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)
 
@@ -168,12 +182,13 @@ class LowestCurvature:
         """Search from something of each mode, for near a mode that is known a lower one comes up
         late, and without rigid motions, for their curvature mostly is about 1, which would hide a
         lower one as long; then from the best of all of them."""
-        start = self._random(effort.block)
+        is_uniform = effort is UNIFORM_EFFORT
+        start = self._random(effort.block - (is_uniform and self.mode is not None))
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
         known = [] if self.mode is None else [self.mode[None]]
         self.rigid = self._rigid_motions(q)
-        if self.rigid is None and effort is UNIFORM_EFFORT:  # nothing hides a mode, nor is any slow to come
+        if self.rigid is None and is_uniform:  # nothing hides a mode, nor is any slow to come
             return self._iterate(np.concatenate([start, *known]), effort.block, MOST, effort.least)
         _, modes = self._iterate(self._without_rigid(start), effort.block, MOST, effort.least)
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None

@@ -3,6 +3,10 @@
 The error of x is |x - x*|_M / |x - y|_M, estimated (solve.nonlinear.estimate). |F(x)|_(M^-1) / |x -
 y|_M bounds it wherever E is convex between x and x*. Where the bound will do already, or no
 estimate can be had, the bound is the error.
+
+That bound is far too large while what is left of F is rough, and does not tell when an estimate is worth its cost. With
+multigrid the norm that CG works in does: |F|_(P^-1), P the preconditioner, is what a linear solve leaves, known without
+any work. It is believed where F at the next iterate is about that, so that g is a parabola there (LINEAR).
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +29,9 @@ LEAST_RATIO = 10.0  # taken, however near they were: an estimate that comes too 
 EARLY = 2.0  # times the error that would do: when a step is first estimated
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
+LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabola there
+NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
+ATOL = 1e-50  # of KSP: none
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
 NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 KINDS = {
@@ -49,8 +56,10 @@ class Outcome:
     error: float = np.inf  # of the last iterate, estimated or bounded
     bound: float = np.inf  # on it
     residual: float = np.inf  # |F|_(M^-1) of the last iterate
+    distance: float = 0.0  # |x - y|_M of it
     early: float = EARLY  # how many times the goal an error may be to be estimated
     corrected: bool = False
+    left: float = np.inf  # by the linear solve that led here, |r|_(P^-1); infinite where that says nothing
     alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
     at_rounding: bool = False  # F is nothing but rounding
     doubts: int = 0
@@ -77,33 +86,65 @@ class ErrorControl:
         """What is known at an iterate: its error, or a bound on it while that is far too large."""
         residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
         at_rounding, alarm = self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
-        now = replace(before, residual=residual, at_rounding=at_rounding, alarm=alarm, corrected=False)
+        now = replace(
+            before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm, corrected=False
+        )
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
             return replace(now, error=0.0 if at_rounding else np.inf)
         now = replace(now, bound=residual / distance)
-        if now.bound > max(self.ratio, LEAST_RATIO) * now.early * now.goal and not at_rounding:
+        is_near = at_rounding or now.bound <= self._farthest(now)
+        seems_near = self._seems_near(now) if self._is_smooth(now) else is_near
+        if not seems_near and not at_rounding:
             return replace(now, error=now.bound)
         if now.bound <= now.goal:
             lowest = self.curvature.compression(iterate.q).least_curvature
             if lowest > 0 and now.bound <= now.goal * lowest:
                 return replace(now, error=now.bound / lowest)
-        return self.estimated(iterate, distance, now, now.goal)
+        found = self.estimated(iterate, now, now.goal)
+        if is_near or self.estimate.is_trusted:
+            return found
+        return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here
 
-    def estimated(self, iterate: Iterate, distance: float, now: Outcome, goal: float) -> Outcome:
+    def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
+        distance = now.distance
         enough = EARLY * goal * distance if goal else np.inf
-        length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance)
+        trusted = LINEAR * now.left if self._is_smooth(now) else 0.0
+        length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance, trusted=trusted)
         if not np.isfinite(length):
             return replace(now, error=now.bound, alarm=Alarm.HERE)
-        if self.estimate.missing is None:
+        is_known = now.bound <= self._farthest(now) or self.estimate.is_trusted
+        if self.estimate.missing is None and is_known:
             self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
         error = self.rounding.relative(length, self.functional.distance(iterate.q, self.estimate.correction))
         return replace(now, error=error, early=1.0, corrected=True)
 
-    def relative_tolerance(self, now: Outcome) -> float:
-        """ksp_rtol of the next linear solve: it need not gain more digits than are missing."""
+    def _farthest(self, now: Outcome) -> float:
+        """The bound up to which an estimate says something, by what those before have said."""
+        return max(self.ratio, LEAST_RATIO) * now.early * now.goal
+
+    def _seems_near(self, now: Outcome) -> bool:
+        """Whether the linear solve that led here has left so little that an estimate is worth its cost."""
+        return now.left <= EARLY * now.goal * now.distance * np.sqrt(self.estimate.least)
+
+    def _is_smooth(self, now: Outcome) -> bool:
+        """Whether |F|_(P^-1) may bound errors: P is near H, and nothing has shown a negative curvature."""
+        return now.left < np.inf and not now.alarm and self.estimate.least >= NEAR
+
+    def led_by(self, ksp: PETSc.KSP, now: Outcome) -> Outcome:
+        """What is known once a linear solve with the true Hessian has led to the next iterate."""
+        is_natural = ksp.getType() == PETSc.KSP.Type.CG and ksp.getNormType() == PETSc.KSP.NormType.NATURAL
+        if ksp.reason < 0 or not is_natural or not self.estimate.preconditioner.is_uniform:
+            return replace(now, left=np.inf)
+        self.estimate.learn(ksp)
+        return replace(now, left=ksp.getResidualNorm())
+
+    def tolerances(self, now: Outcome) -> tuple[float, float]:
+        """ksp_rtol and ksp_atol of the next linear solve: it need not gain more digits than are missing."""
+        if self._is_smooth(now):
+            return self.tightest, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
         missing = now.bound / self.ratio
-        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST)
+        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), ATOL
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """What is known where a step goes on from a point that is no minimum, or farther from one
@@ -114,10 +155,11 @@ class ErrorControl:
         goal = now.goal if has_moved else CLOSER * now.goal
         if not has_moved and goal < CLOSEST * self.target and np.isfinite(now.error):
             return None
-        return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
+        return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, left=np.inf, corrected=False)
 
     def forget(self) -> None:
         self.ratio = FIRST_RATIO
+        self.estimate.forget()
 
 
 def not_converged(

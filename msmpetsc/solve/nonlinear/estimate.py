@@ -8,7 +8,9 @@ the second is a part of the first and |e_k|_M hardly grows, or when that is over
 end before k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes that are so much stiffer hide the others for that long.
 
 What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends,
-too, once |e_k|_M and that are together an error that will do; their sum is then the estimate.
+too, once |e_k|_M and that are together an error that will do; their sum is then the estimate. With multigrid, where
+lambda is known from the step's own solves, so it is with |r_k|_(P^-1) / sqrt(lambda), which makes much less of what is
+rough: mostly |F|_(P^-1) itself will do, before any iteration.
 """
 
 import numpy as np
@@ -26,6 +28,9 @@ UNIFORMLY_CLOSE = 0.3  # with multigrid, which leaves out nothing that is smooth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
 LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: where g is convex the error is then at most three times what was found
 MOST = 512
+LOWER = 0.7  # of the least eigenvalue that some iterations of CG have come to
+GREATEST = 1.1  # eigenvalue of P^(-1) H, where P has all that H has: not contact that came up since
+FEW, MANY = 2, 4  # iterations: fewer have not come near the least eigenvalue; so many have
 
 
 class ErrorEstimate:
@@ -38,10 +43,13 @@ class ErrorEstimate:
         self.operator = python_matrix(functional.unknowns, hessian, functional.comm)
         self.correction, self.residual = self.operator.createVecs()
         self.length = np.inf  # the last estimate [m sqrt(kg)]
+        self.products = 0  # with H so far, and at multigrid's finest level
         self.right_side: PETSc.Vec | None = None  # of the solve in progress, as the next four
         self.bound = self.enough = np.inf
         self.lowest, self.will_do = 1.0, 0.0
-        self.missing: float | None = None  # of a length that will do, |r_k|_(M^-1)
+        self.trusted = self.begun = 0.0  # |F|_(P^-1) up to which that norm bounds errors, and as it was
+        self.missing: float | None = None  # of a length that will do
+        self.least = 0.0  # eigenvalue of P^(-1) H that CG has come to; 0 where none is known
         self.lengths: dict[int, float] = {}  # |e_k|_M by iteration
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
@@ -55,23 +63,33 @@ class ErrorEstimate:
         self.ksp.setConvergenceTest(self._converged)
 
     def __call__(
-        self, iterate: Iterate, bound: float, enough: float, will_do: float = 0.0, lowest: float = 1.0
+        self,
+        iterate: Iterate,
+        bound: float,
+        enough: float,
+        will_do: float = 0.0,
+        lowest: float = 1.0,
+        trusted: float = 0.0,
     ) -> float:
         """Estimate |x - x*|_M at an iterate (collective); a result over ``enough`` may be too low.
 
         bound   : on it, |F|_(M^-1) where H is no less than M
         will_do : an error bounded by that need not be known better
         lowest  : eigenvalue of M^(-1) H, as far as is known
+        trusted : |F|_(P^-1) up to which that norm may bound the error
 
         Infinite where the Hessian is not positive definite: no linear correction shows the way.
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
         self.lowest, self.lengths = min(lowest, 1.0), {}
-        self.will_do, self.missing = will_do, None
+        self.will_do, self.missing, self.trusted = will_do, None, trusted
+        before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
             self.linearise(iterate.q)
             self.ksp.solve(iterate.f, self.correction)
+            self.learn(self.ksp)
             self.length = self._length() if self.ksp.reason > 0 else np.inf
+        self.products += self.hessian.products + self.preconditioner.products - before
         return self.length
 
     def _length(self) -> float:
@@ -96,7 +114,10 @@ class ErrorEstimate:
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
         every = 1 if self.preconditioner.is_uniform else CHECK_EVERY
-        if residual > 0 and (its == 0 or its % max(every // 2, 1)):
+        if its == 0:
+            self.begun = residual
+        too_early = residual > self.trusted if its == 0 else bool(its % max(every // 2, 1))
+        if residual > 0 and too_early:
             return reasons.ITERATING
         length = self.lengths[its] = self.functional.norm(ksp.getSolution())
         if residual == 0 or its >= MOST or length > self.enough or self._will_do(length, residual):
@@ -111,11 +132,41 @@ class ErrorEstimate:
         """Whether |e_k|_M, here ``length``, and all that may be missing are together less than will do."""
         if length + residual > self.will_do:  # as the preconditioner is no more than M^(-1), |r_k|_(M^-1) is no less
             return False
-        missing = self._left()
+        missing = self._missing(residual)
         if length + missing > self.will_do:
             return False
         self.missing = missing
         return True
+
+    @property
+    def is_trusted(self) -> bool:
+        """Whether |F|_(P^-1) bounds the error of what is estimated."""
+        return self.begun <= self.trusted
+
+    def _missing(self, residual: float) -> float:
+        """Bound on what is missing of |e|_M, by the norm of the residual in M^-1 or, where CG has come to the least
+        eigenvalue of P^(-1) H, in P^-1, which makes much less of what is rough."""
+        missing = self._left()
+        if not self.is_trusted:
+            return missing
+        least = LOWER * self._least(self.ksp) * self.lowest
+        return min(missing, residual / np.sqrt(least)) if least > 0 else missing
+
+    def _least(self, ksp: PETSc.KSP) -> float:
+        """The least eigenvalue of P^(-1) H that is known, that of a solve by CG included; 0 where there is none."""
+        if ksp.its < FEW:
+            return self.least
+        least = ksp.computeExtremeSingularValues()[1]
+        if not 0 < least <= GREATEST:
+            return 0.0
+        return least if ksp.its >= MANY or not self.least else min(least, self.least)
+
+    def learn(self, ksp: PETSc.KSP) -> None:
+        """A solve by CG with this Hessian and preconditioner has ended."""
+        self.least = self._least(ksp)
+
+    def forget(self) -> None:
+        self.least = 0.0
 
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Whether e is near in the norm of H, as far as CG can show."""

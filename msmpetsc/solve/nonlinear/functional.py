@@ -153,8 +153,9 @@ class StepFunctional:
 
     def distance(self, q: Positions, correction: PETSc.Vec | None = None) -> float:
         """|q - e - y|_M over the free nodes, e a ``correction`` of q: what errors of the step are relative to."""
-        free = self.unknowns.free
-        columns = (q[free] - self.problem.y[free]).T.ravel()
+        columns = np.empty_like(self.mass)
+        self.unknowns.collect(q - self.problem.y, columns.reshape(3, -1))
         if correction is not None:
             columns -= self.memory.read(correction)
-        return float(np.sqrt(self.comm.allreduce(float(columns**2 @ self.mass))))
+        columns *= columns
+        return float(np.sqrt(self.comm.allreduce(float(columns @ self.mass))))

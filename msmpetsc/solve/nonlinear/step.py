@@ -144,6 +144,7 @@ class Stepper:
         if self.preset.start_from_b:
             ksp.setInitialGuessNonzero(True)
         snes.setFromOptions()
+        ksp.setComputeEigenvalues(ksp.getType() == PETSc.KSP.Type.CG)
         return snes, ksp
 
     def _create_control(self) -> tuple[ErrorControl, Minimum]:
@@ -222,7 +223,8 @@ class Stepper:
         of_estimates = total_iterations(self.control.estimate.ksp)
         ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
-        return Work(iterations=self.iterations, ksp_its=ksp_its, products=products)
+        proof = self.control.estimate.products + self.minimum.curvature.products
+        return Work(iterations=self.iterations, ksp_its=ksp_its, products=products, proof_products=proof)
 
     def solve_once(self, outcome: Outcome) -> Outcome:
         """Bring F at x down to the goal of an outcome so far, by SNES (collective). Raises StepFailed.
@@ -361,6 +363,8 @@ class Stepper:
         reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
+            is_true = self.preset.true_hessian and not self.projected
+            self.outcome = self.control.led_by(self.ksp, self.outcome) if is_true else self.outcome
         if its > 0 or not self.has_npc:  # else known since _is_solved
             self.outcome = self.control.judge(iterate, self.outcome)
         outcome = self.outcome
@@ -376,7 +380,7 @@ class Stepper:
             return reasons.CONVERGED_SNORM_RELATIVE if outcome.corrected else reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
             if not outcome.corrected:
-                self.outcome = self.control.estimated(iterate, self.functional.distance(iterate.q), outcome, 0.0)
+                self.outcome = self.control.estimated(iterate, outcome, 0.0)
             return reasons.CONVERGED_ITS
         self._adapt()
         return reasons.ITERATING
@@ -391,7 +395,8 @@ class Stepper:
     def _adapt(self) -> None:
         """Let the next linear solve leave what the step can do with; a tolerance of the user's own is left alone."""
         if self.preset.inexact and self.options.is_default("ksp_rtol"):
-            self.ksp.setTolerances(rtol=self.control.relative_tolerance(self.outcome))
+            rtol, atol = self.control.tolerances(self.outcome)
+            self.ksp.setTolerances(rtol=rtol, atol=None if self.options.is_given("ksp_atol") else atol)
 
     def _abandon(self) -> None:
         """Keep PETSc's objects for ever: after an error they may crash when they are destroyed."""

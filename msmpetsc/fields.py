@@ -74,6 +74,7 @@ class Frame:
     energy_error: Annotated[float, _number("f8", "1", "true relative error of a step, in energy")] = math.nan
     inverted: Annotated[int, _number("i8", "1", "cells turned inside out, -1 if not counted")] = 0
     products: Annotated[int, _number("i8", "1", "products with the Hessian, and at multigrid's finest level")] = 0
+    proof_products: Annotated[int, _number("i8", "1", "of these, to estimate errors and to search for saddles")] = 0
     substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0
     fallbacks: Annotated[int, _number("i8", "1", "steps solved by the robust method")] = 0
     energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0

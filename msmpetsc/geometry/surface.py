@@ -55,8 +55,6 @@ class SurfaceReport:
 
     nonmanifold_edges    : edges of more than two triangles
     inconsistent_edges   : edges whose two triangles run along them in the same direction
-    degenerate_triangles : triangles with two corners at the same position
-    unused_points        : points of no triangle
     """
 
     volume: float  # [m^3], signed: negative if wound inwards; of little meaning if open
@@ -64,8 +62,6 @@ class SurfaceReport:
     boundary_edges: int
     nonmanifold_edges: int
     inconsistent_edges: int
-    degenerate_triangles: int
-    unused_points: int
 
     @property
     def closed(self) -> bool:
@@ -78,16 +74,13 @@ def examine(surface: Surface) -> SurfaceReport:
     corners = surface.points[surface.triangles]  # (f, 3 corners, 3)
     corners = corners - surface.points[surface.triangles[0, 0]]  # small numbers round less
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    merged = merged_triangles(surface)
-    used, forward = edge_use(merged)
+    used, forward = edge_use(merged_triangles(surface))
     return SurfaceReport(
         volume=float(np.einsum("ij,ij->", corners[:, 0], normals) / 6),
         area=float(np.linalg.norm(normals, axis=1).sum() / 2),
         boundary_edges=int((used == 1).sum()),
         nonmanifold_edges=int((used > 2).sum()),
         inconsistent_edges=int(((used == 2) & (forward != 1)).sum()),
-        degenerate_triangles=len(surface.triangles) - len(merged),
-        unused_points=len(surface.points) - len(np.unique(surface.triangles)),
     )
 
 

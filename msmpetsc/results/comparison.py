@@ -1,6 +1,7 @@
-"""Two runs of one lattice held against each other, frame by frame, without MPI and without PETSc.
+"""Two runs held against each other, frame by frame, without MPI and without PETSc.
 
-An error is the greatest difference at a frame over the scale of its field, which is the same for all frames:
+Of one lattice all fields are. An error is the greatest difference at a frame over the scale of its field, which is
+the same for all frames:
 
     position, surface                       the largest displacement from rest, at least 1e-6 of a body's longest side
     kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
@@ -9,8 +10,12 @@ An error is the greatest difference at a frame over the scale of its field, whic
 
 each over both runs and all frames compared. What the digits of the coarser of the two stored types
 cannot tell apart is equal, and so are two NaN, or two infinities of one sign.
+
+Of different lattices of one mesh their surfaces are, point by point: both carry the same points of the same mesh, so
+that nothing is projected or interpolated. A point counts by the area around it, a third of its triangles'.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,6 +31,8 @@ COMPARED = ("position", "surface", *ENERGIES, "momentum")
 LEAST_STRAIN = 1e-6  # of the body or of a spring: less is rounding
 SAME_POINT = 1e-6  # of a cell
 SAME_TIME = 1e-6  # of the spacing of frames
+OF_SURFACES = ("frames/surface", "surface/points", "surface/triangles")
+MEAN = "surface, rms"  # name of the field
 
 
 class DifferentLattices(InputError):
@@ -193,10 +200,17 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
         refuse(f"{len(nodes)} and {len(b_nodes)} nodes, cells of {sizes[0]:.4g} m and {sizes[1]:.4g} m")
     if abs(sizes[0] - sizes[1]) > SAME_POINT * sizes[0]:
         refuse(f"cells of {sizes[0]:.6g} m and {sizes[1]:.6g} m")
-    same = rows_agree(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0))
-    if not same.all():
-        node = int(np.argmin(same))
-        refuse(f"node {node} rests at {point_text(nodes[node])} in one, at {point_text(b_nodes[node])} in the other")
+    if where := first_apart(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0)):
+        refuse(f"node {where}")
+
+
+def first_apart(a: Positions, b: Positions, slack: float) -> str:
+    """Return which of points (n, 3) [m] is the first that two runs have farther apart than this, in words."""
+    same = rows_agree(a, b, slack)
+    first = int(np.argmin(same))
+    return (
+        "" if same.all() else f"{first} rests at {point_text(a[first])} in one, at {point_text(b[first])} in the other"
+    )
 
 
 def cell_size(run: Result, nodes: Positions) -> float:
@@ -222,3 +236,71 @@ def common_times(a: Floats, b: Floats) -> Indices:
     near = near.clip(0, len(b) - 1)
     same = np.abs(b[near] - a) <= slack
     return np.column_stack([np.nonzero(same)[0], near[same]])
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is far apart, and is reported as that
+def compare_surfaces(run: Result, reference: Result, until: float = math.inf) -> Comparison:
+    """Return how far the surface of a run is from that of a reference run, at the times that both have.
+
+    Its fields are the greatest distance of a point, and the root mean square over the area (MEAN).
+    Both are relative to the largest displacement of a point in the reference, their scale [m]; if
+    that is 0, as none moves, they are in metres.
+
+    until : times after it do not count [s]
+
+    Raises InputError where a file has no surface, the meshes differ or no time is common.
+    """
+    refuse_different_meshes(run, reference)
+    rest, area = reference["surface/points"][:], point_areas(reference)
+    times = run.frames.time[:]
+    pairs = common_times(times, reference.frames.time[:])
+    pairs = pairs[times[pairs[:, 0]] <= until * (1 + SAME_TIME)]
+    if reference.scene.get("time", {}).get("integrator") == "static":
+        pairs = pairs[times[pairs[:, 0]] > 0]  # when it is in its rest shape, which is no state of equilibrium
+    if not len(pairs):
+        raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
+    worst = np.empty(len(pairs), int)
+    greatest, rms = np.empty((2, len(pairs)))
+    moved = 0.0
+    for number, (of_run, of_reference) in enumerate(pairs):
+        true = np.asarray(reference.frames.surface[of_reference], float)
+        apart = np.linalg.norm(run.frames.surface[of_run] - true, axis=1)
+        apart[np.isnan(apart)] = np.inf
+        rms[number] = np.sqrt(area @ apart**2 / area.sum())
+        worst[number] = np.argmax(apart)
+        greatest[number] = apart[worst[number]]
+        moved = max(moved, float(np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0)))
+    if moved <= LEAST_STRAIN * longest_side(rest, reference.body_of("surface")):
+        moved = 0.0  # less is rounding
+    scale = moved or 1.0
+    surface = FieldError("surface", "m", moved, greatest / scale, worst)
+    mean = FieldError(MEAN, "m", moved, rms / scale, worst)
+    return Comparison(pairs, times[pairs[:, 0]], [surface, mean], [])
+
+
+def point_areas(run: Result) -> Array:
+    """Return the area around each surface point at rest, (v,) [m^2]: a third of its triangles'."""
+    points, triangles = run["surface/points"][:], run.indices("surface/triangles")
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    around = np.bincount(triangles.ravel(), np.repeat(areas / 3, 3), len(points))
+    return around if around.sum() > 0 else np.ones(len(points))
+
+
+def refuse_different_meshes(a: Result, b: Result) -> None:
+    """Raise InputError with the first reason why the two do not carry the same surface."""
+    for run in (a, b):
+        missing = next((name for name in OF_SURFACES if name not in run), None)
+        if missing is not None:
+            raise InputError(f"{run.path} has no {missing}: it was run with output.surface = false")
+
+    def refuse(reason: str) -> None:
+        raise InputError(f"{a.path} and {b.path} are runs of different meshes: {reason}")
+
+    points, b_points = a["surface/points"][:], b["surface/points"][:]
+    if len(points) != len(b_points) or not len(points):
+        refuse(f"{len(points)} and {len(b_points)} surface points")
+    if where := first_apart(points, b_points, SAME_POINT * np.ptp(points, axis=0).max()):
+        refuse(f"point {where}")
+    if not np.array_equal(a["surface/triangles"][:], b["surface/triangles"][:]):
+        refuse("their triangles join other points")

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.results.comparison import common_times
+from msmpetsc.results.comparison import common_times, refuse_different_meshes
 from msmpetsc.results.gaps import SurfaceGaps, gaps_to_obstacles
 from msmpetsc.results.reader import Result
-from msmpetsc.results.surfaces import refuse_different_meshes
 from msmpetsc.view.drawable import Drawable
 
 BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"

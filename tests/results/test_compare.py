@@ -11,9 +11,8 @@ from small_result import DT, FRAMES, NODES, POINTS, frame, number, position
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
-from msmpetsc.results.comparison import COMPARED, compare, difference
+from msmpetsc.results.comparison import COMPARED, compare, compare_surfaces, difference, point_areas
 from msmpetsc.results.reader import Result
-from msmpetsc.results.surfaces import compare_surfaces, point_areas
 from msmpetsc.study.metrics import surface_error
 
 DISPLACED = 0.1 * (FRAMES - 1) * 0.5  # [m]: the top of the sheared bar at the last frame

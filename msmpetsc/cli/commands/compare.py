@@ -8,9 +8,16 @@ from typing import Any
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.results.comparison import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
+from msmpetsc.results.comparison import (
+    Comparison,
+    DifferentLattices,
+    FieldError,
+    compare,
+    compare_surfaces,
+    point_text,
+    rest_of,
+)
 from msmpetsc.results.reader import Result, refuse_deadly
-from msmpetsc.results.surfaces import compare_surfaces
 
 SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"

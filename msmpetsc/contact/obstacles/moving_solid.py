@@ -22,8 +22,8 @@ class Obstacle(Timed):
     path        : how it moves
     start, stop : it is there while start <= time < stop [s]; None: to the end
     key         : of its table in the scene, for messages
-    outside     : (l,) how far nodes stick out of the surface at rest [m] (obstacles.outside): they go so much deeper
-        before the surface meets the obstacle. None: they are the surface
+    outside     : (l,) how far nodes stick out of the surface at rest [m] (build.nearest_of_body): they go so much
+        deeper before the surface meets the obstacle. None: they are the surface
     """
 
     solid: Solid

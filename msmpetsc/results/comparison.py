@@ -207,10 +207,10 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
 def first_apart(a: Positions, b: Positions, slack: float) -> str:
     """Return which of points (n, 3) [m] is the first that two runs have farther apart than this, in words."""
     same = rows_agree(a, b, slack)
+    if same.all():
+        return ""
     first = int(np.argmin(same))
-    return (
-        "" if same.all() else f"{first} rests at {point_text(a[first])} in one, at {point_text(b[first])} in the other"
-    )
+    return f"{first} rests at {point_text(a[first])} in one, at {point_text(b[first])} in the other"
 
 
 def cell_size(run: Result, nodes: Positions) -> float:

@@ -198,13 +198,24 @@ def test_parts_that_are_as_good_as_rigid_are_refused_at_once(tmp_path: Path, sof
         load_scene(write_case(tmp_path, "crushed"), [f"material.young_modulus={soft!r}", PART % stiff])
 
 
+def error_study(*words: object) -> str:
+    """What scripts/error_study.py prints."""
+    command = [sys.executable, "-W", "ignore", ROOT / "scripts" / "error_study.py", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def shares_said(seed: int, number: int, *changes: str) -> list[float]:
+    """The error that each step of one of its scenes says, over the true one."""
+    printed = error_study("--seed", seed, "--only", number, *(word for change in changes for word in ("--set", change)))
+    return [error / true for error, true in json.loads(printed)["steps"]]
+
+
 def test_random_hard_scenes_say_no_less_than_a_third_of_their_error(tmp_path: Path):
     """A sample of what scripts/error_study.py draws; it takes 500."""
     told = tmp_path / "rows.json"
-    script = ROOT / "scripts" / "error_study.py"
-    command = [sys.executable, "-W", "ignore", script, "--scenes", "12", "--seed", "7", "--json", told]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
-    assert done.returncode == 0, done.stdout + done.stderr
+    error_study("--scenes", 12, "--seed", 7, "--json", told)
     rows = json.loads(told.read_text())
     assert len(rows) == 12 and sum(len(row["steps"]) for row in rows) > 15
 
@@ -217,20 +228,11 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(seed: int, number: int, chan
     """Friction and contact make F at the next iterate another than CG has left of it: errors of 0.3 and 1.6 were
     said to be 0.08 and 0.07. What is said is an estimate all the same: of the first step's error 0.76 on one machine,
     before that bound was taken, too, and more than 0.9 on another."""
-    script = ROOT / "scripts" / "error_study.py"
-    changes = ['solver.preset="newton-multigrid"', *changes]
-    words = ["--seed", str(seed), "--only", str(number), *(word for change in changes for word in ("--set", change))]
-    command = [sys.executable, "-W", "ignore", script, *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert [error / true > 0.6 for error, true in json.loads(done.stdout)["steps"]] == 3 * [True]
+    said = shares_said(seed, number, 'solver.preset="newton-multigrid"', *changes)
+    assert [share > 0.6 for share in said] == 3 * [True]
 
 
 def test_a_mode_that_stiffens_hides_no_lower_one():
     """A step said 0.13 of its error while the search for curvature followed the mode of the step before (1.57, when the
     lowest was 0.29): on the way to its solution the Hessian had negative curvatures."""
-    script = ROOT / "scripts" / "error_study.py"
-    command = [sys.executable, "-W", "ignore", script, "--seed", "28", "--only", "11"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert [error / true > 0.9 for error, true in json.loads(done.stdout)["steps"]] == 3 * [True]
+    assert [share > 0.9 for share in shares_said(28, 11)] == 3 * [True]

@@ -347,5 +347,5 @@ def _contacts(
             continue
         stiffness, friction = table.stiffness or usual, table.friction or 0.0
         slows = None if restitution == 1 else restitution
-        penalties.append(Penalty(obstacle, stiffness, friction, stick, slows))
+        penalties.append(Penalty(obstacle, stiffness, friction, table.friction_speed or stick, slows))
     return exchanges, penalties

@@ -9,6 +9,8 @@ from msmpetsc.scene.motion import PATH, Path3
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.values import Box, FunctionName, NotNegative, Positive, Table, UnitVector, Vector, after_start
 
+FRICTION_SPEED = "slip speed below which friction fades, so that what it holds creeps [m/s]; 1% a second of "
+
 NEEDED = {
     "plane": ("point", "normal"),
     "box": ("box",),
@@ -46,6 +48,9 @@ class ObstacleTable(Table):
         None, description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent'
     )
     friction: NotNegative | None = Field(None, description='of "penalty": Coulomb\'s coefficient; 0 if absent [-]')
+    friction_speed: Positive | None = Field(
+        None, description=f'of "penalty": {FRICTION_SPEED}the largest body\'s longest side if absent'
+    )
 
     _after_start = field_validator("stop")(after_start)
 
@@ -55,7 +60,8 @@ class ObstacleTable(Table):
         if missing:
             raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
         uses: dict[str, tuple[str, ...]] = {name: (shape,) for shape, names in NEEDED.items() for name in names}
-        uses |= {"restitution": ("reflect", "exchange"), "stiffness": ("penalty",), "friction": ("penalty",)}
+        uses |= {name: ("penalty",) for name in ("stiffness", "friction", "friction_speed")}
+        uses["restitution"] = ("reflect", "exchange")
         for name, use in uses.items():
             if getattr(self, name) is not None and not {self.shape, self.response} & set(use):
                 raise rule(f"has {name}, which is for {' or '.join(map(repr, use))} only")
@@ -71,6 +77,9 @@ class SelfContactTable(Table):
         "or the median distance of a coarser surface from the body's own if that is more",
     )
     friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
+    friction_speed: Positive | None = Field(
+        None, description=f"{FRICTION_SPEED}the largest body's longest side if absent"
+    )
     surface: int | None = Field(
         None,
         ge=4,

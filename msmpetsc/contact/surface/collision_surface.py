@@ -45,7 +45,8 @@ def collision_surface(
     # takes both of each contact; with those of the stiffest cell it, and the energy of a state, is always the same.
     mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
     layer = (PER_EDGE * lattice.stiffest(comm) + mass / scene.time.step**2) / lattice.cell_size**2
-    law = BarrierLaw(distance, float(distance**2 * layer), table.friction, STICK * float(sides.max()))
+    stick = table.friction_speed or STICK * float(sides.max())
+    law = BarrierLaw(distance, float(distance**2 * layer), table.friction, stick)
     return CollisionSurface(joined(surfaces), SurfacePoints(comm, lattice, embedding), law)
 
 

@@ -9,7 +9,10 @@ from msmpetsc.scene.motion import PATH, Path3
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.values import Box, FunctionName, NotNegative, Positive, Table, UnitVector, Vector, after_start
 
-FRICTION_SPEED = "slip speed below which friction fades, so that what it holds creeps [m/s]; 1% a second of "
+FRICTION_SPEED = (
+    "slip speed below which friction fades, so that what it holds creeps; "
+    "1% of the largest body's longest side a second if absent [m/s]"
+)
 
 NEEDED = {
     "plane": ("point", "normal"),
@@ -48,9 +51,7 @@ class ObstacleTable(Table):
         None, description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent'
     )
     friction: NotNegative | None = Field(None, description='of "penalty": Coulomb\'s coefficient; 0 if absent [-]')
-    friction_speed: Positive | None = Field(
-        None, description=f'of "penalty": {FRICTION_SPEED}the largest body\'s longest side if absent'
-    )
+    friction_speed: Positive | None = Field(None, description=f'of "penalty": {FRICTION_SPEED}')
 
     _after_start = field_validator("stop")(after_start)
 
@@ -60,8 +61,8 @@ class ObstacleTable(Table):
         if missing:
             raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
         uses: dict[str, tuple[str, ...]] = {name: (shape,) for shape, names in NEEDED.items() for name in names}
-        uses |= {name: ("penalty",) for name in ("stiffness", "friction", "friction_speed")}
-        uses["restitution"] = ("reflect", "exchange")
+        uses |= dict.fromkeys(("stiffness", "friction", "friction_speed"), ("penalty",))
+        uses |= {"restitution": ("reflect", "exchange")}
         for name, use in uses.items():
             if getattr(self, name) is not None and not {self.shape, self.response} & set(use):
                 raise rule(f"has {name}, which is for {' or '.join(map(repr, use))} only")
@@ -77,9 +78,7 @@ class SelfContactTable(Table):
         "or the median distance of a coarser surface from the body's own if that is more",
     )
     friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
-    friction_speed: Positive | None = Field(
-        None, description=f"{FRICTION_SPEED}the largest body's longest side if absent"
-    )
+    friction_speed: Positive | None = Field(None, description=FRICTION_SPEED)
     surface: int | None = Field(
         None,
         ge=4,

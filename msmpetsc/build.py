@@ -11,7 +11,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Row
 from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.clamp import clamped
 from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
-from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
+from msmpetsc.constraints.loads import Anchor, Load, OwnForce, RigidMotion, spread_by_mass, total_of
 from msmpetsc.constraints.reactions import Holders
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
@@ -76,7 +76,7 @@ class Model:
     retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
-    holders: Holders = field(default_factory=lambda: Holders((), np.zeros(0, np.int64)))
+    holders: Holders = field(default_factory=lambda: Holders((), np.zeros(0, np.int64), np.zeros((0, 3))))
 
     @property
     def body_of_point(self) -> Indices:
@@ -160,7 +160,8 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     points = shape.nearest(lattice) if has_regions else lattice.nodes
     masks = regions(scene, lattice, finder, points)
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
-    anchors = _anchors(scene.tables("anchor"), lattice, masks)
+    holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
+    anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
@@ -183,7 +184,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),
-        holders=Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice.owned),
+        holders=holders,
     )
 
 
@@ -284,13 +285,15 @@ def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
     return build_lattice(shape.cages, material, shape.topology)
 
 
-def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions) -> list[Anchor]:
+def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders) -> list[Anchor]:
     """Return the anchors: a pin is stronger than an anchor, and of two anchors on a node the first."""
     anchors = []
     taken = lattice.pinned
     for anchor in tables:
         where = masks[anchor.key] & ~taken
-        anchors.append(Anchor(where, Motion.through(anchor.table.path), anchor.table.stop))
+        middle = holders.centers[holders.keys.index(anchor.key)]
+        center = middle if anchor.table.center is None else np.array(anchor.table.center)
+        anchors.append(Anchor(where, RigidMotion.through(anchor.table.path, center), anchor.table.stop))
         taken = taken | where
     return anchors
 

@@ -103,14 +103,17 @@ class Environment:
         """Return the nodes (l,) bool that are no unknowns, pinned or held by an anchor."""
         return reduce(np.logical_or, (anchor.where for anchor in self.anchors_at(time)), self.lattice.pinned)
 
-    def prescribed(self, q: Positions, time: float) -> Positions | None:
-        """Return q with the anchored nodes where they will be; None if there are none."""
+    def prescribed(self, q: Positions, time: float, begin: float = 0.0, share: float = 1.0) -> Positions | None:
+        """Return q with the anchored nodes where they will be; None if there are none.
+
+        begin, share : they have made but this share of their path from ``begin`` [s] to ``time`` [s]
+        """
         anchors = self.anchors_at(time)
         if not anchors:
             return None
         for anchor in anchors:
-            target = self.lattice.nodes + like(q, anchor.path.displacement_at(time))
-            q = np.where(anchor.where[:, None], target, q)
+            pose = (1 - share) * anchor.path.value_at(begin) + share * anchor.path.value_at(time)
+            q = np.where(anchor.where[:, None], anchor.path.moved(self.lattice.nodes, pose), q)
         return q
 
     def is_same(self, begin: float, end: float) -> bool:
@@ -118,7 +121,7 @@ class Environment:
 
         def at(time: float) -> list[Any]:
             loads = [load.state_at(time) for load in self.pulling]
-            anchors = [anchor.holds_at(time) and tuple(anchor.path.displacement_at(time)) for anchor in self.anchors]
+            anchors = [anchor.holds_at(time) and tuple(anchor.path.value_at(time)) for anchor in self.anchors]
             obstacles = [o.acts_at(time) and tuple(o.path.displacement_at(time)) for o in self.obstacles]
             return [*loads, *anchors, *obstacles]
 

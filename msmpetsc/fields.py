@@ -87,6 +87,7 @@ class Frame:
         default_factory=lambda: np.zeros(3)
     )
     reaction: Annotated[Rows | None, Field("f8", ("T", "a", 3), "N", "force of a pin or anchor")] = None
+    torque: Annotated[Rows | None, Field("f8", ("T", "a", 3), "N m", "torque of a pin or anchor")] = None
     push: Annotated[Rows | None, Field("f8", ("T", "o", 3), "N", "force of an obstacle, blows left out")] = None
     contact_push: Annotated[Rows | None, Field("f8", ("T", "b", 3), "N", "force on a body where surfaces meet")] = None
     probe: Annotated[Rows | None, Field("f8", ("T", "w", 3), "m", "position of a probe")] = None

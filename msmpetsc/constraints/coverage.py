@@ -91,9 +91,10 @@ def reach_of(
 
 
 def _leads_alike(a: Anchor, b: Anchor) -> bool:
-    """Return whether two anchors have the same path and stop: on a node of both it does not matter which has it."""
-    same = np.array_equal(a.path.times, b.path.times)
-    return same and np.array_equal(a.path.vectors, b.path.vectors) and a.stop == b.stop
+    """Return whether it does not matter which of two anchors has a node: path, center and stop are the same."""
+    same = np.array_equal(a.path.times, b.path.times) and np.array_equal(a.path.vectors, b.path.vectors)
+    turns = a.path.vectors[:, 3:].any()
+    return same and a.stop == b.stop and not (turns and (a.path.center != b.path.center).any())
 
 
 def _warn_of_overruled(reach: Reach, pinned: int, prescribed: int) -> None:

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import ForceFunction
-from msmpetsc.scene.motion import ForceTable, Keyframe
+from msmpetsc.scene.motion import ForceTable, Keyframe, Pose
 from msmpetsc.scene.values import Vector
 
 if TYPE_CHECKING:
@@ -25,13 +26,13 @@ def within(time: float, start: float, stop: float | None) -> bool:
 
 @dataclass(frozen=True)
 class Lines:
-    """Vectors (k, 3) at ascending times (k,) [s], straight lines between them; before and after, the first and last."""
+    """Vectors (k, c) at ascending times (k,) [s], straight lines between them; before and after, the first and last."""
 
     times: Floats
     vectors: Rows
 
     def value_at(self, time: float) -> Floats:
-        """Return the vector (3,) at a time [s]."""
+        """Return the vector (c,) at a time [s]."""
         return np.array([np.interp(time, self.times, along) for along in self.vectors.T])
 
 
@@ -40,7 +41,7 @@ class Motion(Lines):
 
     @classmethod
     def through(cls, keyframes: Iterable[Keyframe]) -> "Motion":
-        """Return the motion of a scene's obstacle or anchor."""
+        """Return the motion of a scene's obstacle."""
         stops = [(0.0, (0.0, 0.0, 0.0)), *((k.time, k.by) for k in keyframes)]
         return cls(np.array([time for time, _ in stops]), np.array([by for _, by in stops], float))
 
@@ -56,6 +57,30 @@ class Motion(Lines):
     def displacement_between(self, begin: float, end: float) -> Floats:
         """Return the way (3,) [m] that the motion makes good from one time [s] to another."""
         return self.value_at(end) - self.value_at(begin)
+
+
+@dataclass(frozen=True)
+class RigidMotion(Lines):
+    """Displacements [m] and turns [rad], rotation vectors, side by side (k, 6); none at time 0, the first.
+
+    center : (3,) about which it turns [m], at rest
+    """
+
+    center: Floats
+
+    @classmethod
+    def through(cls, poses: Iterable[Pose], center: Floats) -> "RigidMotion":
+        """Return the motion of a scene's anchor."""
+        stops = [(0.0, np.zeros(6)), *((p.time, np.hstack([p.by, np.radians(p.turn)])) for p in poses)]
+        return cls(np.array([time for time, _ in stops]), np.array([pose for _, pose in stops]), center)
+
+    def moved(self, x: Positions, pose: Floats) -> Positions:
+        """Return where points x (n, 3) [m] are in a pose (6,): c + R (x - c) + by, R of Rodrigues' formula."""
+        by, turn = like(x, pose[:3]), pose[3:]
+        if not turn.any():
+            return x + by
+        center, rotation = like(x, self.center), like(x, Rotation.from_rotvec(turn).as_matrix())
+        return (x - center) @ rotation.T + center + by
 
 
 def total_of(total: Vector | ForceTable) -> Lines:
@@ -74,7 +99,7 @@ class Anchor:
     """
 
     where: Mask
-    path: Motion
+    path: RigidMotion
     stop: float | None
 
     def holds_at(self, time: float) -> bool:

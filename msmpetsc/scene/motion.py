@@ -1,7 +1,7 @@
 """Tables of what moves the body: its start, gravity, pins, anchors, forces."""
 
 from itertools import pairwise
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -67,7 +67,21 @@ class Keyframe(Table):
     by: Vector = Field(description="displacement from the start [m]")
 
 
-def _ascending(path: tuple[Keyframe, ...]) -> tuple[Keyframe, ...]:
+class Pose(Keyframe):
+    """A place on a path on which nodes turn as one rigid body."""
+
+    by: Vector = Field((0.0, 0.0, 0.0), description="displacement from the start [m]")
+    turn: Vector = Field(
+        (0.0, 0.0, 0.0),
+        description="turn from the start, right-handed about this vector's direction by its length, also by more than "
+        "360 [degrees]",
+    )
+
+
+KeyframeType = TypeVar("KeyframeType", bound=Keyframe)
+
+
+def _ascending(path: tuple[KeyframeType, ...]) -> tuple[KeyframeType, ...]:
     if any(a.time >= b.time for a, b in pairwise(path)):
         raise rule("must have ascending times")
     return path
@@ -145,8 +159,15 @@ class Force(Table):
 
 
 class AnchorTable(Table):
-    """Nodes that are led along a path, each keeping its place among them."""
+    """Nodes that are led along a path as one rigid body, each keeping its place among them."""
 
     region: Region = Field(description="the nodes led")
-    path: Path3 = Field(min_length=1, description=f"how they move: {PATH} [s, m]")
+    path: Annotated[ListOf[Pose], AfterValidator(_ascending)] = Field(
+        min_length=1, description=f"how they move: {PATH} [s, m, degrees]"
+    )
+    center: Vector | None = Field(
+        None,
+        description="point at rest about which they turn, and which the path leads along; if absent the centre of mass "
+        "of the nodes [m]",
+    )
     stop: Positive | None = Field(None, description="let go at this time [s]; never if absent")

@@ -26,7 +26,8 @@ class Forces:
         self.elasticity = elasticity
         self.pushing = [number for number, obstacle in enumerate(scene.obstacle) if obstacle.response != "exchange"]
         bodies = len(model.lattice.first_of_body) if model.collision else 0
-        rows = {"reaction": len(model.holders.keys), "push": len(model.obstacles), "contact_push": bodies}
+        held = len(model.holders.keys)
+        rows = {"reaction": held, "torque": held, "push": len(model.obstacles), "contact_push": bodies}
         self.rows = {name: count for name, count in rows.items() if count}
 
     def __call__(self, q: Positions, time: float, sides: Indices | None, step: StepResult | None) -> dict[str, Any]:
@@ -37,9 +38,17 @@ class Forces:
         load = environment.load(time)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "reaction" in self.rows:
-            held = self._held(q, contact, step) - load
-            sums["reaction"] = self.model.holders.totals(held * environment.fixed_at(time)[:owned, None])
+            held = (self._held(q, contact, step) - load) * environment.fixed_at(time)[:owned, None]
+            sums["reaction"] = self.model.holders.totals(held)
+            sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
         return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
+
+    def _torque_points(self, time: float) -> Positions:
+        """Return the points (a, 3) [m] about which the torques of pins and anchors are counted, which these lead."""
+        points, anchors = self.model.holders.centers.copy(), self.model.anchors
+        for row, anchor in enumerate(anchors, len(points) - len(anchors)):
+            points[row] = anchor.path.center + anchor.path.value_at(time)[:3]
+        return points
 
     def _held(self, q: Positions, contact: Contact | None, step: StepResult | None) -> Rows:
         """Return what would hold this rank's nodes where they are, beside the loads (owned, 3) [N]."""

@@ -15,7 +15,7 @@ from msmpetsc.scene.schema import SceneFile
 from msmpetsc.view.drawable import read_scene
 
 SERIES = (
-    "kinetic", "elastic", "potential", "contact", "self_contact", "momentum", "load", "reaction", "push",
+    "kinetic", "elastic", "potential", "contact", "self_contact", "momentum", "load", "reaction", "torque", "push",
     "contact_push", "probe",
 )  # fmt: skip
 
@@ -43,6 +43,7 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
     yield "time [s]", run.frames.time[:]
     names = {
         "reaction": [table.key for table in held_by(scene)],
+        "torque": [table.key for table in held_by(scene)],
         "push": [f"obstacle.{number}" for number in range(len(scene.obstacle))],
         "contact_push": [f"body.{number}" for number in range(max(1, len(scene.body)))],
         "probe": [probe.name for probe in scene.output.probe],

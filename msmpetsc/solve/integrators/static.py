@@ -132,7 +132,7 @@ class LoadPath:
                 self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
                 self.holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
             load = load + (1 - share) * self.holding
-            prescribed = None if prescribed is None else self.base + share * (prescribed - self.base)
+            prescribed = self.environment.prescribed(self.base, self.time, self.time - self.time_step, share)
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:

@@ -1,0 +1,109 @@
+"""Anchors that turn: where their nodes are, and the torque that they report."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from block_scene import SIDES, block_scene, play
+from conftest import run
+
+from msmpetsc.errors import InputError
+from msmpetsc.results.reader import Result
+
+T = 0.01
+SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3}
+LEFT = {"box": [[-1, -1, -1], [0.01, 1, 1]]}
+RIGHT = {"box": [[0.49, -1, -1], [1, 1, 1]]}
+
+
+def turned(x: np.ndarray, axis: list[float], angle: float, center: np.ndarray) -> np.ndarray:
+    """Points turned by trimesh's matrix, which is made from a quaternion."""
+    return trimesh.transform_points(x, trimesh.transformations.rotation_matrix(angle, axis, center))
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
+def test_nodes_turn_about_an_axis_at_a_steady_speed_and_go_on_as_they_were_let_go(tmp_path: Path, integrator: str):
+    axis, center = np.array([2.0, 1.0, 2.0]) / 3, [0.1, 0.2, 0.3]
+    path = [{"time": 0.05, "by": [0.05, 0, 0], "turn": list(450 * axis)}]
+    time = {"step": T, "duration": 4 * T, "integrator": integrator}
+    handle = {"region": RIGHT, "path": path, "center": center, "stop": 3.5 * T}
+    model, frames = play(block_scene(tmp_path, time=time, material=SOLID, anchor=[handle]))
+    rest = model.lattice.nodes
+    led = rest[:, 0] > 0.49
+    for frame in frames[:4]:
+        share = frame.time / 0.05
+        expected = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array([0.05, 0, 0])
+        np.testing.assert_allclose(frame.position[led], expected, atol=1e-14)
+    share = frames[4].time / 0.05
+    gone_on = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array([0.05, 0, 0])
+    assert np.linalg.norm(frames[4].position[led] - gone_on, axis=1).min() > 1e-4  # let go
+
+
+def test_without_a_center_nodes_turn_about_their_centre_of_mass(tmp_path: Path):
+    path = [{"time": T, "turn": [90, 0, 0]}, {"time": 2 * T, "turn": [90, 0, 0]}]
+    anchors = [{"region": RIGHT, "path": path}]
+    model, frames = play(block_scene(tmp_path, time={"step": T, "duration": 2 * T}, anchor=anchors))
+    rest = model.lattice.nodes
+    led = rest[:, 0] > 0.49
+    center = np.average(rest[led], axis=0, weights=model.lattice.mass[led])
+    assert center == pytest.approx([0.5, *SIDES[1:] / 2])
+    for frame in frames[1:]:
+        np.testing.assert_allclose(frame.position[led], turned(rest[led], [1, 0, 0], np.pi / 2, center), atol=1e-15)
+
+
+def bar(folder: Path, cells: int, turn: float, **tables) -> Path:
+    """A bar of 5 x 1 x 1 along x, clamped on the left, its right end a handle, which turns about x."""
+    path = [{"time": 1.0, "turn": [turn, 0, 0]}]
+    return block_scene(
+        folder, sides=np.array([5.0, 1.0, 1.0]), **{"solver": {"error": 1e-12}} | tables, material=SOLID,
+        cages={"cell_size": 1 / cells}, time={"integrator": "static", "step": 1.0, "duration": 1.0},
+        pin=[{"region": LEFT}], anchor=[{"region": {"box": [[4.99, -1, -1], [6, 2, 2]]}, "path": path}],
+    )  # fmt: skip
+
+
+def test_a_bar_twisted_by_a_handle_resists_as_saint_venants(tmp_path: Path):
+    """T = G K theta / L with K = 0.1406 b^4 of a square; ends that may not warp make it a little stiffer."""
+    shear = SOLID["young_modulus"] / (2 * (1 + SOLID["poisson_ratio"]))
+    theory = shear * 0.1406 * np.radians(1) / 5
+    of_sizes = []
+    for cells in (4, 8):
+        _, (_, frame) = play(bar(tmp_path, cells, 1.0))
+        of_sizes.append(frame.torque[1, 0] / theory)
+        np.testing.assert_allclose(frame.torque[0], -frame.torque[1], atol=1e-6 * frame.torque[1, 0])
+    assert 1.0 < of_sizes[1] < of_sizes[0] < 1.15
+    richardson = (4 * of_sizes[1] - of_sizes[0]) / 3
+    assert 1.0 < richardson < 1.05
+
+
+def test_forces_and_torques_of_a_body_in_balance_add_up(tmp_path: Path):
+    """A weight held by a pin and a handle that has bent and twisted it: moments about any point are none."""
+    gravity = np.array([0.3, -0.5, -2.0])
+    scene = bar(tmp_path, 4, 120.0, gravity={"acceleration": gravity.tolist()})
+    text = scene.read_text().replace("time = 1.0", "time = 1.0\nby = [-0.3, 0.2, -0.4]")
+    scene.write_text(text)
+    model, (_, frame) = play(scene)
+    mass, q = model.lattice.mass, frame.position
+    points = np.array([[0.0, 0.5, 0.5], [5 - 0.3, 0.7, 0.1]])
+    pull = mass[:, None] * gravity
+    moment = frame.torque.sum(axis=0) + np.cross(points, frame.reaction).sum(axis=0) + np.cross(q, pull).sum(axis=0)
+    assert moment == pytest.approx(0, abs=1e-6 * np.abs(frame.torque).max())
+    assert frame.reaction.sum(axis=0) + pull.sum(axis=0) == pytest.approx(0, abs=1e-6 * np.abs(frame.reaction).max())
+
+
+def test_ranks_agree_and_the_file_has_the_torque(tmp_path: Path):
+    scene = bar(tmp_path, 4, 30.0)
+    results = []
+    for ranks in (1, 3):
+        output = tmp_path / f"{ranks}.h5"
+        assert run(ranks, "msmpetsc", "run", scene, "-o", output).returncode == 0
+        with Result(output) as result:
+            results.append(result.frames["torque"][1])
+    assert results[0].shape == (2, 3)
+    np.testing.assert_allclose(results[1], results[0], rtol=1e-8, atol=1e-8 * np.abs(results[0]).max())
+
+
+def test_what_is_no_turn_is_told_by_its_key(tmp_path: Path):
+    path = [{"time": 1.0, "turn": 90}]
+    with pytest.raises(InputError, match=r"anchor\.0\.path\.0\.turn"):
+        play(block_scene(tmp_path, time={"step": T, "duration": T}, anchor=[{"region": LEFT, "path": path}]))

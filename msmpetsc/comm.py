@@ -45,6 +45,17 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
     return value
 
 
+class Stop:
+    """The signal that asks this process to stop, 0 while none does: signals are a process's own, so there is one."""
+
+    signal = 0
+
+    @classmethod
+    def agreed(cls, comm: MPI.Comm) -> int:
+        """Return the greatest that any rank has got (collective)."""
+        return max(comm.allgather(cls.signal)) if comm.size > 1 else cls.signal
+
+
 class Route:
     """A way of rows to the ranks named for them (Alltoallv), and of answers back in the rows' own order.
 

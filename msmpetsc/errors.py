@@ -33,6 +33,10 @@ class StepFailed(MsmpetscError):
         self.kind, self.frame = kind, frame
 
 
+class StepStopped(MsmpetscError):
+    """A signal ended a time step between two of its iterations; the state before it stands."""
+
+
 PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
 NO_ROOM = ENOSPC, EDQUOT, EFBIG
 EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by

@@ -5,13 +5,16 @@ import re
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from time import perf_counter
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
-from msmpetsc.errors import InputError
+from msmpetsc.comm import Stop
+from msmpetsc.errors import InputError, StepStopped
+from msmpetsc.fields import Frame
 from msmpetsc.results.writer import ResultFile
 
 if TYPE_CHECKING:  # PETSc must first be given its options
@@ -55,6 +58,13 @@ class Checkpoints:
         self._frames = 0
         self._ended = perf_counter()
 
+    def steps(self) -> Iterator[Frame | None]:
+        """Yield the frames of the steps, and None after those that give none, until a signal ends one (collective)."""
+        try:
+            yield from self.simulation.advance()
+        except StepStopped:
+            self.after_step(is_stored=False)
+
     def after_step(self, is_stored: bool) -> bool:
         """Write a checkpoint if one is due; return whether the run is to stop (collective).
 
@@ -84,14 +94,16 @@ class Checkpoints:
 
 
 class Signals:
-    """Note SIGUSR1, SIGTERM and SIGINT, which ask a run to stop after its step; a second SIGINT ends it at once.
+    """Note SIGUSR1, SIGTERM and SIGINT, which ask a run to stop after the iteration or the explicit step under way.
+
+    A second SIGINT ends it at once.
 
     Used as a context, after PETSc has set its own handlers. Python lets the main thread alone have
     handlers: a run in another thread hears no signals.
     """
 
     def __init__(self, comm: MPI.Comm):
-        self.comm, self._asked, self._stepping = comm, 0, False
+        self.comm, self._stepping = comm, False
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Signals":
@@ -102,6 +114,7 @@ class Signals:
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        Stop.signal = 0
 
     def begin(self) -> None:
         """Mark that steps are taken from now on: before, a SIGINT has nothing to keep."""
@@ -109,17 +122,16 @@ class Signals:
 
     def agree(self, due: bool) -> tuple[bool, int]:
         """Return whether any rank has a checkpoint due, and the signal that any has got, or 0 (collective)."""
-        own = 2 * self._asked + due
-        greatest = self.comm.allreduce(own, MPI.MAX) if self.comm.size > 1 else own
-        return bool(greatest), greatest // 2
+        number = Stop.agreed(self.comm)
+        return self.comm.allreduce(bool(due or number), MPI.LOR), number
 
     def _note(self, number: int, _: FrameType | None) -> None:
         if number == signal.SIGINT and not self._stepping:
             raise KeyboardInterrupt
-        if number == self._asked == signal.SIGINT:
+        if number == Stop.signal == signal.SIGINT:
             sys.stderr.write("msmpetsc: stopped at once\n")
             sys.stderr.flush()
             if self.comm.size > 1:
                 self.comm.Abort(STATUS[number])
             os._exit(STATUS[number])  # the file is left as by a kill, which it is made for
-        self._asked = max(self._asked, number) if number != signal.SIGINT else number
+        Stop.signal = max(Stop.signal, number) if number != signal.SIGINT else number

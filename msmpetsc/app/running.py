@@ -103,7 +103,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
                 with closing(Progress(simulation.steps, is_shown)) as progress:
                     observers = [cost.count, progress.update, *filter(None, [plan.request.on_frame])]
                     signals.begin()
-                    for frame in simulation.advance():
+                    for frame in checkpoints.steps():
                         with cost.of_output():
                             if frame is not None and next(numbers) >= file.finished:  # a run that goes on has some
                                 file.append(frame)

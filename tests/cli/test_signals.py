@@ -83,14 +83,32 @@ def start(*arguments: object, ranks: int = 1) -> subprocess.Popen:
     raise AssertionError("it never began")
 
 
-def test_a_second_interrupt_stops_at_once(tmp_path):
-    """Both come within one step, which these settings would not end for minutes."""
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks: int):
+    """The step would take 100,000 iterations; a rank that gets the signal takes the other one along."""
     path = tmp_path / "x.h5"
-    stiff = {"young_modulus": 1e9, "density": 1000.0}
-    scene = hanging(
-        tmp_path, 2, cages={"cell_size": 1 / 48}, material=stiff, solver={"preset": "anderson", "error": 1e-9}
-    )
-    process = start(scene, "-o", path, "-snes_max_it", "100000")
+    scene = hanging(tmp_path, 2, cages={"cell_size": 1 / 32}, material={"young_modulus": 1e9, "density": 1000.0})
+    endless = ["-snes_type", "nrichardson", "-snes_linesearch_type", "basic", "-snes_max_it", "100000"]
+    process = start(scene, "-o", path, "--error", "1e-13", "--preset", "anderson", *endless, ranks=ranks)
+    with process:
+        time.sleep(0.5)
+        pid = process.pid if ranks == 1 else ranks_of(process)[-1]
+        os.kill(pid, signal.SIGTERM)
+        began = time.perf_counter()
+        told = process.stderr.read()
+    assert time.perf_counter() - began < 20
+    assert "stopped by SIGTERM after step 0 of 2 (t = 0 s); to go on: msmpetsc run --resume" in told
+    with h5py.File(path) as file:
+        assert finished(file) == 1 and max(file["checkpoint/step"]) == 0
+    able = ["--preset", "newton", "--error", "1e-3", "-snes_type", "newtonls", "-snes_linesearch_type", "bt"]
+    assert main(["run", "--resume", str(path), "--force", *able]) == 0
+
+
+def test_a_second_interrupt_stops_at_once(tmp_path):
+    """Both come within one linear solve, which these settings would not end for minutes."""
+    path = tmp_path / "x.h5"
+    scene = hanging(tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9})
+    process = start(scene, "-o", path, "-ksp_rtol", "0", "-ksp_atol", "0", "-ksp_max_it", "10000000")
     with process:
         time.sleep(0.5)  # before the step begins, the first interrupt alone would end the run
         for _ in range(20):

@@ -11,8 +11,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.comm import Stop
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, StepStopped
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
@@ -176,7 +177,8 @@ class Stepper:
 
         start : a first guess (l, 3) [m]; the best of several if None
 
-        Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
+        Raises StepFailed on all ranks, StepStopped where a signal asks for it, and InputError where PETSc's options do
+        not go together.
         """
         with petsc_errors("PETSc cannot take a step with these options", self._abandon):
             before = self.work_so_far()
@@ -257,6 +259,8 @@ class Stepper:
     def _run_snes(self) -> int:
         self.snes.solve(None, self.x)
         self.iterations += self.snes.its
+        if self.snes.reason < 0 and Stop.agreed(self.comm):
+            raise StepStopped("stopped by a signal")
         return self.snes.its
 
     def examine(self, outcome: Outcome) -> Verdict:
@@ -374,6 +378,8 @@ class Stepper:
             self.observer(iterate.q)
         if not np.isfinite(outcome.residual):
             return NOT_FINITE
+        if Stop.agreed(self.comm):
+            return reasons.DIVERGED_INNER  # _run_snes says so
         if outcome.is_enough:
             if outcome.at_rounding:
                 return reasons.CONVERGED_FNORM_ABS

@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.contact.surface.barrier import SurfaceFriction
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.points import Carried
@@ -32,7 +32,7 @@ class SurfaceHessian:
     carried: Carried
     points: csr_array
 
-    def add_product(self, v: Rows, product: Rows) -> None:
+    def add_product(self, v: Array, product: Array) -> None:
         """Add the Hessian times v (owned or more, 3) to owned rows of ``product`` (collective)."""
         at, weights = self.carried
         moved = np.zeros((self.points.shape[0] // 3, 3))
@@ -40,6 +40,21 @@ class SurfaceHessian:
         self.comm.Allreduce(MPI.IN_PLACE, moved)
         forces = (self.points @ moved.ravel()).reshape(-1, 3)
         product[: weights.shape[1]] += weights.T @ forces[at]
+
+    def split(self, most: int) -> "tuple[SurfaceHessian, SurfaceHessian | None]":
+        """Return the part of the stiffest points, so many at most, and that of the others, if any."""
+        stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1)
+        if len(stiffness) <= most:
+            return self, None
+        order = np.argsort(-stiffness, kind="stable")
+        return self._part(np.sort(order[:most])), self._part(np.sort(order[most:]))
+
+    def _part(self, numbers: Indices) -> "SurfaceHessian":
+        at, weights = self.carried
+        own = np.isin(at, numbers)
+        rows = (3 * numbers[:, None] + np.arange(3)).ravel()
+        carried = Carried(np.searchsorted(numbers, at[own]), weights[own])
+        return SurfaceHessian(self.comm, carried, csr_array(self.points[rows][:, rows]))
 
     @cached_property
     def blocks(self) -> Rows:

@@ -17,6 +17,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
@@ -24,6 +25,7 @@ from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import Viewable, python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
+from msmpetsc.solve.multigrid.contact import ContactSmoother
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
@@ -99,11 +101,14 @@ class Multigrid:
             rows = 3 * np.arange(len(ijk))[:, None] + np.arange(3)
         return galerkin, levels
 
-    def update(self, q: Positions, contact: Rows) -> None:
-        """Build the hierarchy at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
-        self.fine.update(q, contact)
+    def update(self, q: Positions, contact: Rows, joined: SurfaceHessian | None = None) -> None:
+        """Build the hierarchy at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m].
+
+        joined : contact of the surface with itself that is to join nodes of the finest level
+        """
+        self.fine.update(q, contact, joined)
         self.operator.assemble()
-        self.sum.update(q, contact)
+        self.sum.update(q, contact + joined.blocks if joined else contact)
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
         is_new = self.pc.getType() is None
@@ -123,6 +128,11 @@ class Multigrid:
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), LEAST * bound, bound)
         if is_new:
             self._read_options()
+
+    def join(self, joined: SurfaceHessian | None) -> None:
+        """Have another contact of the surface join nodes of the finest level; coarse ones keep that of ``update``."""
+        self.fine.join(joined)
+        self.operator.assemble()
 
     def _finest_bound(self) -> float:
         """Greatest eigenvalue of D^-1 H on the finest level, at most, or as some iterations of CG know it."""
@@ -235,17 +245,29 @@ class ProjectedHessian(Viewable):
         self.products, self.q = 0, lattice.nodes
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
+        self.joined: SurfaceHessian | None = None
+        self.smoother: ContactSmoother | None = None
 
-    def update(self, q: Positions, contact: Rows) -> None:
-        """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
+    def update(self, q: Positions, contact: Rows, joined: SurfaceHessian | None = None) -> None:
+        """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m].
+
+        joined : of the surface's contact with itself
+        """
         self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
         unknowns, blocks = self.unknowns, self._bound()
         invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
+        self.join(joined)
+
+    def join(self, joined: SurfaceHessian | None) -> None:
+        """Take another contact of the surface with itself."""
+        self.joined = joined
+        self.smoother = ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
 
     def getDiagonal(self, _: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         """Write that of D, for -mg_levels_pc_type jacobi."""
         unknowns, (blocks, contact) = self.unknowns, (self._bound(), self.contact)
         acting = blocks[unknowns.free] + (contact[unknowns.free] if len(contact) else 0)
+        acting += self.joined.blocks[unknowns.free] if self.joined else 0
         own = unknowns.ballast[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
         unknowns.columns_to_write(diagonal)[:] = own
 
@@ -264,6 +286,8 @@ class ProjectedHessian(Viewable):
             self.elastic.add_product(self.v, self.product)
             if len(self.contact):
                 add_node_blocks(len(self.contact), self.contact, self.v, self.product)
+            if self.joined:
+                self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
             count_flops(self.elasticity.flops.product + (BLOCK + 3) * len(self.contact))
 
@@ -276,7 +300,10 @@ class DiagonalBlocks:
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         unknowns = self.hessian.unknowns
-        apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, unknowns.columns_to_write(y))
+        moved = unknowns.columns_to_write(y)
+        apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, moved)
+        if self.hessian.smoother:
+            self.hessian.smoother.correct(moved)
         count_flops(BLOCK * unknowns.size)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:

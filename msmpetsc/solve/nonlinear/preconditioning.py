@@ -17,6 +17,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.preconditioner import Preconditioner
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -30,6 +31,8 @@ USUAL = 0.1  # ksp_rtol
 LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
 USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
 WORTH = 10.0  # iterations that a new hierarchy takes the time of
+MANY = 150  # iterations of a solve that contact is to blame for: from there on it joins nodes
+POINTS = 200  # in contact, that join nodes in the cycle: the stiffest
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
 
 
@@ -41,6 +44,8 @@ class LatticePreconditioner:
     pace     : iterations a digit of the first solve with it; None before that
     wasted   : iterations since then that were more than that
     is_stale : a new one is due
+    joins    : contact of the surface with itself joins nodes in the cycle; it is held to the ground by blocks otherwise
+    joined   : what joins them
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -53,6 +58,8 @@ class LatticePreconditioner:
         self.pace: float | None = None
         self.wasted = 0.0
         self.is_stale, self.is_free = True, False
+        self.joins = False
+        self.joined: SurfaceHessian | None = None
 
     @property
     def matrix(self) -> PETSc.Mat:
@@ -66,11 +73,16 @@ class LatticePreconditioner:
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
-        due = self.is_stale
-        self.is_free = self._is_free(q, contact)
+        surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+        joined, held = surface.split(POINTS) if surface and self.joins else (None, surface)
+        is_other = joined is not self.joined
+        self.joined, self.is_free, due = joined, self._is_free(q, contact), self.is_stale
         if due:
-            self._build(q.copy(), self._blocks(q, contact))
-        return due
+            blocks = self._blocks(q, contact)
+            self._build(q.copy(), blocks + held.blocks if held else blocks)
+        elif is_other:
+            self.multigrid.join(joined)
+        return due or is_other
 
     def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Move bodies that nothing holds as wholes to where forces balance, from q, or unknowns x, where F is f."""
@@ -88,12 +100,13 @@ class LatticePreconditioner:
         digits = max(-np.log10(rtol), 0.1)
         if self.pace is None:
             self.pace = its / digits
+        self.joins |= its > MANY
         self.wasted += max(its - self.pace * digits, 0.0)
         self.is_stale |= self.wasted > WORTH
 
     def _build(self, q: Positions, contact: Rows) -> None:
         with HIERARCHY:
-            self.multigrid.update(q, contact)
+            self.multigrid.update(q, contact, self.joined)
         self.pace = None
         if self.is_first:
             self.pace = USUAL_PACE
@@ -110,13 +123,12 @@ class LatticePreconditioner:
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) without it."""
+        """The Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) without contact."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
         for nodes, added in contact.hessian(q, False) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
-        surface = contact.surface.hessian(q, True) if contact and contact.surface else None
-        return blocks + surface.blocks if surface else blocks
+        return blocks
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         with CYCLE:
@@ -128,6 +140,7 @@ class LatticePreconditioner:
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""
         self.is_stale = self.is_first = True
+        self.joins = False
 
     def destroy(self) -> None:
         self.multigrid.destroy()

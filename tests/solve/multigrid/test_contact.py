@@ -1,0 +1,84 @@
+"""Contact of the surface with itself in the finest level's smoother: Woodbury's formula, and steps that it leads to."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+from block_scene import play
+from mpi4py import MPI
+from pinch import pinch_scene
+
+from msmpetsc.contact.surface.points import Carried
+from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.solve.multigrid.contact import ContactSmoother
+from msmpetsc.solve.nonlinear import preconditioning
+
+POINTS, NODES, T2 = 7, 12, 1e-3
+
+
+@pytest.fixture
+def surface() -> SurfaceHessian:
+    """Three stiff pairs of points, each of which five nodes carry; the last pair is the stiffest by far."""
+    rng = np.random.default_rng(5)
+    weights = np.where(rng.random((POINTS, NODES)) < 0.4, rng.normal(size=(POINTS, NODES)), 0.0)
+    points = np.zeros((3 * POINTS, 3 * POINTS))
+    for stiffness, (a, b) in zip((1e3, 1e6, 1e12), ((0, 1), (2, 3), (5, 6)), strict=True):
+        along = np.zeros((POINTS, 3))
+        along[a] = rng.normal(size=3)
+        along[b] = -along[a]
+        points += stiffness * np.outer(along, along)
+    carried = Carried(np.arange(POINTS), sparse.csr_array(weights))
+    return SurfaceHessian(MPI.COMM_SELF, carried, sparse.csr_array(points))
+
+
+def joined(surface: SurfaceHessian) -> np.ndarray:
+    """C = t^2 W^T H_c W (3n, 3n), columns x, y, z of a node together."""
+    w = np.kron(surface.carried.weights.toarray(), np.eye(3))
+    return T2 * w.T @ surface.points.toarray() @ w
+
+
+def test_the_smoother_inverts_blocks_and_contact_together(surface: SurfaceHessian):
+    """Its eigenvalues are 1, though contact is 1e9 times as stiff as the blocks."""
+    rng = np.random.default_rng(6)
+    roots = rng.normal(size=(NODES, 3, 3))
+    inverse = roots @ roots.transpose(0, 2, 1) + np.eye(3)
+    d = np.zeros((NODES, 3, NODES, 3))
+    d[np.arange(NODES), :, np.arange(NODES)] = np.linalg.inv(inverse)
+    whole = np.linalg.cholesky(d.reshape(3 * NODES, -1) + joined(surface))
+    unknowns = SimpleNamespace(comm=MPI.COMM_SELF, free=np.arange(NODES))
+    smoother = ContactSmoother(unknowns, surface, T2, inverse.reshape(-1, 9))
+    columns = []
+    for x in np.eye(3 * NODES):
+        y = np.einsum("nij,nj->in", inverse, x.reshape(-1, 3))
+        smoother.correct(y)
+        columns.append(y.T.ravel())
+    eigenvalues = np.linalg.eigvals(whole.T @ np.array(columns) @ whole)
+    np.testing.assert_allclose(eigenvalues, 1.0, atol=1e-4)
+
+
+def test_the_stiffest_points_and_the_others_are_the_whole_less_what_joins_both(surface: SurfaceHessian):
+    stiff, others = surface.split(2)
+    assert others is not None and stiff.points.shape == (6, 6)
+    np.testing.assert_allclose(
+        joined(stiff) + joined(others), joined(surface), atol=1e-12 * np.abs(joined(surface)).max()
+    )
+    assert np.abs(joined(stiff)).max() > 1e3 * np.abs(joined(others)).max()
+    assert surface.split(POINTS) == (surface, None)
+
+
+SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}
+
+
+def test_contact_that_joins_nodes_takes_a_part_of_the_iterations_to_the_same_frames(tmp_path: Path, monkeypatch):
+    tables = {"material": SOLID, "time": {"step": 0.01, "duration": 0.08}}
+    its, positions = [], []
+    for many in (10**9, 5):
+        monkeypatch.setattr(preconditioning, "MANY", many)
+        _, frames = play(pinch_scene(tmp_path, solver={"preset": "newton-multigrid", "error": 1e-8}, **tables))
+        assert frames[-1].self_contacts > 0
+        its.append(sum(frame.ksp_its for frame in frames))
+        positions.append(frames[-1].position)
+    assert its[1] < 0.75 * its[0]
+    np.testing.assert_allclose(positions[1], positions[0], atol=1e-4 * np.ptp(positions[0]))

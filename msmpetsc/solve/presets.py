@@ -34,7 +34,6 @@ class Preset:
     extrapolate: bool = True
     iterations: int | None = None
     inexact: bool = False
-    kronecker: bool = False  # A is factored as A (x) I_3, 3m x 3m
     chooses: bool = False
 
 
@@ -139,13 +138,6 @@ PRESETS = {
         {**PLAIN, **CHOLESKY},
         extrapolate=False,
         iterations=10,
-    ),
-    "fast-msm-kronecker": Preset(
-        "The same as the seed paper must have had it: the factor of A (x) I_3, 3m x 3m; only to compare with",
-        {**PLAIN, **CHOLESKY},
-        extrapolate=False,
-        iterations=10,
-        kronecker=True,
     ),
     "paper": Preset(
         "Zheng et al.: the same iterations with plain CG from x = b to a fixed tolerance",

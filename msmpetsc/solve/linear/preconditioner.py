@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Floats, Positions, like
+from msmpetsc.backend.arrays import Positions, like
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -19,7 +19,7 @@ class Preconditioner:
     It is this inner one that the options -pc_... set, for every preset: A is also what the true
     Hessian is preconditioned with.
 
-    matrix  : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
+    matrix  : A, m x m: all three columns go in one call, which MUMPS solves at once
     contact : what is added to its diagonal, if anything
     """
 
@@ -35,9 +35,6 @@ class Preconditioner:
         return self.contact is not None and self.contact.follow(contact, q)
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if x.getSize() == self.matrix.getSize()[0]:  # A (x) I_3
-            self.pc.apply(x, y)
-            return
         if not self.blocks:  # where the inner preconditioner works: a direct solver does on the CPU
             memory = HOST if self.pc.getType() in DIRECT else self.memory
             self.blocks = [Block(self.matrix, memory), Block(self.matrix, memory)]
@@ -58,8 +55,8 @@ class ContactDiagonal:
 
     A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a step downhill too.
 
-    own   : (k,) diagonal of A or A (x) I_3, of this rank [kg]
-    added : (k,) t^2 times what is added to it, over t^2 [N/m]
+    own   : (m,) diagonal of A, of this rank [kg]
+    added : (m,) t^2 times what is added to it, over t^2 [N/m]
     """
 
     def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, time_step: float):
@@ -72,20 +69,13 @@ class ContactDiagonal:
     def follow(self, contact: Contact | None, q: Positions) -> bool:
         """Add the bound of contact at positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         lattice = self.unknowns.lattice
-        bound = self._columns(contact.bound(q) if contact else np.zeros(lattice.owned, like=q))
+        bound = (contact.bound(q) if contact else np.zeros(lattice.owned, like=q))[self.unknowns.free]
         changed = lattice.table.comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
         if changed:
-            self._add(bound)
+            self.added = bound
+            self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
+            self.matrix.setDiagonal(self.vector)
         return changed
-
-    def _columns(self, bound: Floats) -> Floats:
-        free = bound[self.unknowns.free]
-        return np.tile(free, len(self.own) // max(len(free), 1))
-
-    def _add(self, bound: Floats) -> None:
-        self.added = bound
-        self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
-        self.matrix.setDiagonal(self.vector)
 
     def destroy(self) -> None:
         """Collective."""

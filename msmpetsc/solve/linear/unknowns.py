@@ -18,7 +18,7 @@ from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
 BALLAST = 1e-6  # of the mass
-BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node, for a forecast of memory
+BYTES_OF_NODE = 8  # of ``numbers``, for a forecast of memory
 
 
 class Unknowns:
@@ -26,7 +26,6 @@ class Unknowns:
 
     free    : (m,) local numbers of the free owned nodes, where the lattice's arrays are
     numbers : (l,) global number of each local node among the free ones, -1 where pinned
-    indices : (l, 3) of its x, y and z in a vector of unknowns, of no meaning where pinned
     total   : number of free nodes on all ranks
     inertia : (owned,) [kg] by which a node resists being moved: its mass; nothing where an equilibrium is looked for
     ballast : (owned,) [kg] the same in multigrid, never nothing: a cell squashed flat has a singular block of its own
@@ -49,11 +48,10 @@ class Unknowns:
         own[to_host(self.free)] = first + np.arange(self.size)
         self.numbers = with_ghosts(comm, lattice, own)
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
-        self.indices = with_ghosts(comm, lattice, index)
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
-        sources = self.indices[free_ghosts].ravel()  # in a vector of unknowns
+        sources = with_ghosts(comm, lattice, index)[free_ghosts].ravel()  # in a vector of unknowns
         self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
         vector = self.create_vector()
         index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)

@@ -69,20 +69,14 @@ class Jacobian:
     @cached_property
     def matrix(self) -> PETSc.Mat:
         """A, assembled where something is to be done with it."""
-        matrix = self._assembled(1)
-        self.options.hide("mat_view")  # which is of A: PETSc would show all matrices, and write each into the same file
-        return matrix
-
-    def _assembled(self, columns: int) -> PETSc.Mat:
-        matrix = assemble(self.comm, self.unknowns, self.functional.time_step, columns, self.options.prefix)
+        matrix = assemble(self.comm, self.unknowns, self.functional.time_step, self.options.prefix)
         self.owned.callback(matrix.destroy)
+        self.options.hide("mat_view")  # which is of A: PETSc would show all matrices, and write each into the same file
         return matrix
 
     def _of_matrix(self) -> Preconditioner:
         matrix = self.matrix
-        if self.preset.kronecker:
-            matrix = self._assembled(3)
-        elif self.touches:  # contact changes what A is preconditioned with, but not A
+        if self.touches:  # contact changes what A is preconditioned with, but not A
             matrix = matrix.copy()
             self.owned.callback(matrix.destroy)
         diagonal = ContactDiagonal(matrix, self.unknowns, self.functional.time_step) if self.touches else None

@@ -219,7 +219,6 @@ class SolverOptions:
 
     def __init__(self, preset: Preset, prefix: str, budget: int):
         self.preset, self.prefix = preset, prefix
-        self.hidden: dict[str, str | None] = {}
         options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
         database = PETSc.Options()
         given = [name for name in database.getAll() if name.startswith(prefix) and not in_use[name]]
@@ -234,13 +233,6 @@ class SolverOptions:
             database.setValue(prefix + name, options[name] or None)
         self.names = {prefix + name for name in ours}
         in_use.update(self.names)
-
-    def hide(self, name: str) -> None:
-        """Keep an option of the user's from all objects that are made from now on."""
-        database = PETSc.Options()
-        if self.prefix + name in database.getAll():
-            self.hidden[self.prefix + name] = database.getAll()[self.prefix + name]
-            database.delValue(self.prefix + name)
 
     def is_default(self, name: str) -> bool:
         """Whether an option is the preset's own, not the user's."""
@@ -261,9 +253,6 @@ class SolverOptions:
 
     def withdraw(self) -> None:
         """Leave the database as the user has it: other presets follow, -options_left shows his own."""
-        for name, value in self.hidden.items():
-            PETSc.Options().setValue(name, value)
-            PETSc.Options().getString(name)  # it has been of use
         in_use.subtract(self.names)
         for name in self.names:
             if not in_use[name]:

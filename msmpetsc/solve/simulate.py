@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from msmpetsc.backend.arrays import Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
-from msmpetsc.comm import Route, on_root
+from msmpetsc.comm import Route
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
@@ -39,7 +39,6 @@ from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery
-from msmpetsc.solve.refused_options import refuse_bad_values, refuse_unused
 from msmpetsc.solve.rest import Rest
 from msmpetsc.solve.work import NO_WORK, Work
 
@@ -58,17 +57,14 @@ def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
     return solvers
 
 
-def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
-    """Raise InputError for PETSc options that the solvers of this scene refuse, before there is anything to solve."""
+def refuse_bad_options(scene: Scene, probes: Probes) -> None:
+    """Raise InputError for a preset that is unknown or not for this scene, and for steps and probes that cannot be."""
     solvers = solvers_of(scene, probes)
     refuse_bad_steps(scene.time)
     if scene.self_contact and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(f"self_contact is for newton's presets, not {scene.solver.preset}")
     if scene.time.error and probes != Probes():
         raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
-    if "" not in solvers:
-        refuse_unused(comm, set(), at_end=True, awaited=tuple(solvers))
-    on_root(comm, lambda: refuse_bad_values(solvers))
 
 
 @dataclass

@@ -71,7 +71,6 @@ class Jacobian:
         """A, assembled where something is to be done with it."""
         matrix = assemble(self.comm, self.unknowns, self.functional.time_step, self.options.prefix)
         self.owned.callback(matrix.destroy)
-        self.options.hide("mat_view")  # which is of A: PETSc would show all matrices, and write each into the same file
         return matrix
 
     def _of_matrix(self) -> Preconditioner:

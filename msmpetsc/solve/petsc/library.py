@@ -107,24 +107,21 @@ def _check(error: int) -> None:
 
 
 @contextmanager
-def petsc_errors(
-    what: str, abandon: Callable[[], None] = lambda: None, further: type[Exception] = ImportError
-) -> Iterator[None]:
+def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
     ImportError is that of an object of type python whose context is not there. A solver that did
     not converge, where an option made that an error, becomes StepFailed.
 
     abandon : called after such an error
-    further : more exceptions that come of options here
     """
     try:
         yield
-    except (PETSc.Error, ImportError, further) as error:
+    except (PETSc.Error, ImportError) as error:
         # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, for ever.
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
         cause = error.__cause__
-        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError, further)):
+        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError)):
             raise cause  # noqa: B904 (the error itself, not another)
         abandon()
         if getattr(error, "ierr", 0) == NOT_CONVERGED:

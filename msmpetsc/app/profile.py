@@ -56,7 +56,7 @@ class Cost:
 
     def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""
-        from msmpetsc.solve.instrumentation import hierarchies, times
+        from msmpetsc.solve.instrumentation import times
         from msmpetsc.solve.integrators.verlet import explicit_limit
 
         comm, simulation = self.comm, self.simulation
@@ -64,13 +64,11 @@ class Cost:
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
         time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
         time["setup"] -= min(time["factor"], time["setup"])
-        stepper = getattr(simulation.integrator, "stepper", None)  # an explicit integrator has none
         record = {
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
             **self.counts,
             "time": time,
             "products": self.products,
-            "hierarchy": hierarchies(comm, stepper),
             "memory": comm.allreduce(peak_memory()),
             "trace": simulation.trace,
             "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),

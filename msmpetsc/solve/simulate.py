@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from time import perf_counter
 from typing import ClassVar
 
@@ -23,11 +22,14 @@ from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.probe import ProbePoints
 from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.forces import Forces
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators import INTEGRATORS, make_integrator
+from msmpetsc.solve.integrators import INTEGRATORS
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.monitors import Monitors
@@ -105,15 +107,14 @@ class TimeLoop:
             ProbePoints(comm, model.lattice, points) if points else None
         )  # or refused, before PETSc has objects
         self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
-        make = partial(make_integrator, comm, self.environment)
         swings = scene.time.integrator != "implicit-euler"
         checks = scene.safety.checks
         self.balance = EnergyBalance(comm, self.environment, self.elasticity, swings, checks)
         self.adaptive: Adaptive | None = None
         if scene.time.error:
-            self.adaptive = Adaptive(scene, make, self.balance)
-        self.integrator = self.adaptive or make(scene.time, scene.solver, probes=probes)
-        self.recovery = Recovery(scene, lambda time, solver, prefix: make(time, solver, prefix=prefix), self.balance)
+            self.adaptive = Adaptive(scene, self._make, self.balance)
+        self.integrator = self.adaptive or self._make(scene.time, scene.solver)
+        self.recovery = Recovery(scene, self._make, self.balance)
         self.monitors = Monitors(comm, model.lattice)
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
@@ -125,6 +126,10 @@ class TimeLoop:
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.time_error = np.nan  # estimated, of the trajectory so far
         self._saved = Checkpoint()
+
+    def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
+        """Make the integrator that a scene's tables ask for, its PETSc options of this prefix (collective)."""
+        return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, self.probes, prefix)
 
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).

@@ -26,15 +26,13 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.forces import Forces
-from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes
 from msmpetsc.solve.integrators import INTEGRATORS
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.monitors import Monitors
-from msmpetsc.solve.nonlinear.reference import PREFIX as REFERENCE
-from msmpetsc.solve.nonlinear.reference import PRESET
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
@@ -55,7 +53,7 @@ def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
     if scene.safety.on_failure == "fallback":
         solvers[FALLBACK] = find_preset(ROBUST), 0
     if probes != Probes():
-        solvers[REFERENCE] = find_preset(PRESET), 0
+        solvers[REFERENCE_PREFIX] = find_preset(REFERENCE_PRESET), 0
     return solvers
 
 

@@ -14,10 +14,9 @@ from one_process import errors
 
 from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.instrumentation import Probes, Reference
 from msmpetsc.solve.nonlinear import error_control, minimum
 from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.nonlinear.reference import Reference
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
 from msmpetsc.solve.simulate import TimeLoop

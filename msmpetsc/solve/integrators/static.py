@@ -28,8 +28,7 @@ from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.solve.integrators.contact_faces import ContactFaces
-from msmpetsc.solve.integrators.implicit import ImplicitEuler
+from msmpetsc.solve.integrators.implicit import ContactFaces, ImplicitEuler
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.free_bodies import bodies_of

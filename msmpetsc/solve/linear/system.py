@@ -10,8 +10,7 @@ from scipy.sparse import coo_array
 
 from msmpetsc.backend.arrays import Array, to_host
 from msmpetsc.errors import InputError
-from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.limits import refuse_nonzeros
+from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 
 
 def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str = "") -> PETSc.Mat:

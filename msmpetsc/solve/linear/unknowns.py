@@ -12,11 +12,13 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Array, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
+from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.events import GHOSTS
-from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
+LARGEST = int(np.iinfo(PETSc.IntType).max)  # of PETSc's integers: 32 bits, unless it was configured otherwise
+ADVICE = "a PETSc configured with --with-64-bit-indices can"
 BALLAST = 1e-6  # of the mass
 BYTES_OF_NODE = 8  # of ``numbers``, for a forecast of memory
 
@@ -132,6 +134,21 @@ def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     return np.concatenate([rows, to_owner.answer(rows[asked])])
+
+
+def refuse_unknowns(nodes: int) -> None:
+    """Raise InputError for more ``nodes`` than PETSc can number three coordinates of."""
+    if 3 * nodes > LARGEST:
+        most = f"the {LARGEST} unknowns that PETSc can number here"
+        raise InputError(f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}")
+
+
+def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
+    """Raise InputError where a rank has more nonzeros, ``own`` of this one, than PETSc can count."""
+    most = comm.allreduce(own, MPI.MAX)
+    if most > LARGEST:
+        many = f"{most} nonzeros of the system matrix on one rank are more than the {LARGEST} that PETSc can count here"
+        raise InputError(f"cages: {many}; more ranks have fewer each, or {ADVICE}")
 
 
 @kernel

@@ -15,8 +15,7 @@ from msmpetsc.backend.arrays import Indices, Mask, to_host
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
-from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.limits import refuse_unknowns
+from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 
 SHRINK = 0.7  # a grid with more nodes than this share of the finer one's is no help
 

@@ -12,7 +12,6 @@ from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
-from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
 from msmpetsc.solve.linear.system import assemble
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
@@ -20,6 +19,7 @@ from msmpetsc.solve.nonlinear.preconditioning import (
     MULTIGRID,
     LatticePreconditioner,
     Preconditioned,
+    Preconditioner,
     StepPreconditioner,
 )
 from msmpetsc.solve.presets import Preset, SolverOptions
@@ -78,8 +78,7 @@ class Jacobian:
         if self.touches:  # contact changes what A is preconditioned with, but not A
             matrix = matrix.copy()
             self.owned.callback(matrix.destroy)
-        diagonal = ContactDiagonal(matrix, self.unknowns, self.functional.time_step) if self.touches else None
-        return Preconditioner(matrix, self.unknowns.memory, self.options.prefix, diagonal)
+        return Preconditioner(matrix, self.unknowns, self.options.prefix, self.functional.time_step, self.touches)
 
     def _contact_blocks(self) -> ContactBlocks | None:
         return ContactBlocks(self.unknowns, self.functional.time_step) if self.touches else None

@@ -36,7 +36,8 @@ class Cost:
         self.comm, self.simulation, self.setup = comm, simulation, setup
         self.output, self.stepping, self.products = 0.0, 0.0, 0
         model = simulation.model
-        own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, simulation.integrator.unknowns
+        free = int((~simulation.environment.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())
+        own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, free
         self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
 
     @contextmanager

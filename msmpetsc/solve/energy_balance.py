@@ -31,8 +31,7 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import EnergyBudget, State
+from msmpetsc.solve.integrators.integrator import EnergyBudget, Integrator, State
 from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 

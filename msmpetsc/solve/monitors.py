@@ -14,7 +14,7 @@ from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.energy_balance import MUCH
-from msmpetsc.solve.integrators.state import EnergyBudget
+from msmpetsc.solve.integrators.integrator import EnergyBudget
 
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 

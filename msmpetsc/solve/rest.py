@@ -21,7 +21,7 @@ from msmpetsc.checkpoint import COUNT, LENGTH, Range
 from msmpetsc.comm import log
 from msmpetsc.environment import Environment
 from msmpetsc.scene.reading import Scene
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR
 from msmpetsc.solve.nonlinear.functional import Iterate, StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper

@@ -29,8 +29,7 @@ from msmpetsc.solve.forces import Forces
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes
 from msmpetsc.solve.integrators import INTEGRATORS
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.monitors import Monitors
 from msmpetsc.solve.nonlinear.step import StepResult

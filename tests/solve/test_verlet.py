@@ -21,7 +21,7 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators import verlet
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.simulate import TimeLoop
 

@@ -34,8 +34,7 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
 from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
@@ -135,10 +134,6 @@ class Adaptive(Integrator):
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
         self.tick = self.last = 0
         self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
-
-    @property
-    def unknowns(self) -> int:
-        return self._integrator_last().unknowns
 
     def set_up(self) -> None:
         """Make ready the integrator of the first step, and say what is to come."""

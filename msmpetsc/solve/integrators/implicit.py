@@ -28,8 +28,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, Probes, Reference, Trace
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.events import CONTACT
@@ -144,10 +143,6 @@ class ImplicitEuler(Integrator):
     def _carried(self, duration: float) -> float:
         """Return how far a velocity carries in a time step [s] under damping."""
         return duration / (1 + self.damping * duration)
-
-    @property
-    def unknowns(self) -> int:
-        return self.stepper.unknowns.size
 
     def set_up(self) -> None:
         """Raises InputError for a preconditioner that PETSc or the matrix lacks (collective)."""

@@ -29,7 +29,7 @@ from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.solve.integrators.implicit import ContactFaces, ImplicitEuler
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm

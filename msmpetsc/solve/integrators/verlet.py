@@ -35,8 +35,7 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.linear.unknowns import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.refused_options import refuse_unused
@@ -89,10 +88,6 @@ class Verlet(Integrator):
         self.fixed = environment.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
         self.most = TORN * comm.allreduce(crushing_energy(self.lattice))  # [J]
-
-    @property
-    def unknowns(self) -> int:
-        return int((~self.environment.fixed_at(self.time_step)[: self.lattice.owned]).sum())
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""

@@ -18,8 +18,7 @@ from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
-from msmpetsc.solve.nonlinear.rounding import Rounding
+from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left to tell by

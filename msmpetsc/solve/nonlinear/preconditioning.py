@@ -92,6 +92,7 @@ class Preconditioner:
 class LatticePreconditioner:
     """The cycle, and how its hierarchy serves. All methods are collective.
 
+    matrix, pc   : the projected Hessian, and PETSc's PCMG of it
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
     is_first : there is none yet
     pace     : iterations a digit of the first solve with it; None before that
@@ -103,22 +104,13 @@ class LatticePreconditioner:
         self.unknowns = unknowns
         with GRIDS:
             self.multigrid = Multigrid(unknowns, elasticity, time_step, prefix)
+        self.matrix, self.pc = self.multigrid.operator, self.multigrid.pc
         bodies = self.multigrid.bodies
         self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
         self.is_first = True
         self.pace: float | None = None
         self.wasted = 0.0
         self.is_stale, self.is_free = True, False
-
-    @property
-    def matrix(self) -> PETSc.Mat:
-        """The projected Hessian."""
-        return self.multigrid.operator
-
-    @property
-    def pc(self) -> PETSc.PC:
-        """PETSc's, which has read its options when its levels are there."""
-        return self.multigrid.pc
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
@@ -177,9 +169,9 @@ class LatticePreconditioner:
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         with CYCLE:
             if self.translations and self.is_free:
-                self.translations.around(self.multigrid.pc, x, y)
+                self.translations.around(self.pc, x, y)
             else:
-                self.multigrid.pc.apply(x, y)
+                self.pc.apply(x, y)
 
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""

@@ -28,11 +28,10 @@ from msmpetsc.solve.nonlinear.error_control import (
 )  # fmt: skip
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
-from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
+from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
-from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions

@@ -79,23 +79,6 @@ def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:
     _check(petsc_library().KSPChebyshevSetEigenvalues(ctypes.c_void_p(ksp.handle), *bounds))
 
 
-@cache
-def square_restricts_transposed() -> bool:
-    """Whether MatRestrict applies a square matrix transposed, as that of PETSc 3.22 does, or as it is, as in 3.18."""
-    matrix = PETSc.Mat().createAIJ((2, 2), comm=PETSc.COMM_SELF)
-    matrix.setUp()
-    matrix[0, 1] = 1.0
-    matrix.assemble()
-    x, y = matrix.createVecs()
-    x[0] = 1.0
-    x.assemble()
-    _check(petsc_library().MatRestrict(*(ctypes.c_void_p(each.handle) for each in (matrix, x, y))))
-    is_transposed = bool(y[1])
-    for owned in (matrix, x, y):
-        owned.destroy()
-    return is_transposed
-
-
 def _address(array: Array) -> ctypes.c_void_p:
     on_gpu = getattr(array, "__cuda_array_interface__", None)
     return ctypes.c_void_p(on_gpu["data"][0] if on_gpu else array.ctypes.data)

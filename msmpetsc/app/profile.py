@@ -71,7 +71,7 @@ class Cost:
             "time": time,
             "products": self.products,
             "memory": comm.allreduce(peak_memory()),
-            "trace": simulation.trace,
+            "trace": simulation.true_errors.trace,
             "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),
             "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
         }  # fmt: skip

@@ -9,9 +9,8 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, REFERENCE, begun, seconds
 from msmpetsc.solve.presets import find_preset
 
@@ -60,20 +59,58 @@ class Trace:
         stepper.observer = observe
 
 
-class Reference:
-    """Steps solved to rounding, which true errors are measured against; not timed with the run."""
+class TrueErrors:
+    """True errors of a run's steps, and what the iterates of one had.
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, time_step: float, touches: bool, static: bool = False):
+    trace : of the step that was followed, once it was taken
+    """
+
+    def __init__(self) -> None:
+        self.reference: Reference | None = None
+        self.followed: Trace | None = None
+        self.trace: dict | None = None
+
+    def follow(self, stepper: Stepper) -> None:
+        """Trace the iterates of the step that comes next."""
+        self.followed = Trace()
+        self.followed.follow(stepper)
+
+    def of(self, index: int, stepper: Stepper, result: StepResult) -> Floats:
+        """Position and energy error (2,) of step ``index``, which a stepper took last (collective)."""
+        if self.reference is None or self.reference.of is not stepper:  # an anchor let go
+            self.destroy()
+            self.reference = Reference(stepper)
+        followed, self.followed, stepper.observer = self.followed, None, None
+        assert result.problem is not None, "no step was taken"
+        positions = [*(followed.positions if followed else []), result.position]
+        errors = self.reference.errors(result.problem, positions)
+        if followed:
+            lists = {"iteration": followed.iteration, "ksp_its": followed.ksp_its, "seconds": followed.seconds}
+            of_positions, of_energies = errors[:-1].T.tolist()
+            self.trace = {"frame": index, **lists, "position_error": of_positions, "energy_error": of_energies}
+        return errors[-1]
+
+    def destroy(self) -> None:
+        """Collective."""
+        if self.reference:
+            self.reference.destroy()
+
+
+class Reference:
+    """Steps of a stepper solved to rounding, which true errors are measured against; not timed with the run."""
+
+    def __init__(self, of: Stepper):
+        self.of = of
         with begun(REFERENCE):
             self.stepper = Stepper(
-                comm,
-                lattice,
-                time_step,
+                of.comm,
+                of.lattice,
+                of.time_step,
                 find_preset(REFERENCE_PRESET),
                 REFERENCE_ERROR,
-                touches=touches,
+                touches=of.touches,
                 prefix=REFERENCE_PREFIX,
-                static=static,
+                static=of.static,
             )
             self.stepper.set_up()
 

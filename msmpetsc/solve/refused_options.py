@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.solve.petsc.library import Integer, petsc_library
-from msmpetsc.solve.presets import PRESETS
+from msmpetsc.solve.presets import PRESETS, in_use
 
 READ_AT_THE_END = re.compile(
     r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$"
@@ -47,17 +47,18 @@ def refuse_early(comm: MPI.Comm) -> None:
     _refuse(comm, lines)
 
 
-def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
+def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
     """Raise InputError for options of the user that no object has looked at (collective).
 
-    ours    : names of the preset's own options, which another type may well leave unused
+    A preset's own options another type may well leave unused.
+
     at_end  : before the end, options that are read while solving still have their time
     awaited : prefixes of solvers that are only made while solving
     """
     unused = [
         name
         for name in _left()
-        if name not in ours
+        if not in_use[name]
         and not READ_AT_THE_END.search(name)
         and (at_end or not READ_WHILE_SOLVING.search(name))
         and not name.startswith(awaited)

@@ -26,18 +26,20 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.forces import Forces
-from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes, TrueErrors
 from msmpetsc.solve.integrators import INTEGRATORS
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
+from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.monitors import Monitors
-from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery
+from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.rest import Rest
 from msmpetsc.solve.work import NO_WORK, Work
 
@@ -64,6 +66,8 @@ def refuse_bad_options(scene: Scene, probes: Probes) -> None:
         raise InputError(f"self_contact is for newton's presets, not {scene.solver.preset}")
     if scene.time.error and probes != Probes():
         raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
+    if "" not in solvers and probes != Probes():
+        raise InputError("the true error and the trace are of a step that is solved: verlet has none")
 
 
 @dataclass
@@ -87,7 +91,7 @@ class TimeLoop:
     state         : that goes with the last frame, or the last step
     step          : steps taken
     steps         : steps of the whole run; those taken, once that is at rest
-    trace         : of the step that the probes follow, once it was taken
+    true_errors   : of the steps that the probes ask for
     stored        : number of frames of the whole run; ``stored_until(step)`` of a part
     """
 
@@ -98,7 +102,6 @@ class TimeLoop:
         self.comm, self.model, self.probes, self.time_step = comm, model, probes, scene.time.step
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
-        self.trace: dict | None = None
         points = [probe.point for probe in scene.output.probe]
         self.probe = (
             ProbePoints(comm, model.lattice, points) if points else None
@@ -112,7 +115,7 @@ class TimeLoop:
             self.adaptive = Adaptive(scene, self._make, self.balance)
         self.integrator = self.adaptive or self._make(scene.time, scene.solver)
         self.recovery = Recovery(scene, self._make, self.balance)
-        self.monitors = Monitors(comm, model.lattice)
+        self.monitors, self.true_errors = Monitors(comm, model.lattice), TrueErrors()
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         self.forces = Forces(scene, model, self.environment, self.elasticity)
@@ -126,7 +129,13 @@ class TimeLoop:
 
     def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
         """Make the integrator that a scene's tables ask for, its PETSc options of this prefix (collective)."""
-        return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, self.probes, prefix)
+        return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, prefix)
+
+    @property
+    def _stepper(self) -> Stepper:
+        """That of a scene whose steps are solved."""
+        assert isinstance(self.integrator, ImplicitEuler)
+        return self.integrator.stepper
 
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
@@ -154,7 +163,7 @@ class TimeLoop:
         """The next step (collective), as a frame if stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
         if index == self.probes.trace:
-            self.integrator.follow()
+            self.true_errors.follow(self._stepper)
         self._overlaps(index, time)
         begin = perf_counter()
         try:
@@ -170,9 +179,7 @@ class TimeLoop:
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
         if self.probes.asks(index) and not result.cost.substeps + result.cost.fallbacks:  # not of recovery
-            errors, trace = self.integrator.true_errors(index, result)
-            self.effort.measure(errors)
-            self.trace = trace or self.trace
+            self.effort.measure(self.true_errors.of(index, self._stepper, result))
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
@@ -225,7 +232,10 @@ class TimeLoop:
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
-        self.integrator.refuse_unused_options(at_end, self.recovery.awaited)
+        awaited = self.recovery.awaited
+        if self.probes != Probes() and not at_end:
+            awaited = (*awaited, REFERENCE_PREFIX)
+        refuse_unused(self.comm, at_end, awaited)
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
@@ -283,6 +293,7 @@ class TimeLoop:
         self.destroy()
 
     def destroy(self) -> None:
+        self.true_errors.destroy()
         self.recovery.destroy()
         self.integrator.destroy()
 

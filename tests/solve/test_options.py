@@ -60,7 +60,7 @@ def test_a_misspelt_option_is_told_with_the_nearest(petsc_options, name: str):
     petsc_options(**{name: "cg"})
     refuse_early(COMM)
     with pytest.raises(InputError, match=f"-{name}: no part of this run.*, did you mean '{name[:5]}"):
-        refuse_unused(COMM, set(), at_end=True)
+        refuse_unused(COMM, at_end=True)
 
 
 LINES = dict.fromkeys(("-ksp_type cg", "", '-log_view "a b"', "-shift -0.5", "alias -a -b"), True)  # PETSc can read it

@@ -255,10 +255,7 @@ class Adaptive(Integrator):
     def save(self, checkpoint: Checkpoint) -> None:
         for part in (self, self.control):
             checkpoint.keep_counts(part)
-        self._integrator_last().save(checkpoint)
-
-    def _integrator_last(self) -> Integrator:
-        return self.kept[next(reversed(self.kept))]
+        self.kept[next(reversed(self.kept))].save(checkpoint)  # that used last
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         for part in (self, self.control):
@@ -268,9 +265,6 @@ class Adaptive(Integrator):
     def forget(self) -> None:
         for integrator in self.kept.values():
             integrator.forget()
-
-    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
-        self._integrator_last().refuse_unused_options(at_end, awaited)
 
     def sum_up(self) -> None:
         """Say at the end of a run how far off the motion may be."""

@@ -20,20 +20,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
-from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, Probes, Reference, Trace
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.events import CONTACT
 from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
@@ -113,18 +111,13 @@ class ImplicitEuler(Integrator):
     SHARE = 1.0  # tau / t
     STATIC = False  # M is no part of F
 
-    def __init__(
-        self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, probes: Probes, prefix: str
-    ):
-        self.comm, self.environment, self.solver, self.probes, self.prefix = comm, environment, solver, probes, prefix
+    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, prefix: str):
+        self.comm, self.environment, self.solver, self.prefix = comm, environment, solver, prefix
         self.time_step = time.step
         self.damping, self.retardation = environment.damping, environment.retardation
         self.tau = self._first_tau()
         self.anchors = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
-        self.problem: StepProblem | None = None  # of the step taken last
-        self.reference: Reference | None = None
-        self.trace: Trace | None = None
 
     def _first_tau(self) -> float:
         return self.SHARE * self.time_step
@@ -172,11 +165,11 @@ class ImplicitEuler(Integrator):
         faces = ContactFaces(self.comm, self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         while not faces.is_settled:
-            self.problem = replace(faces.problem(), rates=rates)
-            result = self.stepper.step(self.problem)
+            problem = replace(faces.problem(), rates=rates)
+            result = self.stepper.step(problem)
             faces.compare(result.position)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
-        result = replace(result, cost=cost, problem=self.problem, tau=self.damped_tau)
+        result = replace(result, cost=cost, problem=problem, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides
 
     def _with_viscosity(self, result: StepResult) -> StepResult:
@@ -188,26 +181,6 @@ class ImplicitEuler(Integrator):
         viscosity.add_gradient(result.position, forces)
         taken = -viscosity.change(result.position, problem.fixed)
         return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
-
-    def follow(self) -> None:
-        self.trace = Trace()
-        self.trace.follow(self.stepper)
-
-    def true_errors(self, index: int, result: StepResult) -> tuple[Floats, dict | None]:
-        if self.reference is None:
-            lattice = self.stepper.lattice
-            self.reference = Reference(
-                self.comm, lattice, self.damped_tau, touches=self.environment.touches, static=self.STATIC
-            )
-        trace, self.trace, self.stepper.observer = self.trace, None, None
-        assert self.problem is not None, "no step was taken"
-        positions = [*(trace.positions if trace else []), result.position]
-        errors = self.reference.errors(self.problem, positions)
-        if trace is None:
-            return errors[-1], None
-        lists = {"iteration": trace.iteration, "ksp_its": trace.ksp_its, "seconds": trace.seconds}
-        of_positions, of_energies = errors[:-1].T.tolist()
-        return errors[-1], {"frame": index, **lists, "position_error": of_positions, "energy_error": of_energies}
 
     def _new_stepper(self, time: float) -> Stepper:
         """The solver while the same nodes are fixed as at ``time``: these are no unknowns."""
@@ -231,7 +204,7 @@ class ImplicitEuler(Integrator):
             self.anchors = anchors
             self.destroy()
             self.tau = self._first_tau()  # whatever came before: a resumed run has not seen it
-            self.stepper, self.reference = self._new_stepper(time), None
+            self.stepper = self._new_stepper(time)
             self.set_up()
 
     def save(self, checkpoint: Checkpoint) -> None:
@@ -247,17 +220,7 @@ class ImplicitEuler(Integrator):
     def forget(self) -> None:
         self.stepper.forget()
 
-    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
-        names = self.stepper.options.names
-        if self.reference:
-            names = names | self.reference.stepper.options.names
-        if self.probes != Probes() and not at_end:
-            awaited = (*awaited, REFERENCE_PREFIX)
-        refuse_unused(self.comm, names, at_end, awaited)
-
     def destroy(self) -> None:
-        if self.reference:
-            self.reference.destroy()
         self.stepper.destroy()
 
 

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
+from msmpetsc.backend.arrays import Indices, Positions, Rows, like
 from msmpetsc.checkpoint import FINITE, Checkpoint
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import with_ghosts
@@ -101,17 +101,6 @@ class Integrator(Protocol):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s]: its result, and what the next one starts from. Raises StepFailed."""
 
-    def follow(self) -> None:
-        """Trace the iterates of the step that comes next, if it has any."""
-        return
-
-    def true_errors(self, index: int, result: StepResult) -> tuple[Floats, dict | None]:
-        """Position and energy error (2,) of step ``index``, taken last, and its trace if it was followed.
-
-        NaN where no single step was solved.
-        """
-        return np.full(2, np.nan), None
-
     def save(self, checkpoint: Checkpoint) -> None:
         """Store what the next step depends on beside its state, and forget all else."""
 
@@ -120,12 +109,6 @@ class Integrator(Protocol):
 
     def forget(self) -> None:
         """Forget what earlier steps showed, so that the next step does not depend on it."""
-
-    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
-        """Raise InputError for PETSc options of the user that nothing has used.
-
-        awaited : prefixes of solvers that may still be made
-        """
 
     def destroy(self) -> None:
         """Destroy all PETSc objects."""

@@ -159,6 +159,7 @@ class Static(ImplicitEuler):
     STATIC = True
     state: ClassVar[dict[str, Range]] = {"error": ANY}
     error = made_for = 0.0
+    problem: StepProblem | None = None  # of the last state
 
     def _first_tau(self) -> float:
         """SLENDER times how long sound takes along the longest side of the lattice, roughly [s]."""

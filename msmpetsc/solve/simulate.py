@@ -3,16 +3,18 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Positions, Rows, on_host, to_host
+from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.comm import Route
+from msmpetsc.constraints.reactions import sums_by
+from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
@@ -25,14 +27,13 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.forces import Forces
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes, TrueErrors
 from msmpetsc.solve.integrators import INTEGRATORS
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.monitors import Monitors
+from msmpetsc.solve.monitors import Monitors, Rest
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
@@ -40,7 +41,6 @@ from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery
 from msmpetsc.solve.refused_options import refuse_unused
-from msmpetsc.solve.rest import Rest
 from msmpetsc.solve.work import NO_WORK, Work
 
 REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
@@ -311,3 +311,62 @@ class SurfaceMotion:
     def __call__(self, position: Positions) -> Rows:
         """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
         return self.weights @ self.to_owner.answer(position[self.asked])
+
+
+class Forces:
+    """The forces on a body at a frame (fields.Frame), by the names of those that the scene has a use for: loads,
+    reactions of pins and anchors, pushes of obstacles and of the surface.
+
+    They are those of the step that ended last: its inertia, and friction as it had it. Where there is none, as at the
+    start and in explicit steps, nothing that is held accelerates, and obstacles push without friction.
+    """
+
+    def __init__(self, scene: Scene, model: Model, environment: Environment, elasticity: Elasticity):
+        self.comm, self.model, self.environment = model.lattice.table.comm, model, environment
+        self.elasticity = elasticity
+        self.pushing = [number for number, obstacle in enumerate(scene.obstacle) if obstacle.response != "exchange"]
+        bodies = len(model.lattice.first_of_body) if model.collision else 0
+        rows = {"reaction": len(model.holders.keys), "push": len(model.obstacles), "contact_push": bodies}
+        self.rows = {name: count for name, count in rows.items() if count}
+
+    def __call__(self, q: Positions, time: float, sides: Indices | None, step: StepResult | None) -> dict[str, Any]:
+        """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
+        environment, owned = self.environment, self.model.lattice.owned
+        problem = step.problem if step else None
+        contact = problem.contact if problem else environment.push(time, sides)
+        load = environment.load(time)
+        sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
+        if "reaction" in self.rows:
+            held = self._held(q, contact, step) - load
+            sums["reaction"] = self.model.holders.totals(held * environment.fixed_at(time)[:owned, None])
+        return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
+
+    def _held(self, q: Positions, contact: Contact | None, step: StepResult | None) -> Rows:
+        """Return what would hold this rank's nodes where they are, beside the loads (owned, 3) [N]."""
+        held, owned = np.zeros_like(q), self.model.lattice.owned
+        self.elasticity.add_gradient(q, held)
+        if contact:
+            contact.add_gradient(q, held)
+        held = held[:owned]
+        if step and step.viscous is not None:
+            held += step.viscous
+        if step and step.problem:
+            held += self.model.lattice.mass[:, None] * (q[:owned] - step.problem.y[:owned]) / step.tau**2
+        return held
+
+    def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
+        """Return the pushes of obstacles (o, 3) and of contact on bodies (b, 3) on this rank's nodes with [N]."""
+        lattice, owned = self.model.lattice, self.model.lattice.owned
+        push, penalties = np.zeros((len(self.model.obstacles), 3)), self.environment.penalties
+        for state in contact.states if contact else ():
+            which = next(k for k, penalty in enumerate(penalties) if penalty.obstacle is state.obstacle)
+            gradient = np.zeros_like(q[:owned])
+            state.add_gradient(q[:owned], gradient)
+            push[self.pushing[which]] -= to_host(gradient.sum(axis=0))
+        bodies = len(lattice.first_of_body)
+        touching = np.zeros((bodies, 3))
+        if contact and contact.surface:
+            own = np.zeros_like(q[:owned])
+            contact.surface.add_gradient(q, own)
+            touching -= sums_by(lattice.body[:owned], own, bodies)
+        return {"push": push, "contact_push": touching}

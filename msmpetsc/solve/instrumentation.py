@@ -1,7 +1,8 @@
 """Measurements beside a run's frames: true errors, the iterates of one step, where the time went."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -34,61 +35,92 @@ class Probes:
         return index == self.trace or (self.true_error is not None and index % self.true_error == 0)
 
 
-@dataclass
-class Trace:
-    """Iterates of a step: at each its number, the KSP iterations and seconds so far, positions (l, 3) [m]."""
+class TracedIterate(NamedTuple):
+    """KSP iterations and seconds since its step began, positions (l, 3) [m]."""
 
-    iteration: list[int] = field(default_factory=list)
-    ksp_its: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    positions: list[Positions] = field(default_factory=list)
-
-    def follow(self, stepper: Stepper) -> None:
-        """Take the iterates from now on, which is when the step begins."""
-        begin, before = perf_counter(), stepper.work_so_far()
-
-        def observe(q: Positions) -> None:
-            nonlocal begin
-            now = perf_counter()
-            self.iteration.append(len(self.iteration))
-            self.ksp_its.append((stepper.work_so_far() - before).ksp_its)
-            self.seconds.append(now - begin)
-            self.positions.append(q)
-            begin += perf_counter() - now  # not of the step
-
-        stepper.observer = observe
+    ksp_its: int
+    seconds: float
+    position: Positions
 
 
 class TrueErrors:
-    """True errors of a run's steps, and what the iterates of one had.
+    """True errors of a run's steps, against steps solved to rounding, and what the iterates of one had.
+
+    What it takes is not timed with the run.
 
     trace : of the step that was followed, once it was taken
     """
 
     def __init__(self) -> None:
-        self.reference: Reference | None = None
-        self.followed: Trace | None = None
+        self.stepper: Stepper | None = None  # whose steps the reference takes
+        self.reference: Stepper | None = None
+        self.iterates: list[TracedIterate] = []
         self.trace: dict | None = None
 
     def follow(self, stepper: Stepper) -> None:
-        """Trace the iterates of the step that comes next."""
-        self.followed = Trace()
-        self.followed.follow(stepper)
+        """Trace the iterates of the step that begins now."""
+        begin, before = perf_counter(), stepper.work_so_far()
 
-    def of(self, index: int, stepper: Stepper, result: StepResult) -> Floats:
+        def observe(q: Positions) -> None:
+            nonlocal begin
+            now = perf_counter()
+            self.iterates.append(TracedIterate((stepper.work_so_far() - before).ksp_its, now - begin, q))
+            begin += perf_counter() - now  # not of the step
+
+        stepper.observer = observe
+
+    def measure(self, index: int, stepper: Stepper, result: StepResult) -> Floats:
         """Position and energy error (2,) of step ``index``, which a stepper took last (collective)."""
-        if self.reference is None or self.reference.of is not stepper:  # an anchor let go
-            self.destroy()
-            self.reference = Reference(stepper)
-        followed, self.followed, stepper.observer = self.followed, None, None
+        iterates, self.iterates, stepper.observer = self.iterates, [], None
         assert result.problem is not None, "no step was taken"
-        positions = [*(followed.positions if followed else []), result.position]
-        errors = self.reference.errors(result.problem, positions)
-        if followed:
-            lists = {"iteration": followed.iteration, "ksp_its": followed.ksp_its, "seconds": followed.seconds}
-            of_positions, of_energies = errors[:-1].T.tolist()
-            self.trace = {"frame": index, **lists, "position_error": of_positions, "energy_error": of_energies}
+        errors = self.errors(stepper, result.problem, [*(each.position for each in iterates), result.position])
+        if iterates:
+            self.trace = {
+                "frame": index,
+                "iteration": list(range(len(iterates))),
+                "ksp_its": [each.ksp_its for each in iterates],
+                "seconds": [each.seconds for each in iterates],
+                "position_error": errors[:-1, 0].tolist(),
+                "energy_error": errors[:-1, 1].tolist(),
+            }
         return errors[-1]
+
+    def errors(self, stepper: Stepper, problem: StepProblem, positions: list[Positions]) -> Rows:
+        """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
+
+        Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
+        """
+        try:
+            with begun(REFERENCE):
+                return self._errors(self._reference(stepper), problem, positions)
+        except StepFailed as failure:
+            log.warning("the true error of a step is not known: its reference %s", failure)
+            return np.full((len(positions), 2), np.nan)
+
+    def _reference(self, stepper: Stepper) -> Stepper:
+        if self.reference is None or self.stepper is not stepper:  # an anchor let go
+            self.destroy()
+            self.stepper = stepper
+            self.reference = Stepper(
+                stepper.comm,
+                stepper.lattice,
+                stepper.time_step,
+                find_preset(REFERENCE_PRESET),
+                REFERENCE_ERROR,
+                touches=stepper.touches,
+                prefix=REFERENCE_PREFIX,
+                static=stepper.static,
+            )
+            self.reference.set_up()
+        return self.reference
+
+    def _errors(self, reference: Stepper, problem: StepProblem, positions: list[Positions]) -> Rows:
+        reference.forget()  # what is measured does not depend on what was measured before
+        exact = reference.step(problem, positions[-1]).position
+        start, *distances = (_distances(reference, x, exact) for x in (problem.y, *positions))
+        errors = np.divide(distances, start, out=np.zeros_like(distances), where=start > 0)
+        errors[:, 0] = [reference.control.rounding.added_to(error, start[0]) for error in errors[:, 0]]
+        return errors
 
     def destroy(self) -> None:
         """Collective."""
@@ -96,57 +128,13 @@ class TrueErrors:
             self.reference.destroy()
 
 
-class Reference:
-    """Steps of a stepper solved to rounding, which true errors are measured against; not timed with the run."""
-
-    def __init__(self, of: Stepper):
-        self.of = of
-        with begun(REFERENCE):
-            self.stepper = Stepper(
-                of.comm,
-                of.lattice,
-                of.time_step,
-                find_preset(REFERENCE_PRESET),
-                REFERENCE_ERROR,
-                touches=of.touches,
-                prefix=REFERENCE_PREFIX,
-                static=of.static,
-            )
-            self.stepper.set_up()
-
-    def errors(self, problem: StepProblem, positions: list[Positions]) -> Rows:
-        """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
-
-        Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
-        """
-        try:
-            with begun(REFERENCE):
-                return self._errors(problem, positions)
-        except StepFailed as failure:
-            log.warning("the true error of a step is not known: its reference %s", failure)
-            return np.full((len(positions), 2), np.nan)
-
-    def _errors(self, problem: StepProblem, positions: list[Positions]) -> Rows:
-        self.stepper.forget()  # what is measured does not depend on what was measured before
-        exact = self.stepper.step(problem, positions[-1]).position
-        start = self._distances(problem.y, exact)
-        distances = np.array([self._distances(x, exact) for x in positions])
-        errors = np.divide(distances, start, out=np.zeros_like(distances), where=start > 0)
-        errors[:, 0] = [self.stepper.control.rounding.added_to(error, start[0]) for error in errors[:, 0]]
-        return errors
-
-    def _distances(self, x: Positions, exact: Positions) -> Floats:
-        """|x - x*|_M and g(x) - g*."""
-        stepper = self.stepper
-        stepper.unknowns.from_nodes(x - exact, stepper.x)
-        distance = stepper.functional.norm(stepper.x)
-        stepper.unknowns.from_nodes(x, stepper.x)
-        q = stepper.functional.positions(stepper.x)
-        return np.array([distance, stepper.functional.change(q, exact)[0]])
-
-    def destroy(self) -> None:
-        """Collective."""
-        self.stepper.destroy()
+def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
+    """|x - x*|_M and g(x) - g*."""
+    reference.unknowns.from_nodes(x - exact, reference.x)
+    distance = reference.functional.norm(reference.x)
+    reference.unknowns.from_nodes(x, reference.x)
+    q = reference.functional.positions(reference.x)
+    return np.array([distance, reference.functional.change(q, exact)[0]])
 
 
 def times(comm: MPI.Comm) -> dict[str, float]:

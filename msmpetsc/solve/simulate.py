@@ -179,7 +179,7 @@ class TimeLoop:
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
         if self.probes.asks(index) and not result.cost.substeps + result.cost.fallbacks:  # not of recovery
-            self.effort.measure(self.true_errors.of(index, self._stepper, result))
+            self.effort.measure(self.true_errors.measure(index, self._stepper, result))
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):

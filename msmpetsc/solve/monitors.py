@@ -109,13 +109,12 @@ class Monitors:
 class Rest:
     """Check after each step whether the body has come to rest. All methods are collective.
 
-    A body at rest is where nothing that acts would move it, and moves by nothing. Both are lengths,
+    How far it is from the equilibrium near by, and how far its velocity would carry it from there, in all of the run's
+    time T:
 
-        |e|_M,  H e = T^2 (grad E(q) - f_ext),    and    sqrt(v^T M w),  H w = T^2 M v,    H = M + T^2 (Hessian of E),
+        |e|_M,  H e = T^2 (grad E(q) - f_ext),    and    sqrt(v^T M w),  H w = T^2 M v,    H = M + T^2 (Hessian of E)
 
-    how far it is from the equilibrium near by, and how far its velocity would carry it from there. T is all of the
-    run's time: so of a swing of frequency omega the second is its amplitude |v| / omega, and of a body that nothing
-    holds the way |v| T. They are estimated as errors of steps are, once a step has moved little.
+    They are estimated as errors of steps are, once a step has moved little.
 
     has_come : whether it has
     """

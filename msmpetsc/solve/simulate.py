@@ -28,10 +28,10 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes, TrueErrors
-from msmpetsc.solve.integrators import INTEGRATORS
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
-from msmpetsc.solve.integrators.implicit import ImplicitEuler
+from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
+from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.monitors import Monitors, Rest
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
@@ -43,13 +43,15 @@ from msmpetsc.solve.recovery import ROBUST, Recovery
 from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import NO_WORK, Work
 
+Integrators = dict[str, type[ImplicitEuler] | type[Verlet]]
+INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet, "static": Static}
 REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
 
 
 def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
     """The solvers of a run: prefix of their PETSc options -> preset and budget of iterations."""
     solvers = {}
-    if INTEGRATORS[scene.time.integrator] is not Verlet:
+    if scene.time.integrator != "verlet":
         solvers[""] = find_preset(scene.solver.preset), scene.solver.max_iterations or 0
     if scene.safety.on_failure == "fallback":
         solvers[FALLBACK] = find_preset(ROBUST), 0

@@ -5,13 +5,8 @@ What a step adds to the error of the trajectory is its local error: from positio
     implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
-Waves as short as a cell have the most of it and move next to nothing: an impact's would have each step resolve them,
-and so keep them, where longer steps damp them. So local errors are means over neighbours, taken a few times.
-
-Of nodes that bounce off in a step, which do so at its end and not when they touch, a step times the velocity that they
-changed by is added, as the mean by mass: they push the rest of the body late. A penalty whose push on a node changes in
-a step may have done so early or late in it: that is counted just so, as a step times the change over the mass times a
-step. step_control adds all up and chooses the next step.
+Of these, means over neighbours count, and the changes of velocity by impacts and by pushes of penalties, times a step
+(README: steps as long as the motion allows). step_control adds all up and chooses the next step.
 
 Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and
 so does the history that BDF2 needs where the length changes. All methods are collective.

@@ -114,11 +114,8 @@ class Jacobian:
 class FrictionKinks:
     """Which nodes' friction Newton's method takes by its secant, not by its true curvature, in the step in progress.
 
-    Beyond a small slip the Hessian of friction has nothing along the slip. So Newton's full step takes a node that is
-    about to stick past the kink and round, the next one back, and the line search cuts each of them: of a lung that a
-    plate pressed, all of 79 nodes turned in most of 28 iterations. The parabola of the secant
-    (contact.obstacles.friction) never goes too far, but comes in slowly where nodes slip on. So a step begins with
-    secants; then only those nodes have them that the last full step took over a kink.
+    A step begins with secants, whose parabola never goes too far (contact.obstacles.friction) but comes in slowly where
+    nodes slip on; then only those nodes have them that the last full step took over a kink.
 
     contact : of the step; None where there is none
     secants : of the next Hessian; None where there is no contact

@@ -265,10 +265,6 @@ class StepPreconditioner:
             log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
             self.multigrid = self.make_multigrid()
 
-    def prepare(self, q: Positions, contact: Contact | None) -> bool:
-        """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
-        return self.in_use.prepare(q, contact)
-
     @property
     def to_balance(self) -> LatticePreconditioner | None:
         """What moves bodies as wholes to where their forces balance, which linear solves would not;

@@ -166,7 +166,7 @@ class Stepper:
         """
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
             self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
-            self.jacobian.preconditioner.prepare(self.lattice.nodes, None)
+            self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
             self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
             self.ksp.setUp()
 

@@ -52,7 +52,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str =
 def assembly_bytes(nodes: float | Array, springs: float | Array, nonzeros: float | Array) -> float | Array:
     """Return the bytes that ``assemble`` has at once beside its arguments; numbers, or arrays of a number a rank.
 
-    They are row of each node; weight, ends and kept of each spring; of each nonzero rows,
-    nodes, values, the last two again, COO's two indices, then CSR's index and value.
+    They are row of each node; weight, ends and kept of each spring; of each nonzero row, column and value,
+    COO's two indices, then CSR's index and value.
     """
-    return 8 * nodes + (8 + 4 * 4 + 2) * springs + (5 * 8 + 2 * 4 + 4 + 8) * nonzeros
+    return 8 * nodes + (8 + 4 * 4 + 2) * springs + (3 * 8 + 2 * 4 + 4 + 8) * nonzeros

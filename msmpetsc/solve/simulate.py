@@ -82,6 +82,10 @@ class Effort:
     true_error: float = np.nan
     energy_error: float = np.nan
 
+    def measure(self, errors: Rows) -> None:
+        """Take note of a step whose true errors were measured."""
+        self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
+
 
 class TimeLoop:
     """The loop over the steps of a run, from its start. A context manager, which destroys its PETSc objects on leaving.
@@ -177,9 +181,7 @@ class TimeLoop:
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
         if self.probes.asks(index) and not result.cost.substeps + result.cost.fallbacks:  # not of recovery
-            errors = self.true_errors.measure(index, self._stepper, result)
-            effort = self.effort
-            effort.true_error, effort.energy_error = np.fmax((effort.true_error, effort.energy_error), errors)
+            self.effort.measure(self.true_errors.measure(index, self._stepper, result))
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):

@@ -19,9 +19,9 @@ from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import BYTES_OF_CELL, BYTES_OF_NODE, BYTES_OF_SPRING, Lattice, lattice_bytes
 from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.linear import unknowns as numbering
 from msmpetsc.solve.linear.system import assemble, assembly_bytes
 from msmpetsc.solve.linear.unknowns import Ghosted, Unknowns
+from msmpetsc.solve.petsc import limits
 
 WORKER = WORKERS / "shares_worker.py"
 SELF = MPI.COMM_SELF
@@ -83,15 +83,16 @@ def test_what_is_scaled_is_near_what_is_counted(scene: Path):
 def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     lattice = build_model(SELF, load_scene(scene)).lattice
     nodes, nonzeros = lattice.owned, lattice.owned + 2 * len(lattice.springs)
-    monkeypatch.setattr(numbering, "LARGEST", 3 * nodes - 1)
+    monkeypatch.setattr(limits, "LARGEST", 3 * nodes - 1)
     for holder in (Unknowns, Ghosted):
         with pytest.raises(InputError, match=f"{nodes} nodes are more than the {3 * nodes - 1} unknowns"):
             holder(SELF, lattice)
-    monkeypatch.setattr(numbering, "LARGEST", nonzeros - 1)
+    monkeypatch.setattr(limits, "LARGEST", nonzeros - 1)
     unknowns = Unknowns(SELF, lattice)
-    with pytest.raises(InputError, match=f"{nonzeros} nonzeros"):
-        assemble(SELF, unknowns, 0.01)
-    monkeypatch.setattr(numbering, "LARGEST", nonzeros)
+    for columns in (1, 3):
+        with pytest.raises(InputError, match=f"{columns * nonzeros} nonzeros"):
+            assemble(SELF, unknowns, 0.01, columns=columns)
+    monkeypatch.setattr(limits, "LARGEST", nonzeros)
     assemble(SELF, unknowns, 0.01).destroy()
 
 

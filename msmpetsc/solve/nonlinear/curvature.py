@@ -21,7 +21,7 @@ from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
-from msmpetsc.solve.nonlinear.functional import StepFunctional
+from msmpetsc.solve.nonlinear.functional import StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 MOST = 100  # iterations of a long search
@@ -71,8 +71,13 @@ class Compression:
     inertia: bool = True  # M is part of H, which outweighs what is not positive in the rest
 
     @property
+    def is_harmless(self) -> bool:
+        """H is positive definite for certain: M outweighs all that is negative in it."""
+        return self.least_curvature > 0
+
+    @property
     def least_curvature(self) -> float:
-        """No eigenvalue of M^(-1) H is less, as M outweighs all that is negative in H; 0 where none can be told."""
+        """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
         return max(1 - self.greatest, 0.0) if self.inertia and not self.resists else 0.0
 
 
@@ -92,6 +97,7 @@ class LowestCurvature:
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far
         self.products = 0  # of them with H, and at multigrid's finest level
+        self.known: tuple[StepProblem | None, Positions, Compression] = (None, np.empty(0), NONE)  # the last asked for
         self.searched = NONE  # the compression that the last long search was at
         self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
         self.value = 0.0  # its curvature when it was found
@@ -106,6 +112,10 @@ class LowestCurvature:
 
     def compression(self, q: Positions) -> Compression:
         """Compression at positions q (l, 3) [m] in the functional's problem."""
+        problem, (known_problem, at, known) = self.functional.problem, self.known
+        same = known_problem is problem and bool(np.array_equal(at, q))
+        if self.comm.allreduce(same, MPI.LAND):
+            return known
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
         concavity = elasticity.concavity(q)[free]
@@ -114,7 +124,9 @@ class LowestCurvature:
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
         gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)
-        return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
+        known = Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
+        self.known = problem, q, known
+        return known
 
     def lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None

@@ -262,7 +262,7 @@ class Stepper:
         """Whether x is a minimum, and how far from it (collective)."""
         control, functional, q = self.control, self.functional, self.functional.positions(self.x)
         compression = self.minimum.curvature.compression(q)
-        if compression.least_curvature > 0:
+        if compression.is_harmless:
             return Verdict(outcome.error, is_minimum=True)
         enough = control.target * functional.distance(q) if control.target else np.inf
         verdict = self.minimum.examine(self.x, outcome.corrected, compression, outcome.alarm, enough)

@@ -36,7 +36,8 @@ class Cost:
         self.comm, self.simulation, self.setup = comm, simulation, setup
         self.output, self.stepping, self.products = 0.0, 0.0, 0
         model = simulation.model
-        own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, simulation.integrator.unknowns
+        free = int((~simulation.environment.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())
+        own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, free
         self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
 
     @contextmanager
@@ -56,7 +57,7 @@ class Cost:
 
     def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""
-        from msmpetsc.solve.instrumentation import hierarchies, times
+        from msmpetsc.solve.instrumentation import times
         from msmpetsc.solve.integrators.verlet import explicit_limit
 
         comm, simulation = self.comm, self.simulation
@@ -64,15 +65,13 @@ class Cost:
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
         time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
         time["setup"] -= min(time["factor"], time["setup"])
-        stepper = getattr(simulation.integrator, "stepper", None)  # an explicit integrator has none
         record = {
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
             **self.counts,
             "time": time,
             "products": self.products,
-            "hierarchy": hierarchies(comm, stepper),
             "memory": comm.allreduce(peak_memory()),
-            "trace": simulation.trace,
+            "trace": simulation.true_errors.trace,
             "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),
             "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
         }  # fmt: skip

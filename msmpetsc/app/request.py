@@ -186,7 +186,6 @@ def flag_of(name: str) -> str:
 
 
 OPTIONS: dict[str, Option] = {field.name: cast(Any, field.type).__metadata__[0] for field in fields(RunRequest)}
-FLAGS = [flag_of(name) for name, option in OPTIONS.items() if name != "scene" and not option.python]
 
 
 def asked_by(request: Callable[P, RunRequest]) -> Callable[[Callable[[Callable[[], RunRequest]], T]], Callable[P, T]]:

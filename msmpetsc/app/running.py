@@ -15,7 +15,7 @@ from msmpetsc import __version__
 from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
 from msmpetsc.app.ending import ending_together
 from msmpetsc.app.profile import Cost, refuse_unwritable, versions
-from msmpetsc.app.request import FLAGS, RunRequest
+from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
 from msmpetsc.app.summary import log_end, log_model, tell_stop, warn_of_long_steps
 from msmpetsc.backend.kernel import cache_is_empty
@@ -32,7 +32,7 @@ from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import find_preset, preset_names, shown_options
-from msmpetsc.solve.refused_options import refuse_bad_values, refuse_early, silence_options_left
+from msmpetsc.solve.refused_options import refuse_early, silence_options_left
 from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 
 
@@ -66,7 +66,7 @@ class RunEnd:
 
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
     """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
-    refuse_early(comm, FLAGS)
+    refuse_early(comm)
     choose(comm, request.device)
     began = perf_counter()
     if request.measure:
@@ -74,7 +74,7 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     probes = Probes(request.true_error, request.trace)
     interval = Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
-    refuse_bad_options(comm, scene, probes)
+    refuse_bad_options(scene, probes)
     on_root(comm, lambda: refuse_unwritable(request.measured))
     attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
@@ -152,7 +152,7 @@ def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int
 
 def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> list[str]:
     """Return the options in PETSc's database of a run, or of a preset alone (collective)."""
-    refuse_early(comm, FLAGS)
+    refuse_early(comm)
     choose(comm, request.device)
     if request.scene or earlier:
         scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
@@ -161,7 +161,6 @@ def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier 
         raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
     else:
         solvers = {"": (find_preset(request.preset or Solver.model_fields["preset"].default), 0)}
-    on_root(comm, lambda: refuse_bad_values(solvers))
     lines = shown_options(solvers)
     silence_options_left()
     return lines

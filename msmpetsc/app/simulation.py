@@ -11,7 +11,6 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.app.ending import ending_together, logged_on_root
-from msmpetsc.app.request import FLAGS
 from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
@@ -124,7 +123,7 @@ class Simulation:
         from msmpetsc.solve.instrumentation import Probes
 
         alone = self._lend_options(until_the_end)
-        simulate.refuse_bad_options(self.comm, scene, Probes())
+        simulate.refuse_bad_options(scene, Probes())
         if self._shape is None or not self._shape.fits(scene):
             self._shape = Geometry(self.comm, scene)
         self.model = model = build_model(self.comm, scene, self._shape)
@@ -146,7 +145,7 @@ class Simulation:
         if words:
             until_the_end.enter_context(lent_options(self.comm, words))
         if alone:
-            refuse_early(self.comm, FLAGS)
+            refuse_early(self.comm)
         choose(self.comm, self.device)
         return alone
 

@@ -1,18 +1,22 @@
 """Measurements beside a run's frames: true errors, the iterates of one step, where the time went."""
 
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from time import perf_counter
+from typing import NamedTuple
 
+import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Positions, Rows
-from msmpetsc.solve.multigrid.cycle import Multigrid
-from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, count, seconds
+from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.comm import log
+from msmpetsc.errors import StepFailed
+from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, REFERENCE, begun, seconds
+from msmpetsc.solve.presets import find_preset
 
-INDEX, VALUE = PETSc.IntType().itemsize, PETSc.ScalarType().itemsize
+REFERENCE_PRESET, REFERENCE_ERROR = "newton-multigrid", 1e-10
+REFERENCE_PREFIX = "reference_"  # of its PETSc options
 EVENTS = {
     "factor": ["PCSetUp"], "local": [LOCAL.name], "ksp": ["KSPSolve"], "hierarchy": [GRIDS.name, HIERARCHY.name],
     "cycle": [CYCLE.name], "fine": [FINE.name],
@@ -31,67 +35,108 @@ class Probes:
         return index == self.trace or (self.true_error is not None and index % self.true_error == 0)
 
 
-@dataclass
-class Trace:
-    """Iterates of a step: at each its number, the KSP iterations and seconds so far, positions (l, 3) [m]."""
+class TracedIterate(NamedTuple):
+    """KSP iterations and seconds since its step began, positions (l, 3) [m]."""
 
-    iteration: list[int] = field(default_factory=list)
-    ksp_its: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    positions: list[Positions] = field(default_factory=list)
+    ksp_its: int
+    seconds: float
+    position: Positions
+
+
+class TrueErrors:
+    """True errors of a run's steps, against steps solved to rounding, and what the iterates of one had.
+
+    What it takes is not timed with the run.
+
+    trace : of the step that was followed, once it was taken
+    """
+
+    def __init__(self) -> None:
+        self.stepper: Stepper | None = None  # whose steps the reference takes
+        self.reference: Stepper | None = None
+        self.iterates: list[TracedIterate] = []
+        self.trace: dict | None = None
 
     def follow(self, stepper: Stepper) -> None:
-        """Take the iterates from now on, which is when the step begins."""
+        """Trace the iterates of the step that begins now."""
         begin, before = perf_counter(), stepper.work_so_far()
 
         def observe(q: Positions) -> None:
             nonlocal begin
             now = perf_counter()
-            self.iteration.append(len(self.iteration))
-            self.ksp_its.append((stepper.work_so_far() - before).ksp_its)
-            self.seconds.append(now - begin)
-            self.positions.append(q)
+            self.iterates.append(TracedIterate((stepper.work_so_far() - before).ksp_its, now - begin, q))
             begin += perf_counter() - now  # not of the step
 
         stepper.observer = observe
+
+    def measure(self, index: int, stepper: Stepper, result: StepResult) -> Floats:
+        """Position and energy error (2,) of step ``index``, which a stepper took last (collective)."""
+        iterates, self.iterates, stepper.observer = self.iterates, [], None
+        assert result.problem is not None, "no step was taken"
+        errors = self.errors(stepper, result.problem, [*(each.position for each in iterates), result.position])
+        if iterates:
+            self.trace = {
+                "frame": index,
+                "iteration": list(range(len(iterates))),
+                "ksp_its": [each.ksp_its for each in iterates],
+                "seconds": [each.seconds for each in iterates],
+                "position_error": errors[:-1, 0].tolist(),
+                "energy_error": errors[:-1, 1].tolist(),
+            }
+        return errors[-1]
+
+    def errors(self, stepper: Stepper, problem: StepProblem, positions: list[Positions]) -> Rows:
+        """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
+
+        Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
+        """
+        try:
+            with begun(REFERENCE):
+                return self._errors(self._reference(stepper), problem, positions)
+        except StepFailed as failure:
+            log.warning("the true error of a step is not known: its reference %s", failure)
+            return np.full((len(positions), 2), np.nan)
+
+    def _reference(self, stepper: Stepper) -> Stepper:
+        if self.reference is None or self.stepper is not stepper:  # an anchor let go
+            self.destroy()
+            self.stepper = stepper
+            self.reference = Stepper(
+                stepper.comm,
+                stepper.lattice,
+                stepper.time_step,
+                find_preset(REFERENCE_PRESET),
+                REFERENCE_ERROR,
+                touches=stepper.touches,
+                prefix=REFERENCE_PREFIX,
+                static=stepper.static,
+            )
+            self.reference.set_up()
+        return self.reference
+
+    def _errors(self, reference: Stepper, problem: StepProblem, positions: list[Positions]) -> Rows:
+        reference.forget()  # what is measured does not depend on what was measured before
+        exact = reference.step(problem, positions[-1]).position
+        start, *distances = (_distances(reference, x, exact) for x in (problem.y, *positions))
+        errors = np.divide(distances, start, out=np.zeros_like(distances), where=start > 0)
+        errors[:, 0] = [reference.control.rounding.added_to(error, start[0]) for error in errors[:, 0]]
+        return errors
+
+    def destroy(self) -> None:
+        """Collective."""
+        if self.reference:
+            self.reference.destroy()
+
+
+def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
+    """|x - x*|_M and g(x) - g*."""
+    reference.unknowns.from_nodes(x - exact, reference.x)
+    distance = reference.functional.norm(reference.x)
+    reference.unknowns.from_nodes(x, reference.x)
+    q = reference.functional.positions(reference.x)
+    return np.array([distance, reference.functional.change(q, exact)[0]])
 
 
 def times(comm: MPI.Comm) -> dict[str, float]:
     """Seconds in events of the run, those of its references left out, the greatest of all ranks (collective)."""
     return {name: comm.allreduce(sum(map(seconds, events)), MPI.MAX) for name, events in EVENTS.items()}
-
-
-def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
-    """How many hierarchies of multigrid were built, and bytes of all ranks that the last one holds (collective).
-
-    They are those beside the lattice, without what factors the coarsest level: P and matrix of each
-    coarse level, what sums the first, the finest level's blocks.
-    """
-    own = 0
-    chosen = stepper.jacobian.preconditioner.multigrid if stepper else None
-    if chosen:
-        multigrid = chosen.multigrid
-        total = multigrid.sum
-        fine = multigrid.fine
-        arrays: list[Array] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
-        arrays += [*total.springs, *total.nodes, *total.cells, *_blocks(multigrid)]
-        own = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
-        arrays += [array for coarse in multigrid.coarse for array in (coarse.sums, *coarse.own, *coarse.others)]
-        own += sum(array.nbytes for array in arrays)
-    return {"builds": count(HIERARCHY.name), "bytes": comm.allreduce(own)}
-
-
-def _blocks(multigrid: Multigrid) -> list[Rows]:
-    """Arrays that the finest level's Hessian has of its own, not of the lattice."""
-    hessian = multigrid.fine.elastic
-    lent = {id(array) for part in multigrid.fine.elasticity.parts for array in vars(part).values()}
-    parts = [part for part in hessian.parts if isinstance(part, partial)] if hessian else []
-    return [array for part in parts for array in part.args if hasattr(array, "nbytes") and id(array) not in lent]
-
-
-def _of_matrix(matrix: PETSc.Mat) -> int:
-    """Return bytes of a rank's part of an AIJ matrix; 0 where it is not there yet."""
-    if not matrix:
-        return 0
-    nonzeros = matrix.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"]
-    return int(nonzeros) * (INDEX + VALUE) + (matrix.getLocalSize()[0] + 1) * INDEX

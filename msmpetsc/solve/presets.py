@@ -34,7 +34,6 @@ class Preset:
     extrapolate: bool = True
     iterations: int | None = None
     inexact: bool = False
-    kronecker: bool = False  # A is factored as A (x) I_3, 3m x 3m
     chooses: bool = False
 
 
@@ -140,13 +139,6 @@ PRESETS = {
         extrapolate=False,
         iterations=10,
     ),
-    "fast-msm-kronecker": Preset(
-        "The same as the seed paper must have had it: the factor of A (x) I_3, 3m x 3m; only to compare with",
-        {**PLAIN, **CHOLESKY},
-        extrapolate=False,
-        iterations=10,
-        kronecker=True,
-    ),
     "paper": Preset(
         "Zheng et al.: the same iterations with plain CG from x = b to a fixed tolerance",
         {
@@ -227,7 +219,6 @@ class SolverOptions:
 
     def __init__(self, preset: Preset, prefix: str, budget: int):
         self.preset, self.prefix = preset, prefix
-        self.hidden: dict[str, str | None] = {}
         options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
         database = PETSc.Options()
         given = [name for name in database.getAll() if name.startswith(prefix) and not in_use[name]]
@@ -242,13 +233,6 @@ class SolverOptions:
             database.setValue(prefix + name, options[name] or None)
         self.names = {prefix + name for name in ours}
         in_use.update(self.names)
-
-    def hide(self, name: str) -> None:
-        """Keep an option of the user's from all objects that are made from now on."""
-        database = PETSc.Options()
-        if self.prefix + name in database.getAll():
-            self.hidden[self.prefix + name] = database.getAll()[self.prefix + name]
-            database.delValue(self.prefix + name)
 
     def is_default(self, name: str) -> bool:
         """Whether an option is the preset's own, not the user's."""
@@ -269,9 +253,6 @@ class SolverOptions:
 
     def withdraw(self) -> None:
         """Leave the database as the user has it: other presets follow, -options_left shows his own."""
-        for name, value in self.hidden.items():
-            PETSc.Options().setValue(name, value)
-            PETSc.Options().getString(name)  # it has been of use
         in_use.subtract(self.names)
         for name in self.names:
             if not in_use[name]:

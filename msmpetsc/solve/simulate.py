@@ -2,18 +2,19 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from time import perf_counter
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Positions, Rows, on_host, to_host
+from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
-from msmpetsc.comm import Route, on_root
+from msmpetsc.comm import Route
+from msmpetsc.constraints.reactions import sums_by
+from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
@@ -23,52 +24,52 @@ from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.probe import ProbePoints
 from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.forces import Forces
-from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators import INTEGRATORS, make_integrator
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes, TrueErrors
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
+from msmpetsc.solve.integrators.integrator import Integrator, State
+from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.monitors import Monitors
-from msmpetsc.solve.nonlinear.reference import PREFIX as REFERENCE
-from msmpetsc.solve.nonlinear.reference import PRESET
-from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.monitors import Monitors, Rest
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery
-from msmpetsc.solve.refused_options import refuse_bad_values, refuse_unused
-from msmpetsc.solve.rest import Rest
+from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import NO_WORK, Work
 
+Integrators = dict[str, type[ImplicitEuler] | type[Verlet]]
+INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet, "static": Static}
 REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
 
 
 def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
     """The solvers of a run: prefix of their PETSc options -> preset and budget of iterations."""
     solvers = {}
-    if INTEGRATORS[scene.time.integrator] is not Verlet:
+    if scene.time.integrator != "verlet":
         solvers[""] = find_preset(scene.solver.preset), scene.solver.max_iterations or 0
     if scene.safety.on_failure == "fallback":
         solvers[FALLBACK] = find_preset(ROBUST), 0
     if probes != Probes():
-        solvers[REFERENCE] = find_preset(PRESET), 0
+        solvers[REFERENCE_PREFIX] = find_preset(REFERENCE_PRESET), 0
     return solvers
 
 
-def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
-    """Raise InputError for PETSc options that the solvers of this scene refuse, before there is anything to solve."""
+def refuse_bad_options(scene: Scene, probes: Probes) -> None:
+    """Raise InputError for a preset that is unknown or not for this scene, and for steps and probes that cannot be."""
     solvers = solvers_of(scene, probes)
     refuse_bad_steps(scene.time)
     if scene.self_contact and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(f"self_contact is for newton's presets, not {scene.solver.preset}")
     if scene.time.error and probes != Probes():
         raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
-    if "" not in solvers:
-        refuse_unused(comm, set(), at_end=True, awaited=tuple(solvers))
-    on_root(comm, lambda: refuse_bad_values(solvers))
+    if "" not in solvers and probes != Probes():
+        raise InputError("the true error and the trace are of a step that is solved: verlet has none")
 
 
 @dataclass
@@ -92,7 +93,7 @@ class TimeLoop:
     state         : that goes with the last frame, or the last step
     step          : steps taken
     steps         : steps of the whole run; those taken, once that is at rest
-    trace         : of the step that the probes follow, once it was taken
+    true_errors   : of the steps that the probes ask for
     stored        : number of frames of the whole run; ``stored_until(step)`` of a part
     """
 
@@ -103,22 +104,20 @@ class TimeLoop:
         self.comm, self.model, self.probes, self.time_step = comm, model, probes, scene.time.step
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
-        self.trace: dict | None = None
         points = [probe.point for probe in scene.output.probe]
         self.probe = (
             ProbePoints(comm, model.lattice, points) if points else None
         )  # or refused, before PETSc has objects
         self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
-        make = partial(make_integrator, comm, self.environment)
         swings = scene.time.integrator != "implicit-euler"
         checks = scene.safety.checks
         self.balance = EnergyBalance(comm, self.environment, self.elasticity, swings, checks)
         self.adaptive: Adaptive | None = None
         if scene.time.error:
-            self.adaptive = Adaptive(scene, make, self.balance)
-        self.integrator = self.adaptive or make(scene.time, scene.solver, probes=probes)
-        self.recovery = Recovery(scene, lambda time, solver, prefix: make(time, solver, prefix=prefix), self.balance)
-        self.monitors = Monitors(comm, model.lattice)
+            self.adaptive = Adaptive(scene, self._make, self.balance)
+        self.integrator = self.adaptive or self._make(scene.time, scene.solver)
+        self.recovery = Recovery(scene, self._make, self.balance)
+        self.monitors, self.true_errors = Monitors(comm, model.lattice), TrueErrors()
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         self.forces = Forces(scene, model, self.environment, self.elasticity)
@@ -129,6 +128,16 @@ class TimeLoop:
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.time_error = np.nan  # estimated, of the trajectory so far
         self._saved = Checkpoint()
+
+    def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
+        """Make the integrator that a scene's tables ask for, its PETSc options of this prefix (collective)."""
+        return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, prefix)
+
+    @property
+    def _stepper(self) -> Stepper:
+        """That of a scene whose steps are solved."""
+        assert isinstance(self.integrator, ImplicitEuler)
+        return self.integrator.stepper
 
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
@@ -156,7 +165,7 @@ class TimeLoop:
         """The next step (collective), as a frame if stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
         if index == self.probes.trace:
-            self.integrator.follow()
+            self.true_errors.follow(self._stepper)
         self._overlaps(index, time)
         begin = perf_counter()
         try:
@@ -172,9 +181,7 @@ class TimeLoop:
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
         if self.probes.asks(index) and not result.cost.substeps + result.cost.fallbacks:  # not of recovery
-            errors, trace = self.integrator.true_errors(index, result)
-            self.effort.measure(errors)
-            self.trace = trace or self.trace
+            self.effort.measure(self.true_errors.measure(index, self._stepper, result))
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
@@ -227,7 +234,10 @@ class TimeLoop:
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
-        self.integrator.refuse_unused_options(at_end, self.recovery.awaited)
+        awaited = self.recovery.awaited
+        if self.probes != Probes() and not at_end:
+            awaited = (*awaited, REFERENCE_PREFIX)
+        refuse_unused(self.comm, at_end, awaited)
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
@@ -285,6 +295,7 @@ class TimeLoop:
         self.destroy()
 
     def destroy(self) -> None:
+        self.true_errors.destroy()
         self.recovery.destroy()
         self.integrator.destroy()
 
@@ -302,3 +313,71 @@ class SurfaceMotion:
     def __call__(self, position: Positions) -> Rows:
         """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
         return self.weights @ self.to_owner.answer(position[self.asked])
+
+
+class Forces:
+    """The forces on a body at a frame (fields.Frame), by the names of those that the scene has a use for: loads,
+    reactions of pins and anchors, pushes of obstacles and of the surface.
+
+    They are those of the step that ended last: its inertia, and friction as it had it. Where there is none, as at the
+    start and in explicit steps, nothing that is held accelerates, and obstacles push without friction.
+    """
+
+    def __init__(self, scene: Scene, model: Model, environment: Environment, elasticity: Elasticity):
+        self.comm, self.model, self.environment = model.lattice.table.comm, model, environment
+        self.elasticity = elasticity
+        self.pushing = [number for number, obstacle in enumerate(scene.obstacle) if obstacle.response != "exchange"]
+        bodies = len(model.lattice.first_of_body) if model.collision else 0
+        held = len(model.holders.keys)
+        rows = {"reaction": held, "torque": held, "push": len(model.obstacles), "contact_push": bodies}
+        self.rows = {name: count for name, count in rows.items() if count}
+
+    def __call__(self, q: Positions, time: float, sides: Indices | None, step: StepResult | None) -> dict[str, Any]:
+        """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
+        environment, owned = self.environment, self.model.lattice.owned
+        problem = step.problem if step else None
+        contact = problem.contact if problem else environment.push(time, sides)
+        load = environment.load(time)
+        sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
+        if "reaction" in self.rows:
+            held = (self._held(q, contact, step) - load) * environment.fixed_at(time)[:owned, None]
+            sums["reaction"] = self.model.holders.totals(held)
+            sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
+        return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
+
+    def _torque_points(self, time: float) -> Positions:
+        """Return the points (a, 3) [m] about which the torques of pins and anchors are counted, which these lead."""
+        points, anchors = self.model.holders.centers.copy(), self.model.anchors
+        for row, anchor in enumerate(anchors, len(points) - len(anchors)):
+            points[row] = anchor.path.center + anchor.path.value_at(time)[:3]
+        return points
+
+    def _held(self, q: Positions, contact: Contact | None, step: StepResult | None) -> Rows:
+        """Return what would hold this rank's nodes where they are, beside the loads (owned, 3) [N]."""
+        held, owned = np.zeros_like(q), self.model.lattice.owned
+        self.elasticity.add_gradient(q, held)
+        if contact:
+            contact.add_gradient(q, held)
+        held = held[:owned]
+        if step and step.viscous is not None:
+            held += step.viscous
+        if step and step.problem:
+            held += self.model.lattice.mass[:, None] * (q[:owned] - step.problem.y[:owned]) / step.tau**2
+        return held
+
+    def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
+        """Return the pushes of obstacles (o, 3) and of contact on bodies (b, 3) on this rank's nodes with [N]."""
+        lattice, owned = self.model.lattice, self.model.lattice.owned
+        push, penalties = np.zeros((len(self.model.obstacles), 3)), self.environment.penalties
+        for state in contact.states if contact else ():
+            which = next(k for k, penalty in enumerate(penalties) if penalty.obstacle is state.obstacle)
+            gradient = np.zeros_like(q[:owned])
+            state.add_gradient(q[:owned], gradient)
+            push[self.pushing[which]] -= to_host(gradient.sum(axis=0))
+        bodies = len(lattice.first_of_body)
+        touching = np.zeros((bodies, 3))
+        if contact and contact.surface:
+            own = np.zeros_like(q[:owned])
+            contact.surface.add_gradient(q, own)
+            touching -= sums_by(lattice.body[:owned], own, bodies)
+        return {"push": push, "contact_push": touching}

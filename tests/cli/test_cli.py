@@ -124,7 +124,7 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
     ("preset", "options", "seen"),
     [
         ("newton-multigrid", "-ksp_view", "type: mg"),
-        ("fast-msm-kronecker", "", ""),
+        ("fast-msm", "", ""),
         ("paper", "", ""),
         ("anderson", "-snes_type ngmres -snes_view", "SNES Object"),
         ("lbfgs", "-snes_view", "type is LBFGS"),

@@ -226,7 +226,7 @@ def test_what_would_move_the_surface_past_itself_is_refused(tmp_path, override: 
 def test_presets_of_a_are_refused(tmp_path):
     scene = load_scene(pinch_scene(tmp_path), ("solver.preset=anderson",))
     with pytest.raises(InputError, match="self_contact is for newton's presets, not anderson"):
-        refuse_bad_options(COMM, scene, Probes())
+        refuse_bad_options(scene, Probes())
 
 
 def sliding(folder: Path, angle: float, **given: float) -> Path:

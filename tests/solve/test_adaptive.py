@@ -7,7 +7,6 @@ import pytest
 from block_scene import block_scene, play
 from conftest import result_on
 from failing_steps import Failing
-from mpi4py import MPI
 from one_process import input_error
 
 from msmpetsc.fields import Frame
@@ -168,7 +167,7 @@ def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monk
 )
 def test_what_has_no_meaning_is_refused_in_a_line(tmp_path: Path, more: dict, says: str):
     scene = load_scene(beam(tmp_path, **more))
-    assert says in input_error(lambda: refuse_bad_options(MPI.COMM_SELF, scene, Probes()))
+    assert says in input_error(lambda: refuse_bad_options(scene, Probes()))
 
 
 def test_ranks_take_the_same_steps(tmp_path: Path):

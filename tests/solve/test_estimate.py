@@ -14,10 +14,9 @@ from one_process import errors
 
 from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.instrumentation import Probes, TrueErrors
 from msmpetsc.solve.nonlinear import error_control, minimum
 from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.nonlinear.reference import Reference
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
 from msmpetsc.solve.simulate import TimeLoop
@@ -84,13 +83,15 @@ def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
     """A mass on a spring along z: x* in closed form, and g is a parabola, so its error is the other's square."""
     m, k, r = 0.3, 40.0, 1.0
     lattice = one_spring(m, k, r)
-    reference = Reference(COMM, lattice, T, touches=False)
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"))
+    true_errors = TrueErrors()
     q, before = np.array([[0.0, 0, 0], [0, 0, 1.3]]), np.array([[0.0, 0, 0], [0, 0, 1.25]])
     y = 2 * 1.3 - 1.25
     exact = (m * y + T**2 * k * r) / (m + T**2 * k)
     found = [np.array([[0.0, 0, 0], [0, 0, exact + e * (y - exact)]]) for e in (1.0, 0.5, -0.01)]
-    errors = reference.errors(StepProblem(q, 2 * q - before, np.zeros((2, 3))), found)
-    reference.destroy()
+    errors = true_errors.errors(stepper, StepProblem(q, 2 * q - before, np.zeros((2, 3))), found)
+    for owned in (true_errors, stepper):
+        owned.destroy()
     np.testing.assert_allclose(errors, [[1, 1], [0.5, 0.25], [0.01, 1e-4]], rtol=1e-6)
 
 

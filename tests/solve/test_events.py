@@ -78,14 +78,6 @@ def test_times_are_of_all_stages_of_the_run_but_not_of_its_reference(run: tuple)
     assert cost["time"]["stepping"] == pytest.approx(frames["wall_time"].sum())
 
 
-def test_the_hierarchy_is_measured(run: tuple):
-    stages, cost, _ = run
-    builds = [stages[stage].get("msmpetsc hierarchy", (0,))[0] for stage in ("set-up", "steps")]
-    assert cost["hierarchy"]["builds"] == sum(builds) > 0 and "msmpetsc hierarchy" in stages["reference"]
-    blocks = 16 * cost["springs"] + 36 * cost["unknowns"]  # of the finest level, in single precision
-    assert blocks < cost["hierarchy"]["bytes"] < 10 * blocks
-
-
 def test_products_are_those_of_the_log(run: tuple):
     stages, cost, frames = run
     counts = [stages["steps"][f"msmpetsc {name}"][0] for name in ("product", "fine")]

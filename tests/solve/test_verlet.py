@@ -19,9 +19,8 @@ from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
-from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators import verlet
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -33,7 +32,7 @@ EXPLICIT = {"integrator": "verlet"}
 def integrator(lattice: Lattice, substep: float | None = None) -> Verlet:
     model = Model(None, lattice, None, [], [], [], [], at_rest(lattice))
     time = Time(step=T, duration=1.0, substep=substep, **EXPLICIT)
-    return Verlet(COMM, Environment(model), time, Solver(), Probes(), "")
+    return Verlet(COMM, Environment(model), time, Solver(), "")
 
 
 def fly(lattice: Lattice, q: np.ndarray, v: np.ndarray, steps: int, substep: float | None = None) -> list[State]:

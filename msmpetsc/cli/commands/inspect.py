@@ -104,7 +104,7 @@ def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) ->
     from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
 
     nodes, springs = partition.nodes + partition.ghosts, partition.springs
-    arrays = lattice_bytes(partition.cells, nodes, springs) + nodes * sum(BYTES_OF_NODE.values())
+    arrays = lattice_bytes(partition.cells, nodes, springs) + nodes * BYTES_OF_NODE
     arrays += assembly_bytes(nodes, springs, partition.nonzeros)
     points = sum(len(surface.points) for surface in surfaces)
     needed = np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / partition.ranks)

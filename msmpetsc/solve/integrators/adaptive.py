@@ -5,13 +5,8 @@ What a step adds to the error of the trajectory is its local error: from positio
     implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
-Waves as short as a cell have the most of it and move next to nothing: an impact's would have each step resolve them,
-and so keep them, where longer steps damp them. So local errors are means over neighbours, taken a few times.
-
-Of nodes that bounce off in a step, which do so at its end and not when they touch, a step times the velocity that they
-changed by is added, as the mean by mass: they push the rest of the body late. A penalty whose push on a node changes in
-a step may have done so early or late in it: that is counted just so, as a step times the change over the mass times a
-step. step_control adds all up and chooses the next step.
+Of these, means over neighbours count, and the changes of velocity by impacts and by pushes of penalties, times a step
+(README: steps as long as the motion allows). step_control adds all up and chooses the next step.
 
 Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and
 so does the history that BDF2 needs where the length changes. All methods are collective.
@@ -34,8 +29,7 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
 from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
@@ -135,10 +129,6 @@ class Adaptive(Integrator):
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
         self.tick = self.last = 0
         self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
-
-    @property
-    def unknowns(self) -> int:
-        return self._integrator_last().unknowns
 
     def set_up(self) -> None:
         """Make ready the integrator of the first step, and say what is to come."""
@@ -260,10 +250,7 @@ class Adaptive(Integrator):
     def save(self, checkpoint: Checkpoint) -> None:
         for part in (self, self.control):
             checkpoint.keep_counts(part)
-        self._integrator_last().save(checkpoint)
-
-    def _integrator_last(self) -> Integrator:
-        return self.kept[next(reversed(self.kept))]
+        self.kept[next(reversed(self.kept))].save(checkpoint)  # that used last
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         for part in (self, self.control):
@@ -273,9 +260,6 @@ class Adaptive(Integrator):
     def forget(self) -> None:
         for integrator in self.kept.values():
             integrator.forget()
-
-    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
-        self._integrator_last().refuse_unused_options(at_end, awaited)
 
     def sum_up(self) -> None:
         """Say at the end of a run how far off the motion may be."""

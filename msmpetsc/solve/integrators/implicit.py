@@ -15,27 +15,89 @@ A viscous solid has its dissipation over the step beside E (elasticity.viscosity
 Euler's difference of two positions is that of the turn half way between; BDF2's is of the step's end.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
+from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
-from msmpetsc.solve.instrumentation import Probes, Trace
-from msmpetsc.solve.integrators.contact_faces import ContactFaces
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.nonlinear.reference import PREFIX, Reference
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.petsc.events import CONTACT
 from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
+
+MOST_SOLVES = 10  # of a step, for nodes that pass through a box
+
+
+@dataclass
+class ContactFaces:
+    """Search for the faces by which nodes are pushed out of obstacles in one step. All methods are collective.
+
+    They are settled before the step is solved, by the way to y. Where the way to x shows others,
+    the step is solved again; from then on a node that has a face keeps it, so that this ends.
+
+    q, y       : (l, 3) [m], as a StepProblem has them
+    q_before   : (l, 3) [m] one step before q, of a step that looks so far back
+    sides      : (o, l) faces of the problem to solve; once settled, those of the step
+    is_settled : the problem solved last was the right one
+    """
+
+    comm: MPI.Comm
+    environment: Environment
+    q: Positions
+    y: Positions
+    time: float  # of the step's end [s]
+    time_step: float
+    before: Indices | None  # (o, l) faces when it began (environment); None: the nearest
+    fixed: Mask  # (l,) bool, nodes that are no unknowns
+    q_before: Positions | None = None
+
+    def __post_init__(self) -> None:
+        self.solves = 0
+        self.is_settled = False
+        self.sides = self._crossed(self.y)
+
+    def _crossed(self, end: Positions) -> Indices:
+        """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
+        with CONTACT:
+            return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
+
+    def problem(self) -> StepProblem:
+        """The step with the faces as they are known now."""
+        environment, time = self.environment, self.time
+        contact = environment.contact(self.q, self.y, time, self.time_step, self.sides, self.q_before)
+        return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
+
+    def compare(self, x: Positions) -> None:
+        """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
+        crossed, pressing = self._crossed(x), self.environment.pressing
+        sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
+        self.solves += 1
+        environment, differs = self.environment, False
+        if environment.has_sides and environment.penalties:  # which may press otherwise
+            alike = environment.same_push(x, self.time, self.sides, sides)
+            differs = self.comm.allreduce(not alike, MPI.LOR)
+        self.is_settled = not differs
+        if differs:
+            self.sides = sides
+            if self.solves == MOST_SOLVES:
+                raise StepFailed(
+                    f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came "
+                    'in by; try a smaller time.step, or safety.on_failure = "substep"',
+                    "contact",
+                )
+            return
+        if self.environment.penalties:  # what reflects goes by the way to x alone
+            crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
+        self.sides = crossed
 
 
 class ImplicitEuler(Integrator):
@@ -49,18 +111,13 @@ class ImplicitEuler(Integrator):
     SHARE = 1.0  # tau / t
     STATIC = False  # M is no part of F
 
-    def __init__(
-        self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, probes: Probes, prefix: str
-    ):
-        self.comm, self.environment, self.solver, self.probes, self.prefix = comm, environment, solver, probes, prefix
+    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, prefix: str):
+        self.comm, self.environment, self.solver, self.prefix = comm, environment, solver, prefix
         self.time_step = time.step
         self.damping, self.retardation = environment.damping, environment.retardation
         self.tau = self._first_tau()
         self.anchors = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
-        self.problem: StepProblem | None = None  # of the step taken last
-        self.reference: Reference | None = None
-        self.trace: Trace | None = None
 
     def _first_tau(self) -> float:
         return self.SHARE * self.time_step
@@ -79,10 +136,6 @@ class ImplicitEuler(Integrator):
     def _carried(self, duration: float) -> float:
         """Return how far a velocity carries in a time step [s] under damping."""
         return duration / (1 + self.damping * duration)
-
-    @property
-    def unknowns(self) -> int:
-        return self.stepper.unknowns.size
 
     def set_up(self) -> None:
         """Raises InputError for a preconditioner that PETSc or the matrix lacks (collective)."""
@@ -112,11 +165,11 @@ class ImplicitEuler(Integrator):
         faces = ContactFaces(self.comm, self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         while not faces.is_settled:
-            self.problem = replace(faces.problem(), rates=rates)
-            result = self.stepper.step(self.problem)
+            problem = replace(faces.problem(), rates=rates)
+            result = self.stepper.step(problem)
             faces.compare(result.position)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
-        result = replace(result, cost=cost, problem=self.problem, tau=self.damped_tau)
+        result = replace(result, cost=cost, problem=problem, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides
 
     def _with_viscosity(self, result: StepResult) -> StepResult:
@@ -128,26 +181,6 @@ class ImplicitEuler(Integrator):
         viscosity.add_gradient(result.position, forces)
         taken = -viscosity.change(result.position, problem.fixed)
         return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
-
-    def follow(self) -> None:
-        self.trace = Trace()
-        self.trace.follow(self.stepper)
-
-    def true_errors(self, index: int, result: StepResult) -> tuple[Floats, dict | None]:
-        if self.reference is None:
-            lattice = self.stepper.lattice
-            self.reference = Reference(
-                self.comm, lattice, self.damped_tau, touches=self.environment.touches, static=self.STATIC
-            )
-        trace, self.trace, self.stepper.observer = self.trace, None, None
-        assert self.problem is not None, "no step was taken"
-        positions = [*(trace.positions if trace else []), result.position]
-        errors = self.reference.errors(self.problem, positions)
-        if trace is None:
-            return errors[-1], None
-        lists = {"iteration": trace.iteration, "ksp_its": trace.ksp_its, "seconds": trace.seconds}
-        of_positions, of_energies = errors[:-1].T.tolist()
-        return errors[-1], {"frame": index, **lists, "position_error": of_positions, "energy_error": of_energies}
 
     def _new_stepper(self, time: float) -> Stepper:
         """The solver while the same nodes are fixed as at ``time``: these are no unknowns."""
@@ -171,7 +204,7 @@ class ImplicitEuler(Integrator):
             self.anchors = anchors
             self.destroy()
             self.tau = self._first_tau()  # whatever came before: a resumed run has not seen it
-            self.stepper, self.reference = self._new_stepper(time), None
+            self.stepper = self._new_stepper(time)
             self.set_up()
 
     def save(self, checkpoint: Checkpoint) -> None:
@@ -187,17 +220,7 @@ class ImplicitEuler(Integrator):
     def forget(self) -> None:
         self.stepper.forget()
 
-    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
-        names = self.stepper.options.names
-        if self.reference:
-            names = names | self.reference.stepper.options.names
-        if self.probes != Probes() and not at_end:
-            awaited = (*awaited, PREFIX)
-        refuse_unused(self.comm, names, at_end, awaited)
-
     def destroy(self) -> None:
-        if self.reference:
-            self.reference.destroy()
         self.stepper.destroy()
 
 

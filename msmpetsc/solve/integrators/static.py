@@ -9,13 +9,9 @@ M only weighs errors. tau scales F, so that M^(-1) tau^2 (Hessian of E) has no e
 is at rest: as a step's Hessian has none for its M, from which bounds on errors follow.
 
 Where the whole load cannot be brought on at once it comes on in load steps. A share s of it, 0 to 1, is the
-equilibrium under  f_ext + (1 - s) r,  r = grad E(x_0) - f_ext  what keeps the state before, x_0, where it is; obstacles
-press as they will, and anchors have gone a share s of their way. So it does not matter what has changed: a force, an
-anchor that lets go, an obstacle. Without inertia, what nothing holds has no equilibrium, and is refused.
+equilibrium under  f_ext + (1 - s) r,  r = grad E(x_0) - f_ext  what keeps the state before, x_0, where it is.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -28,9 +24,8 @@ from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.solve.integrators.contact_faces import ContactFaces
-from msmpetsc.solve.integrators.implicit import ImplicitEuler
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.implicit import ContactFaces, ImplicitEuler
+from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
@@ -160,6 +155,7 @@ class Static(ImplicitEuler):
     STATIC = True
     state: ClassVar[dict[str, Range]] = {"error": ANY}
     error = made_for = 0.0
+    problem: StepProblem | None = None  # of the last state
 
     def _first_tau(self) -> float:
         """SLENDER times how long sound takes along the longest side of the lattice, roughly [s]."""
@@ -204,14 +200,20 @@ class Static(ImplicitEuler):
 
     def _follow(self, path: LoadPath, time: float) -> StepResult:
         """Bring all of the load on, with as few load steps as may be. Raises StepFailed."""
-        steps = LoadSteps()
-        while steps.reached < 1.0:
-            try:
-                with self._hurried(steps.may_be_refused):
+        steps, snes = LoadSteps(), self.stepper.snes
+        most = snes.getTolerances()[3]
+        hurries = not self.stepper.budget and self.stepper.options.is_default("snes_max_it")  # else the user has said
+        try:
+            while steps.reached < 1.0:
+                if hurries:
+                    snes.setTolerances(max_it=SOON if steps.may_be_refused else most)
+                try:
                     result = path.try_share(steps)
-                steps.take()
-            except StepFailed as failure:
-                steps.halve(failure)
+                    steps.take()
+                except StepFailed as failure:
+                    steps.halve(failure)
+        finally:
+            snes.setTolerances(max_it=most)
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", time, steps.count)
         return result
@@ -223,17 +225,6 @@ class Static(ImplicitEuler):
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         super().restore(checkpoint, time)
         checkpoint.restore_counts(self)
-
-    @contextmanager
-    def _hurried(self, soon: bool) -> Iterator[None]:
-        """Give up ``soon``, after a few iterations, unless the user has said after how many."""
-        snes, most = self.stepper.snes, self.stepper.snes.getTolerances()[3]
-        if soon and not self.stepper.budget and self.stepper.options.is_default("snes_max_it"):
-            snes.setTolerances(max_it=SOON)
-        try:
-            yield
-        finally:
-            snes.setTolerances(max_it=most)
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

@@ -5,10 +5,8 @@ with their local errors, from a credit that grows as the motion does, and with t
 
     credit(t) = error / 2 (U(t) + 1/T integral_0^t U)
 
-A step may spend what it earns itself and a share of what was saved: what was saved in an even
-flight is there for the impact that ends it. Where nothing is left it may still spend a part of what
-each step could, were all as long as those so far: to keep one moment much better than all others
-takes more steps than it is worth. Steps are 2^level times as long as the scene's.
+A step may spend what it earns itself and a share of what was saved, and always a part of what each step could, were
+all as long as those so far. Steps are 2^level times as long as the scene's.
 """
 
 import math

@@ -30,16 +30,13 @@ from msmpetsc.contact.obstacles.friction import Movers
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import StepFailed
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
-from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.linear.unknowns import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
-from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
@@ -64,9 +61,7 @@ class Verlet(Integrator):
         "gained": FINITE,
     }
 
-    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, probes: Probes, _prefix: str):
-        if probes != Probes():
-            raise InputError("the true error and the trace are of a step that is solved: verlet has none")
+    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, _prefix: str):
         self.comm, self.lattice, self.environment = comm, environment.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
@@ -89,14 +84,6 @@ class Verlet(Integrator):
         self.fixed = environment.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
         self.most = TORN * comm.allreduce(crushing_energy(self.lattice))  # [J]
-
-    @property
-    def unknowns(self) -> int:
-        return int((~self.environment.fixed_at(self.time_step)[: self.lattice.owned]).sum())
-
-    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
-        """Raise InputError for PETSc options of the user, which have no use here (collective)."""
-        refuse_unused(self.comm, set(), at_end, awaited)
 
     def save(self, checkpoint: Checkpoint) -> None:
         checkpoint.keep_counts(self)

@@ -10,14 +10,11 @@ from scipy.sparse import coo_array
 
 from msmpetsc.backend.arrays import Array, to_host
 from msmpetsc.errors import InputError
-from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.limits import refuse_nonzeros
+from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 
 
-def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int = 1, prefix: str = "") -> PETSc.Mat:
+def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str = "") -> PETSc.Mat:
     """A = M + t^2 L [kg] as a PETSc matrix; ``-mat_type`` chooses its type (collective).
-
-    columns : 1 for A, m x m; 3 for A (x) I_3, 3m x 3m, as methods have it that do not see that it is three times A
 
     Raises InputError for more nonzeros than PETSc can count, and for a type whose vectors are not where the arrays are.
     """
@@ -30,14 +27,12 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     stiffness += np.bincount(lattice.springs[:, 1], lattice.stiffness, len(row))
     diagonal = to_host(unknowns.inertia)[free] + time_step**2 * stiffness[free]
     kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
-    refuse_nonzeros(comm, columns * (unknowns.size + int(kept.sum())))
+    refuse_nonzeros(comm, unknowns.size + int(kept.sum()))
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
-    nodes = np.concatenate([free, ends[kept, 1]])
+    columns = unknowns.numbers[np.concatenate([free, ends[kept, 1]])]
     values = np.concatenate([diagonal, -np.tile(weight, 2)[kept]])
-    indices = unknowns.numbers[:, None] if columns == 1 else unknowns.indices
-    sizes = (columns * unknowns.size, columns * unknowns.total)
-    rows = (rows + unknowns.size * np.arange(columns)[:, None]).ravel()
-    csr = coo_array((np.tile(values, columns), (rows, indices[nodes].T.ravel())), shape=sizes).tocsr()
+    sizes = unknowns.size, unknowns.total
+    csr = coo_array((values, (rows, columns)), shape=sizes).tocsr()
 
     matrix = PETSc.Mat().create(comm=comm)
     matrix.setOptionsPrefix(prefix)
@@ -45,7 +40,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     matrix.setType(unknowns.memory.mat_type)
     matrix.setOption(PETSc.Mat.Option.SPD, True)
     matrix.setFromOptions()
-    matrix.setName("A" if columns == 1 else "A (x) I_3")
+    matrix.setName("A")
     on_gpu = "cusparse" in unknowns.memory.mat_type
     if ("cusparse" in matrix.getType()) != on_gpu:
         computes = f"the run computes on the {'GPU' if on_gpu else 'CPU'}"
@@ -57,7 +52,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
 def assembly_bytes(nodes: float | Array, springs: float | Array, nonzeros: float | Array) -> float | Array:
     """Return the bytes that ``assemble`` has at once beside its arguments; numbers, or arrays of a number a rank.
 
-    They are those of A with one column: row of each node; weight, ends and kept of each spring; of each nonzero rows,
-    nodes, values, the last two again, COO's two indices, then CSR's index and value.
+    They are row of each node; weight, ends and kept of each spring; of each nonzero row, column and value,
+    COO's two indices, then CSR's index and value.
     """
-    return 8 * nodes + (8 + 4 * 4 + 2) * springs + (5 * 8 + 2 * 4 + 4 + 8) * nonzeros
+    return 8 * nodes + (8 + 4 * 4 + 2) * springs + (3 * 8 + 2 * 4 + 4 + 8) * nonzeros

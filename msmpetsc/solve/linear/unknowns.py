@@ -12,13 +12,15 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Array, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
+from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.events import GHOSTS
-from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
+LARGEST = int(np.iinfo(PETSc.IntType).max)  # of PETSc's integers: 32 bits, unless it was configured otherwise
+ADVICE = "a PETSc configured with --with-64-bit-indices can"
 BALLAST = 1e-6  # of the mass
-BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node, for a forecast of memory
+BYTES_OF_NODE = 8  # of ``numbers``, for a forecast of memory
 
 
 class Unknowns:
@@ -26,7 +28,6 @@ class Unknowns:
 
     free    : (m,) local numbers of the free owned nodes, where the lattice's arrays are
     numbers : (l,) global number of each local node among the free ones, -1 where pinned
-    indices : (l, 3) of its x, y and z in a vector of unknowns, of no meaning where pinned
     total   : number of free nodes on all ranks
     inertia : (owned,) [kg] by which a node resists being moved: its mass; nothing where an equilibrium is looked for
     ballast : (owned,) [kg] the same in multigrid, never nothing: a cell squashed flat has a singular block of its own
@@ -49,11 +50,10 @@ class Unknowns:
         own[to_host(self.free)] = first + np.arange(self.size)
         self.numbers = with_ghosts(comm, lattice, own)
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
-        self.indices = with_ghosts(comm, lattice, index)
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
-        sources = self.indices[free_ghosts].ravel()  # in a vector of unknowns
+        sources = with_ghosts(comm, lattice, index)[free_ghosts].ravel()  # in a vector of unknowns
         self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
         vector = self.create_vector()
         index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)
@@ -134,6 +134,21 @@ def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     return np.concatenate([rows, to_owner.answer(rows[asked])])
+
+
+def refuse_unknowns(nodes: int) -> None:
+    """Raise InputError for more ``nodes`` than PETSc can number three coordinates of."""
+    if 3 * nodes > LARGEST:
+        most = f"the {LARGEST} unknowns that PETSc can number here"
+        raise InputError(f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}")
+
+
+def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
+    """Raise InputError where a rank has more nonzeros, ``own`` of this one, than PETSc can count."""
+    most = comm.allreduce(own, MPI.MAX)
+    if most > LARGEST:
+        many = f"{most} nonzeros of the system matrix on one rank are more than the {LARGEST} that PETSc can count here"
+        raise InputError(f"cages: {many}; more ranks have fewer each, or {ADVICE}")
 
 
 @kernel

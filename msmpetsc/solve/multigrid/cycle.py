@@ -31,7 +31,7 @@ from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_siz
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import memory
 from msmpetsc.solve.petsc.events import FINE, count_flops
-from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev, square_restricts_transposed
+from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
@@ -183,11 +183,11 @@ class Multigrid:
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
 
     def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
-        """P^T, or what PETSc takes for it: by its shape alone it cannot tell a square P."""
-        rows, columns = interpolation.getSizes()
-        if rows[1] == columns[1] and square_restricts_transposed():
-            return interpolation
-        restriction = PETSc.Mat().createTranspose(interpolation)
+        """P^T by itself: of a square P PETSc cannot tell by its shape whether it is to be transposed."""
+        fine, coarse = interpolation.getSizes()
+        restriction = PETSc.Mat().createPython((coarse, fine), Restriction(interpolation), comm=interpolation.comm)
+        restriction.setVecType(self.unknowns.memory.vec_type)
+        restriction.setUp()
         self.owned.callback(restriction.destroy)
         return restriction
 
@@ -226,6 +226,18 @@ def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlock
     for owned in (ksp, x, b):
         owned.destroy()
     return greatest
+
+
+class Restriction:
+    """P^T whichever way it is applied (a context of MATPYTHON)."""
+
+    def __init__(self, interpolation: PETSc.Mat):
+        self.interpolation = interpolation
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.interpolation.multTranspose(x, y)
+
+    multTranspose = mult
 
 
 class ProjectedHessian(Viewable):

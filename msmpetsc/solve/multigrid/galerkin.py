@@ -21,10 +21,9 @@ from msmpetsc.elasticity.neo_hookean import add_coarse
 from msmpetsc.elasticity.springs import SYMMETRIC, spring_block
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
-from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
-from msmpetsc.solve.petsc.limits import refuse_nonzeros
 
 HELD = 27  # code of an end that is no unknown; others are 9 i + 3 j + k of where they are in their coarse cell
 RAISED = 1 + 1e-5  # diagonals: few fine nodes in a coarse cell leave its columns linearly dependent

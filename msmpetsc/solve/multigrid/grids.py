@@ -15,8 +15,7 @@ from msmpetsc.backend.arrays import Indices, Mask, to_host
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
-from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.limits import refuse_unknowns
+from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 
 SHRINK = 0.7  # a grid with more nodes than this share of the finer one's is no help
 
@@ -51,26 +50,17 @@ def parents_of(ijk: Indices) -> tuple[Indices, Mask]:
     return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)), needed
 
 
-def coarse_grid(comm: MPI.Comm, ijk: Indices) -> CoarseGrid:
-    """Return the nodes that the unknown ones at grid indices (n, 3) are interpolated from (collective).
-
-    Raises InputError for more of them than PETSc can number.
-    """
-    keys, needed = parents_of(ijk)
-    grid = CoarseGrid(SortedKeys(comm, keys[needed]))
-    refuse_unknowns(grid.table.total)
-    return grid
-
-
 def grids(comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | None = None) -> list[CoarseGrid]:
     """Return the grids above nodes at grid indices (n, 3), of ``total`` on all ranks, the finest first (collective).
 
     There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a
-    coarser one would not be much smaller.
+    coarser one would not be much smaller. Raises InputError for more nodes than PETSc can number.
     """
     levels: list[CoarseGrid] = []
     while not levels or (total > coarsest if count is None else len(levels) < count):
-        grid = coarse_grid(comm, ijk)
+        keys, needed = parents_of(ijk)
+        grid = CoarseGrid(SortedKeys(comm, keys[needed]))
+        refuse_unknowns(grid.table.total)
         if levels and grid.table.total > SHRINK * total:
             break
         levels.append(grid)

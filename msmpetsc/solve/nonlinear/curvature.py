@@ -102,7 +102,7 @@ class LowestCurvature:
         self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
         self.value = 0.0  # its curvature when it was found
         self.knows_mode = False  # in the last checkpoint
-        self.vectors: list[PETSc.Vec] | None = None
+        self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         self.rigid: Rows | None = None  # motions (6, n) that are left out
 
     @property
@@ -270,8 +270,6 @@ class LowestCurvature:
         return directions - like(directions, parts) @ self.rigid
 
     def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: Rows) -> Rows:
-        if self.vectors is None:
-            self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         source, product = self.vectors
         results = np.empty_like(directions)
         for direction, result in zip(directions, results, strict=True):
@@ -307,5 +305,5 @@ class LowestCurvature:
         self.searched, self.mode = NONE, None
 
     def destroy(self) -> None:
-        for vector in self.vectors or ():
+        for vector in self.vectors:
             vector.destroy()

@@ -4,9 +4,8 @@ The error of x is |x - x*|_M / |x - y|_M, estimated (solve.nonlinear.estimate). 
 y|_M bounds it wherever E is convex between x and x*. Where the bound will do already, or no
 estimate can be had, the bound is the error.
 
-That bound is far too large while what is left of F is rough, and does not tell when an estimate is worth its cost. With
-multigrid the norm that CG works in does: |F|_(P^-1), P the preconditioner, is what a linear solve leaves, known without
-any work. It is believed where F at the next iterate is about that, so that g is a parabola there (LINEAR).
+With multigrid |F|_(P^-1), P the preconditioner, tells when an estimate is worth its cost: a linear solve leaves it. It
+is believed where F at the next iterate is about that, so that g is a parabola there (LINEAR).
 """
 
 from dataclasses import dataclass, replace
@@ -18,8 +17,7 @@ from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
-from msmpetsc.solve.nonlinear.rounding import Rounding
+from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left to tell by
@@ -93,7 +91,9 @@ class ErrorControl:
             return replace(now, error=0.0 if at_rounding else np.inf)
         now = replace(now, bound=residual / distance)
         is_near = at_rounding or now.bound <= self._farthest(now)
-        seems_near = self._seems_near(now) if self._is_smooth(now) else is_near
+        seems_near = is_near
+        if self._is_smooth(now):  # whether the linear solve that led here has left so little
+            seems_near = now.left <= EARLY * now.goal * now.distance * np.sqrt(self.estimate.least)
         if not seems_near and not at_rounding:
             return replace(now, error=now.bound)
         if now.bound <= now.goal:
@@ -122,10 +122,6 @@ class ErrorControl:
     def _farthest(self, now: Outcome) -> float:
         """The bound up to which an estimate says something, by what those before have said."""
         return max(self.ratio, LEAST_RATIO) * now.early * now.goal
-
-    def _seems_near(self, now: Outcome) -> bool:
-        """Whether the linear solve that led here has left so little that an estimate is worth its cost."""
-        return now.left <= EARLY * now.goal * now.distance * np.sqrt(self.estimate.least)
 
     def _is_smooth(self, now: Outcome) -> bool:
         """Whether |F|_(P^-1) may bound errors: P is near H, and nothing has shown a negative curvature."""

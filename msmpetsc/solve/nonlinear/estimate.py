@@ -7,10 +7,8 @@ preconditioner and lambda the least eigenvalue of P^(-1) H, of which CG's own Ri
 the second is a part of the first and |e_k|_M hardly grows, or when that is over the error that would do. It does not
 end before k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes that are so much stiffer hide the others for that long.
 
-What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends,
-too, once |e_k|_M and that are together an error that will do; their sum is then the estimate. With multigrid, where
-lambda is known from the step's own solves, so it is with |r_k|_(P^-1) / sqrt(lambda), which makes much less of what is
-rough: mostly |F|_(P^-1) itself will do, before any iteration.
+What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends, too, once |e_k|_M
+and that, or |r_k|_(P^-1) / sqrt(lambda), are together an error that will do; their sum is then the estimate.
 """
 
 import numpy as np
@@ -104,7 +102,7 @@ class ErrorEstimate:
 
     def linearise(self, q: Positions) -> None:
         """Take the Hessian at positions q (l, 3) [m]."""
-        self.preconditioner.prepare(q, self.functional.problem.contact)
+        self.preconditioner.in_use.prepare(q, self.functional.problem.contact)
         self.hessian.linearise(q, self.functional.problem.contact)
         self.operator.assemble()
 

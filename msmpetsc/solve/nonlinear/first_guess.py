@@ -23,10 +23,9 @@ class FirstGuess:
     def best(self) -> Positions:
         """The start (l, 3) [m] of the step that the functional has begun (collective).
 
-        Besides y, as published: the free flight y + t^2 M^(-1) f_ext, exact where no spring is stretched;
-        y and the elastic corrections of the last steps extrapolated, near in smooth motion; and q_n, which after an
-        impact is not folded over as y may be, moved by what the free flight moves on average where nothing is held,
-        so that a step that stops early keeps the momentum.
+        Besides y, as published: the free flight y + t^2 M^(-1) f_ext; y and the elastic corrections of the last steps
+        extrapolated; and q_n, moved by what the free flight moves on average where nothing is held, so that a step that
+        stops early keeps the momentum.
         """
         problem, lattice = self.functional.problem, self.functional.lattice
         q, y = problem.q, problem.y

@@ -12,7 +12,6 @@ from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
-from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
 from msmpetsc.solve.linear.system import assemble
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
@@ -20,6 +19,7 @@ from msmpetsc.solve.nonlinear.preconditioning import (
     MULTIGRID,
     LatticePreconditioner,
     Preconditioned,
+    Preconditioner,
     StepPreconditioner,
 )
 from msmpetsc.solve.presets import Preset, SolverOptions
@@ -69,24 +69,16 @@ class Jacobian:
     @cached_property
     def matrix(self) -> PETSc.Mat:
         """A, assembled where something is to be done with it."""
-        matrix = self._assembled(1)
-        self.options.hide("mat_view")  # which is of A: PETSc would show all matrices, and write each into the same file
-        return matrix
-
-    def _assembled(self, columns: int) -> PETSc.Mat:
-        matrix = assemble(self.comm, self.unknowns, self.functional.time_step, columns, self.options.prefix)
+        matrix = assemble(self.comm, self.unknowns, self.functional.time_step, self.options.prefix)
         self.owned.callback(matrix.destroy)
         return matrix
 
     def _of_matrix(self) -> Preconditioner:
         matrix = self.matrix
-        if self.preset.kronecker:
-            matrix = self._assembled(3)
-        elif self.touches:  # contact changes what A is preconditioned with, but not A
+        if self.touches:  # contact changes what A is preconditioned with, but not A
             matrix = matrix.copy()
             self.owned.callback(matrix.destroy)
-        diagonal = ContactDiagonal(matrix, self.unknowns, self.functional.time_step) if self.touches else None
-        return Preconditioner(matrix, self.unknowns.memory, self.options.prefix, diagonal)
+        return Preconditioner(matrix, self.unknowns, self.options.prefix, self.functional.time_step, self.touches)
 
     def _contact_blocks(self) -> ContactBlocks | None:
         return ContactBlocks(self.unknowns, self.functional.time_step) if self.touches else None
@@ -112,7 +104,7 @@ class Jacobian:
             self.hessian.linearise(q, contact, projected, secants)
         elif self.blocks:
             self.blocks.linearise(contact, q, False)
-        changed = self.preconditioner.prepare(q, contact)
+        changed = self.preconditioner.in_use.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()
         if changed:
@@ -122,11 +114,8 @@ class Jacobian:
 class FrictionKinks:
     """Which nodes' friction Newton's method takes by its secant, not by its true curvature, in the step in progress.
 
-    Beyond a small slip the Hessian of friction has nothing along the slip. So Newton's full step takes a node that is
-    about to stick past the kink and round, the next one back, and the line search cuts each of them: of a lung that a
-    plate pressed, all of 79 nodes turned in most of 28 iterations. The parabola of the secant
-    (contact.obstacles.friction) never goes too far, but comes in slowly where nodes slip on. So a step begins with
-    secants; then only those nodes have them that the last full step took over a kink.
+    A step begins with secants, whose parabola never goes too far (contact.obstacles.friction) but comes in slowly where
+    nodes slip on; then only those nodes have them that the last full step took over a kink.
 
     contact : of the step; None where there is none
     secants : of the next Hessian; None where there is no contact

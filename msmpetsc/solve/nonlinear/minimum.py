@@ -16,8 +16,7 @@ from msmpetsc.backend.arrays import Floats, greatest
 from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import KNOWN
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
-from msmpetsc.solve.nonlinear.rounding import Rounding
+from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there

@@ -14,18 +14,20 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.backend.arrays import Positions, Rows, like
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.solve.linear.preconditioner import Preconditioner
+from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.multigrid.free_bodies import Translations
 from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
+from msmpetsc.solve.petsc.memory import HOST
 
 MULTIGRID = PETSc.PC.Type.MG
+DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
 USUAL = 0.1  # ksp_rtol
 LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
@@ -36,9 +38,64 @@ POINTS = 200  # in contact, that join nodes in the cycle: the stiffest
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
 
 
+class Preconditioner:
+    """Any PETSc preconditioner of A, applied to the three columns, with a bound on contact's blocks on A's diagonal.
+
+    It is this inner one that the options -pc_... set, for every preset: A is also what the true
+    Hessian is preconditioned with. A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a
+    step downhill too.
+
+    matrix  : A, m x m, of its own where there may be contact: all three columns go in one call, as MUMPS can
+    touches : whether there may be
+    own     : (m,) diagonal of A, of this rank [kg]
+    added   : (m,) what is added to it, over t^2 [N/m]
+    """
+
+    def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, prefix: str, time_step: float, touches: bool):
+        self.matrix, self.unknowns, self.t2, self.touches = matrix, unknowns, time_step**2, touches
+        self.blocks: list[Block] = []
+        self.pc = PETSc.PC().create(matrix.comm)
+        self.pc.setOptionsPrefix(prefix)
+        self.pc.setOperators(matrix)
+        self.vector = matrix.createVecLeft()
+        matrix.getDiagonal(self.vector)
+        self.own = unknowns.memory.read(self.vector).copy()
+        self.added = np.zeros_like(self.own)
+
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
+        """Add the bound of contact at positions q (l, 3) [m]; whether that changed the matrix (collective)."""
+        if not self.touches:
+            return False
+        lattice = self.unknowns.lattice
+        bound = (contact.bound(q) if contact else np.zeros(lattice.owned, like=q))[self.unknowns.free]
+        changed = lattice.table.comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
+        if changed:
+            self.added = bound
+            self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
+            self.matrix.setDiagonal(self.vector)
+        return changed
+
+    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        memory = self.unknowns.memory
+        if not self.blocks:  # where the inner preconditioner works: a direct solver does on the CPU
+            where = HOST if self.pc.getType() in DIRECT else memory
+            self.blocks = [Block(self.matrix, where), Block(self.matrix, where)]
+        right, solution = self.blocks
+        values = right.values
+        values[:] = like(values, memory.read(x))
+        self.pc.matApply(right.mat, solution.mat)
+        columns = memory.write(y)
+        columns[:] = like(columns, solution.values)
+
+    def destroy(self) -> None:
+        for part in (*self.blocks, self.pc, self.vector):
+            part.destroy()
+
+
 class LatticePreconditioner:
     """The cycle, and how its hierarchy serves. All methods are collective.
 
+    matrix, pc   : the projected Hessian, and PETSc's PCMG of it
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
     is_first : there is none yet
     pace     : iterations a digit of the first solve with it; None before that
@@ -52,6 +109,7 @@ class LatticePreconditioner:
         self.unknowns = unknowns
         with GRIDS:
             self.multigrid = Multigrid(unknowns, elasticity, time_step, prefix)
+        self.matrix, self.pc = self.multigrid.operator, self.multigrid.pc
         bodies = self.multigrid.bodies
         self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
         self.is_first = True
@@ -60,16 +118,6 @@ class LatticePreconditioner:
         self.is_stale, self.is_free = True, False
         self.joins = False
         self.joined: SurfaceHessian | None = None
-
-    @property
-    def matrix(self) -> PETSc.Mat:
-        """The projected Hessian."""
-        return self.multigrid.operator
-
-    @property
-    def pc(self) -> PETSc.PC:
-        """PETSc's, which has read its options when its levels are there."""
-        return self.multigrid.pc
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
@@ -133,9 +181,9 @@ class LatticePreconditioner:
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         with CYCLE:
             if self.translations and self.is_free:
-                self.translations.around(self.multigrid.pc, x, y)
+                self.translations.around(self.pc, x, y)
             else:
-                self.multigrid.pc.apply(x, y)
+                self.pc.apply(x, y)
 
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""
@@ -229,10 +277,6 @@ class StepPreconditioner:
         if self.multigrid is None:  # else it was chosen before, and forgotten
             log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
             self.multigrid = self.make_multigrid()
-
-    def prepare(self, q: Positions, contact: Contact | None) -> bool:
-        """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
-        return self.in_use.prepare(q, contact)
 
     @property
     def to_balance(self) -> LatticePreconditioner | None:

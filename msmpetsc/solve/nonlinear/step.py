@@ -29,11 +29,10 @@ from msmpetsc.solve.nonlinear.error_control import (
 )  # fmt: skip
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
-from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
+from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
-from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
@@ -168,7 +167,7 @@ class Stepper:
         """
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
             self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
-            self.jacobian.preconditioner.prepare(self.lattice.nodes, None)
+            self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
             self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
             self.ksp.setUp()
 

@@ -44,8 +44,8 @@ def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
         if lacking:
             raise InputError(f"--device cuda (-{OPTION} {wanted}): {lacking}")
     cuda.use_device(PETSc.COMM_WORLD.rank)
-    if AWARE not in PETSc.Options().getAll() and not _mpi_knows_gpus():
-        # PETSc has read its options: this is where it keeps the answer. With another it stops at the first device use.
+    if AWARE not in PETSc.Options().getAll():
+        # Not all MPI know GPUs, and without one PETSc stops at the first device use. It has read its options by now.
         ctypes.c_bool.in_dll(petsc_library(), AWARE).value = False
     return cuda.send
 
@@ -55,13 +55,3 @@ def what_is_missing() -> str | None:
     if not PETSc.Sys.hasExternalPackage("cuda"):
         return "this PETSc was built without CUDA; scripts/build_petsc_cuda makes one that was not"
     return cuda.missing()
-
-
-def _mpi_knows_gpus() -> bool:
-    """Whether MPI takes pointers to a GPU's memory, as Open MPI or MPICH tell; not of others."""
-    library, answer = petsc_library(), ctypes.c_int(0)
-    if hasattr(library, "MPIX_Query_cuda_support"):
-        return bool(library.MPIX_Query_cuda_support())
-    if hasattr(library, "MPIX_GPU_query_support"):
-        library.MPIX_GPU_query_support(0, ctypes.byref(answer))  # 0: CUDA
-    return bool(answer.value)

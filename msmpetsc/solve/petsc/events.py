@@ -43,8 +43,3 @@ def begun(stage: PETSc.Log.Stage) -> ExitStack:
 def seconds(event: str) -> float:
     """Seconds that this rank spent in an event, in all stages of the run."""
     return float(sum(PETSc.Log.Event(event).getPerfInfo(stage)["time"] for stage in OF_THE_RUN))
-
-
-def count(event: str) -> int:
-    """How often this rank began an event, in all stages of the run."""
-    return sum(PETSc.Log.Event(event).getPerfInfo(stage)["count"] for stage in OF_THE_RUN)

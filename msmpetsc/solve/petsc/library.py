@@ -79,23 +79,6 @@ def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:
     _check(petsc_library().KSPChebyshevSetEigenvalues(ctypes.c_void_p(ksp.handle), *bounds))
 
 
-@cache
-def square_restricts_transposed() -> bool:
-    """Whether MatRestrict applies a square matrix transposed, as that of PETSc 3.22 does, or as it is, as in 3.18."""
-    matrix = PETSc.Mat().createAIJ((2, 2), comm=PETSc.COMM_SELF)
-    matrix.setUp()
-    matrix[0, 1] = 1.0
-    matrix.assemble()
-    x, y = matrix.createVecs()
-    x[0] = 1.0
-    x.assemble()
-    _check(petsc_library().MatRestrict(*(ctypes.c_void_p(each.handle) for each in (matrix, x, y))))
-    is_transposed = bool(y[1])
-    for owned in (matrix, x, y):
-        owned.destroy()
-    return is_transposed
-
-
 def _address(array: Array) -> ctypes.c_void_p:
     on_gpu = getattr(array, "__cuda_array_interface__", None)
     return ctypes.c_void_p(on_gpu["data"][0] if on_gpu else array.ctypes.data)
@@ -107,24 +90,21 @@ def _check(error: int) -> None:
 
 
 @contextmanager
-def petsc_errors(
-    what: str, abandon: Callable[[], None] = lambda: None, further: type[Exception] = ImportError
-) -> Iterator[None]:
+def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
     ImportError is that of an object of type python whose context is not there. A solver that did
     not converge, where an option made that an error, becomes StepFailed.
 
     abandon : called after such an error
-    further : more exceptions that come of options here
     """
     try:
         yield
-    except (PETSc.Error, ImportError, further) as error:
+    except (PETSc.Error, ImportError) as error:
         # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, for ever.
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
         cause = error.__cause__
-        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError, further)):
+        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError)):
             raise cause  # noqa: B904 (the error itself, not another)
         abandon()
         if getattr(error, "ierr", 0) == NOT_CONVERGED:

@@ -337,7 +337,7 @@ class Cells:
         (law, at), (*given, rows) = few, arguments
         if self.around is None:
             loop(len(at), q, *law, at, *given, rows)
-        elif len(at):
+        else:
             corners = np.zeros((8 * len(self.law.cells) + 1, rows.shape[1]), like=rows)
             loop(len(at), q, *law, at, *given, corners)
             rows[: self.around.shape[1]] += corners[self.around].sum(axis=0)

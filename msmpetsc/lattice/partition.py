@@ -1,7 +1,7 @@
 """What each of R ranks would hold of a lattice that is built on one: counted without MPI.
 
-The ranks cut cells and nodes, both in Morton order, as comm.SortedKeys does: at splitters of a sample. The sample
-depends on what each rank brings to it, slabs of cells and then the corners of its cells, so that is repeated too.
+Ranks own equal parts of cells and of nodes along the Morton curve; those that R ranks make themselves, by a sample
+(comm.SortedKeys), are as large within a tenth.
 """
 
 from collections.abc import Sequence
@@ -9,10 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Indices
-from msmpetsc.comm import sample_of, splitters_of
-from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
-from msmpetsc.geometry.interior import Slab
+from msmpetsc.backend.arrays import Array
+from msmpetsc.geometry.cages import BodySurface, choose_cell_size, fill
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.scene.body import CagesTable
 
@@ -102,7 +100,7 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, 
     else:
         size = choose_cell_size(bodies, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
     cages = fill(bodies, size, wanted.method, MOST, wanted.boundary)
-    partition = count_partition(bodies, cages, build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
+    partition = count_partition(build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
     counted = int(partition.cells.sum())
     if guess > most:
         cells = wanted.count
@@ -119,10 +117,9 @@ def _cells(volume: float, area: float, h: float) -> float:
     return volume / h**3 + area / h**2
 
 
-def count_partition(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice, ranks: int) -> Partition:
-    """Return the partition among ``ranks`` ranks; cages and lattice are whole, built on one rank."""
-    cell_rank = _ranks_of_cells(bodies, cages, ranks)
-    rank = _ranks_of_nodes(lattice, cell_rank, ranks)
+def count_partition(lattice: Lattice, ranks: int) -> Partition:
+    """Return the partition among ``ranks`` ranks of a lattice that is whole, built on one rank."""
+    cell_rank, rank = (np.arange(n) * ranks // n for n in (len(lattice.cells), lattice.owned))
     of_end = rank[lattice.springs]
     across = of_end[:, 0] != of_end[:, 1]
     to, node = of_end[across].ravel(), lattice.springs[across][:, ::-1].ravel()
@@ -137,32 +134,3 @@ def count_partition(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattic
         "neighbours": np.unique(holder * ranks + owner) // ranks,
     }
     return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
-
-
-def _ranks_of_cells(bodies: Sequence[BodySurface], cages: Cages, ranks: int) -> Indices:
-    """Return the rank (c,) of each cell; each rank first finds those of its slab along each body's longest side."""
-    grids, ijk, slab = cages.grids, cages.ijk, np.empty(len(cages.kind), np.int64)
-    of_cell = grids.body_of(ijk)
-    for number, (body, grid) in enumerate(zip(bodies, grids.grids, strict=True)):
-        axis, own = int(np.argmax(np.ptp(body.bounds, axis=0))), of_cell == number
-        slab[own] = Slab.owner((ijk[own] - grids.first(number))[:, axis], ranks, int(grid.shape[axis]))
-    keys = cages.table.keys
-    return _cut(keys, [keys[part] for part in _parts(slab, ranks)], ranks)
-
-
-def _ranks_of_nodes(lattice: Lattice, cell_rank: Indices, ranks: int) -> Indices:
-    """Return the rank (n,) of each node; each rank first finds the corners of its cells."""
-    keys = lattice.table.keys
-    return _cut(keys, [keys[np.unique(lattice.cells[part])] for part in _parts(cell_rank, ranks)], ranks)
-
-
-def _parts(rank: Indices, ranks: int) -> list[Indices]:
-    """Return what each rank has, in ascending order."""
-    return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank, minlength=ranks))[:-1])
-
-
-def _cut(keys: Indices, brought: list[Indices], ranks: int) -> Indices:
-    """Return the rank of each of the ascending keys, when the ranks have ``brought`` these to the sort."""
-    total = sum(map(len, brought))
-    sample = np.concatenate([sample_of(part, total, ranks) for part in brought])
-    return np.searchsorted(splitters_of(sample, ranks), keys, side="right")

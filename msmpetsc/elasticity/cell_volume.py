@@ -85,8 +85,6 @@ def corner_change(q: Positions, base: Positions, cell: Indices, frame: int, resi
     e, before = edges(q, cell, frame), edges(base, cell, frame)
     lack = lack_of(_volume(e[0], e[1], e[2]), least)
     lack_before = lack_of(_volume(before[0], before[1], before[2]), least)
-    if lack <= 0.0 and lack_before <= 0.0:
-        return 0.0
     if lack <= 0.0 or lack_before <= 0.0:
         return resistance * (max(lack, 0.0) ** 3 - max(lack_before, 0.0) ** 3)
     corner = cell[FRAMES[frame, 0]]
@@ -155,15 +153,13 @@ def least_volume(q: Positions, c: Indices) -> float:
 
 
 @kernel
-def _least_volume_of(first: int, count: int, step: int, q: Positions, cells: Indices, least: Floats) -> None:
+def _least_volume_of(first, count, step, q, cells, least):
     for i in range(first, count, step):
         least[i] = least_volume(q, cells[i])
 
 
 @kernel
-def _energy_of(
-    first: int, count: int, step: int, q: Rows, cells: Indices, resistance: Floats, least: float, parts: Floats
-) -> None:
+def _energy_of(first, count, step, q, cells, resistance, least, parts):
     for i in range(first, count, step):
         energy = 0.0
         for frame in range(8):
@@ -174,9 +170,7 @@ def _energy_of(
 
 
 @kernel
-def _change_of(
-    first: int, count: int, step: int, q: Rows, base: Rows, cells: Indices, stiffness: Floats, least: float, parts: Rows
-) -> None:
+def _change_of(first, count, step, q, base, cells, stiffness, least, parts):
     for i in range(first, count, step):
         change = 0.0
         if min(least_volume(q, cells[i]), least_volume(base, cells[i])) < least:  # of few; it reads each edge once
@@ -244,10 +238,7 @@ def vector_of(role: int, vectors: Frame) -> Vector:
 
 
 @kernel
-def _add_gradient(
-    first: int, count: int, step: int, q: Rows, cells: Indices, stiffness: Floats, volume: float, at: Indices,
-    gradient: Rows,
-) -> None:  # fmt: skip
+def _add_gradient(first, count, step, q, cells, stiffness, volume, at, gradient):
     for i in range(first, count, step):
         for frame in range(8):
             e = edges(q, cells[i], frame)
@@ -258,10 +249,7 @@ def _add_gradient(
 
 
 @kernel
-def _add_product(
-    first: int, count: int, step: int, q: Rows, cells: Indices, stiffness: Floats, volume: float, at: Indices,
-    projected: bool, v: Rows, product: Rows,
-) -> None:  # fmt: skip
+def _add_product(first, count, step, q, cells, stiffness, volume, at, projected, v, product):
     for i in range(first, count, step):
         for frame in range(8):
             e = edges(q, cells[i], frame)
@@ -272,10 +260,7 @@ def _add_product(
 
 
 @kernel
-def _add_bound(
-    first: int, count: int, step: int, q: Rows, cells: Indices, stiffness: Floats, volume: float, at: Indices,
-    blocks: Rows,
-) -> None:  # fmt: skip
+def _add_bound(first, count, step, q, cells, stiffness, volume, at, blocks):
     for i in range(first, count, step):
         for frame in range(8):
             e = edges(q, cells[i], frame)

@@ -36,7 +36,9 @@ def initial_state(
             owned = int((own < lattice.owned).sum())
             q[own] = moved(start, lattice.nodes[own], lattice.global_numbers[own], bounds[number])
             q[own[held[own]]] = lattice.nodes[own[held[own]]]
-            middle = centre_of_mass(comm, q[own], lattice.mass[own[:owned]])
+            mass = lattice.mass[own[:owned]]
+            total: Floats = comm.allreduce(np.append(mass @ q[own[:owned]], mass.sum()))
+            middle = total[:3] / total[3]  # the centre of mass
             velocity[own] = np.array(start.velocity) + np.cross(start.spin, q[own] - middle)
     velocity[held] = 0
     return q, velocity
@@ -79,13 +81,3 @@ def uniform(numbers: Indices) -> Rows:
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return ((z ^ (z >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
-
-
-def centre_of_mass(comm: MPI.Comm, q: Positions, mass: Floats) -> Floats:
-    """Return the centre of mass (3,) [m] of all ranks' nodes (collective).
-
-    q, mass : (l, 3) [m]; (owned,) [kg]
-    """
-    total: Floats = comm.allreduce(np.append(mass @ q[: len(mass)], mass.sum()))
-    centre: Floats = total[:3] / total[3]
-    return centre

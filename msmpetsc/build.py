@@ -156,8 +156,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
-    has_regions = any(any(scene.tables(kind)) for kind in NODES)
-    points = shape.nearest(lattice) if has_regions else lattice.nodes
+    points = shape.nearest(lattice) if any(any(scene.tables(kind)) for kind in NODES) else lattice.nodes
     masks = regions(scene, lattice, finder, points)
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
@@ -167,13 +166,14 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
+    loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     return Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
         lattice=clamped(scene, lattice, masks, finder, points),
         embedding=shape.embedding if scene.output.surface else None,
-        loads=_loads(comm, scene.gravity, scene.tables("force"), lattice, masks),
-        own_forces=_own_forces(scene.tables("force"), lattice, masks),
+        loads=loads,
+        own_forces=own_forces,
         anchors=anchors,
         exchanges=exchanges,
         penalties=penalties,
@@ -306,8 +306,10 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, a
 
 def _loads(
     comm: MPI.Comm, gravity: Gravity | None, forces: Iterable[OfBody], lattice: Lattice, masks: Regions
-) -> list[Load]:
-    loads = []
+) -> tuple[list[Load], tuple[OwnForce, ...]]:
+    """Return the forces, and those that are functions. Raises InputError for a function's name that is neither
+    registered nor installed."""
+    loads, own_forces = [], []
     if gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(gravity.acceleration), 0.0, None))
     for table in forces:
@@ -318,19 +320,10 @@ def _loads(
             loads.append(Load(share, force.start, force.stop, total_of(force.total)))
         elif force.total is not None:
             loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
-    return loads
-
-
-def _own_forces(tables: Iterable[OfBody], lattice: Lattice, masks: Regions) -> tuple[OwnForce, ...]:
-    """Return the forces that are functions. Raises InputError for a name that is neither registered nor installed."""
-    forces = []
-    for table in tables:
-        force = table.table
-        if force.function is not None:
-            rows = np.flatnonzero(masks[table.key][: lattice.owned])
-            function = FORCES.find(force.function)
-            forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))
-    return tuple(forces)
+        else:
+            rows, function = np.flatnonzero(where), FORCES.find(force.function)
+            own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))
+    return loads, tuple(own_forces)
 
 
 def _contacts(

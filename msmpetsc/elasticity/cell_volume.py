@@ -41,11 +41,6 @@ def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(cache=True, inline="always")
-def _sum(a: Vector, b: Vector, c: Vector) -> Vector:
-    return a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2]
-
-
 @numba.njit(cache=True)
 def edges(q: Positions, cell: Indices, frame: int) -> Frame:
     """Return the edges [m] from a corner of a cell to the far ends of its three edges."""
@@ -76,34 +71,19 @@ def lack_of(volume: float, least: float) -> float:
 
 
 @numba.njit(cache=True)
-def corner_change(q: Positions, base: Positions, cell: Indices, frame: int, resistance: float, least: float) -> float:
-    """Return the energy of a corner at q less that at base [J].
+def corner_change(e: Frame, before: Frame, d: Frame, resistance: float, least: float) -> float:
+    """Return the energy of a corner of the edges e less that of its edges ``before``, which changed by d [J].
 
     It comes from how the nodes moved, so that a small change keeps its digits: with d_k = e_k -
     e'_k, J - J' = d_1 . e_2 x e_3 + d_2 . e_3 x e'_1 + d_3 . e'_1 x e'_2.
     """
-    e, before = edges(q, cell, frame), edges(base, cell, frame)
     lack = lack_of(_volume(e[0], e[1], e[2]), least)
     lack_before = lack_of(_volume(before[0], before[1], before[2]), least)
     if lack <= 0.0 or lack_before <= 0.0:
         return resistance * (max(lack, 0.0) ** 3 - max(lack_before, 0.0) ** 3)
-    corner = cell[FRAMES[frame, 0]]
-    d_1 = _farther(q, base, corner, cell[FRAMES[frame, 1]])
-    d_2 = _farther(q, base, corner, cell[FRAMES[frame, 2]])
-    d_3 = _farther(q, base, corner, cell[FRAMES[frame, 3]])
-    larger = _dot(d_1, _cross(e[1], e[2])) + _dot(d_2, _cross(e[2], before[0]))
-    larger += _dot(d_3, _cross(before[0], before[1]))
+    larger = _dot(d[0], _cross(e[1], e[2])) + _dot(d[1], _cross(e[2], before[0]))
+    larger += _dot(d[2], _cross(before[0], before[1]))
     return -resistance * larger / least * (lack**2 + lack * lack_before + lack_before**2)
-
-
-@numba.njit(cache=True, inline="always")
-def _farther(q: Positions, base: Positions, a: int, b: int) -> Vector:
-    """Return how an edge changed, from how its ends moved."""
-    return (
-        (q[b, 0] - base[b, 0]) - (q[a, 0] - base[a, 0]),
-        (q[b, 1] - base[b, 1]) - (q[a, 1] - base[a, 1]),
-        (q[b, 2] - base[b, 2]) - (q[a, 2] - base[a, 2]),
-    )
 
 
 @numba.njit(cache=True)
@@ -170,12 +150,13 @@ def _energy_of(first, count, step, q, cells, resistance, least, parts):
 
 
 @kernel
-def _change_of(first, count, step, q, base, cells, stiffness, least, parts):
+def _change_of(first, count, step, q, base, moved, cells, stiffness, least, parts):
     for i in range(first, count, step):
         change = 0.0
         if min(least_volume(q, cells[i]), least_volume(base, cells[i])) < least:  # of few; it reads each edge once
             for frame in range(8):
-                change += corner_change(q, base, cells[i], frame, stiffness[i], least)
+                e, before, d = edges(q, cells[i], frame), edges(base, cells[i], frame), edges(moved, cells[i], frame)
+                change += corner_change(e, before, d, stiffness[i], least)
         parts[i] = change
 
 
@@ -194,21 +175,14 @@ class Resistance(NamedTuple):
     volume: float
 
 
-@numba.njit(cache=True, inline="always")
-def _add(rows: Rows, row: int, factor: float, vector: Vector) -> None:
-    rows[row, 0] += factor * vector[0]
-    rows[row, 1] += factor * vector[1]
-    rows[row, 2] += factor * vector[2]
-
-
 @numba.njit(cache=True)
-def _add_corner(rows: Rows, cell: Indices, frame: int, factor: float, vectors: Frame) -> None:
+def _add_corner(rows: Rows, at: Indices, frame: int, factor: float, vectors: Frame) -> None:
     """Three vectors to the far ends of a corner's edges, and what balances them to the corner."""
-    a, b, c = vectors
-    _add(rows, cell[FRAMES[frame, 1]], factor, a)
-    _add(rows, cell[FRAMES[frame, 2]], factor, b)
-    _add(rows, cell[FRAMES[frame, 3]], factor, c)
-    _add(rows, cell[FRAMES[frame, 0]], -factor, _sum(a, b, c))
+    for role in range(4):
+        row, vector = rows[at[FRAMES[frame, role]]], vector_of(role, vectors)
+        row[0] += factor * vector[0]
+        row[1] += factor * vector[1]
+        row[2] += factor * vector[2]
 
 
 @numba.njit(cache=True)
@@ -307,7 +281,7 @@ class Cells:
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy at q less that at base [J], corner by corner so that a small change keeps its digits."""
         parts = np.empty(len(self.owned.cells), like=q)
-        _change_of(len(parts), q, base, *self.owned, parts)
+        _change_of(len(parts), q, base, q - base, *self.owned, parts)
         return float(parts.sum())
 
     def resisting(self, q: Positions) -> tuple[Resistance, Indices]:

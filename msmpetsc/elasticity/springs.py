@@ -114,7 +114,8 @@ class Springs(NamedTuple):
     def of_lattice(cls, lattice: Lattice, first: int | None = None) -> "Springs":
         """Return the first springs of a lattice, or all, in the memory that its nodes are in."""
         arrays = (like(lattice.nodes, a[:first]) for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
-        return cls(*arrays, lattice.stiffening)
+        ends, rest_length, stiffness = arrays
+        return cls(ends, rest_length, stiffness, lattice.stiffening)
 
 
 @numba.njit(cache=True, inline="always")

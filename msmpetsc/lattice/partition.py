@@ -65,21 +65,16 @@ class Partition:
         f = cells / self.cells.sum()
         nodes = cells + (self.nodes.sum() - self.cells.sum()) * f ** (2 / 3)
         springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * self.cells.sum()) * f ** (2 / 3)
-        before, after = np.cbrt(self.nodes.mean()), np.cbrt(nodes / self.ranks)
-        cut = self.cut * _cut_springs(after) / _cut_springs(before)
+        around = _shell(np.cbrt(nodes / self.ranks)) / _shell(np.cbrt(self.nodes.mean()))
+        cut = self.cut * around
         inner = self.inner * (springs - cut.sum() / 2) / max(self.inner.sum(), 1)
-        ghosts = self.ghosts * _shell(after) / _shell(before)
-        return Partition(self.cells * f, self.nodes * nodes / self.nodes.sum(), ghosts, inner, cut, self.neighbours)
+        nodes_of_ranks = self.nodes * nodes / self.nodes.sum()
+        return Partition(self.cells * f, nodes_of_ranks, self.ghosts * around, inner, cut, self.neighbours)
 
 
 def _shell(side: float) -> float:
     """Return the number of nodes around a cube of side^3 nodes."""
     return (side + 2) ** 3 - side**3
-
-
-def _cut_springs(side: float) -> float:
-    """Return the number of springs from a cube of side^3 nodes to those around: 26 a node, less twice those within."""
-    return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
 
 
 def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:

@@ -13,8 +13,9 @@ from msmpetsc.constraints.clamp import clamped
 from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
 from msmpetsc.constraints.loads import Anchor, Load, OwnForce, RigidMotion, spread_by_mass, total_of
 from msmpetsc.constraints.reactions import Holders
+from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK
-from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
+from msmpetsc.contact.obstacles.from_scene import build_obstacles
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
@@ -87,7 +88,14 @@ class Model:
     @cached_property
     def solids(self) -> dict[int, Surface]:
         """Surfaces of obstacles that are meshes or functions, by their numbers, on rank 0 (collective at first)."""
-        return surfaces_of(self.lattice.table.comm, self.obstacles, np.array([body.bounds for body in self.bodies]))
+        solids = {number: obstacle.solid for number, obstacle in enumerate(self.obstacles)}
+        drawn = {number: solid for number, solid in solids.items() if isinstance(solid, DistanceSolid)}
+        if not drawn:
+            return {}
+        low = np.min([body.bounds[0] for body in self.bodies], axis=0)
+        high = np.max([body.bounds[1] for body in self.bodies], axis=0)
+        comm = self.lattice.table.comm
+        return on_root(comm, lambda: {number: solid.surface(low, high) for number, solid in drawn.items()}) or {}
 
 
 class Geometry:
@@ -237,9 +245,9 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
             if shape not in shapes:
                 shapes[shape] = prepare(load(mesh.source, scene.folder), mesh.prepare, mesh.size)
             surface = prepare(shapes[shape], (), base=mesh.base)
-            _check_in_range(surface)
+            of_size = _doubtful_unit(surface, mesh.size)
             report = examine(surface)
-            warnings = *check_encloses(surface, report), *_doubtful_unit(surface, mesh.size)
+            warnings = *check_encloses(surface, report), *of_size
         except InputError as error:
             raise InputError(f"{whose}{error}") from error
         for warning in warnings:
@@ -247,8 +255,11 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
         yield compact(surface.points, surface.triangles), report  # a point of no triangle may lie in no cell
 
 
-def _check_in_range(surface: Surface) -> None:
-    """Raise InputError for a body whose volume or shape a double cannot hold."""
+def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
+    """Return a warning of a body whose longest side is unusual, unless the scene says what it is.
+
+    Raises InputError for a body whose volume or shape a double cannot hold.
+    """
     points = surface.points[np.unique(surface.triangles)]
     side, reach = np.ptp(points, axis=0).max(), np.abs(points).max()
     if side > 0 and not (SIDES[0] <= side <= SIDES[1] and reach <= FARTHEST * side):
@@ -256,11 +267,6 @@ def _check_in_range(surface: Surface) -> None:
             f"the mesh is {side:.3g} m long and reaches {reach:.3g} m from the origin: "
             "too large, too small or too far away to compute with"
         )
-
-
-def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
-    """Return a warning of a body whose longest side is unusual, unless the scene says what it is."""
-    side = np.ptp(surface.points[np.unique(surface.triangles)], axis=0).max()
     if size is not None or USUAL[0] <= side <= USUAL[1]:
         return []
     unit = "millimetres" if side > USUAL[1] else "another unit than metres"

@@ -263,7 +263,8 @@ def _made_of(net: Topology, material: LatticeMaterial) -> CellMaterial:
     """Return what the cells around a rank's nodes are made of, all alike where no function tells."""
     if material.of_cells:
         return material.of_cells(net.ijk[net.cells[:, 0]])
-    return CellMaterial.uniform(len(net.cells), material.density, material.spring, material.poisson or 0.0)
+    of_all = material.density, material.spring, material.poisson or 0.0
+    return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
 
 
 def _solid(net: Topology, h: float, material: LatticeMaterial, kept: Indices) -> LawConstants:

@@ -82,34 +82,16 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, 
 
     That lattice has about ``most`` cells where more are wanted, and its numbers are scaled.
     """
-    h = wanted.cell_size
-    area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
-    guess: float
-    if wanted.count is not None:
-        guess = wanted.count
-    else:
-        assert h is not None  # the schema has one of the two
-        guess = _cells(enclosed, 3 / 4 * area, h)  # as choose_cell_size does
-    if h and guess <= most:
-        size = h
-    else:
-        size = choose_cell_size(bodies, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
-    cages = fill(bodies, size, wanted.method, MOST, wanted.boundary)
+    h, cells = wanted.cell_size, float(wanted.count or 0)
+    if h is not None:  # inside the surface, and sticking out of it, as choose_cell_size has it
+        area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
+        cells = enclosed / h**3 + 3 / 4 * area / h**2
+    if h is None or cells > most:
+        h = choose_cell_size(bodies, int(min(cells, most)), wanted.method, MOST, wanted.boundary)
+    cages = fill(bodies, h, wanted.method, MOST, wanted.boundary)
     partition = count_partition(build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
     counted = int(partition.cells.sum())
-    if guess > most:
-        cells = wanted.count
-        if cells is None:
-            assert h is not None
-            volume = enclosed if all(body.report.closed for body in bodies) else counted * size**3
-            cells = round(_cells(volume, (counted * size**3 - volume) / size, h))
-        partition = partition.scaled(cells)
-    return partition, counted
-
-
-def _cells(volume: float, area: float, h: float) -> float:
-    """Return how many cells of side h [m] fill a volume [m^3] and stick out of an area [m^2]."""
-    return volume / h**3 + area / h**2
+    return partition.scaled(round(cells)) if cells > most else partition, counted
 
 
 def count_partition(lattice: Lattice, ranks: int) -> Partition:

@@ -99,8 +99,7 @@ def corner_product(e: Frame, n: Frame, w: Frame, resistance: float, least: float
 
     projected : without what the curvature of J adds
     """
-    lack = lack_of(_dot(e[0], n[0]), least)
-    slope, curvature = -3.0 * resistance * lack * lack / least, 6.0 * resistance * lack / least**2
+    slope, curvature = corner_slope(e, n, resistance, least), corner_curvature(e, n[0], resistance, least)
     change = curvature * (_dot(n[0], w[0]) + _dot(n[1], w[1]) + _dot(n[2], w[2]))
     if projected:
         slope = 0.0

@@ -413,15 +413,13 @@ def _add_block(
 class NeoHookean:
     """The cells around this rank's nodes, those that it owns first: what Elasticity asks of a law.
 
-    owned  : number of blocks of cells that this rank owns
-    h4     : four times the side of a cell [m]
-    single : the same blocks with constants in single precision
+    owned : number of blocks of cells that this rank owns
+    h4    : four times the side of a cell [m]
     """
 
     blocks: Blocks
     owned: int
     h4: float
-    single: Rows
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "NeoHookean":
@@ -442,7 +440,7 @@ class NeoHookean:
             blocks.append(len(of_kind))
         which, distinct = shared(np.concatenate(rows))
         cells = Blocks(np.concatenate(nodes), which, distinct)
-        return cls(cells, blocks[0], h4, distinct.astype(np.float32))
+        return cls(cells, blocks[0], h4)
 
     @property
     def corners(self) -> Indices:
@@ -475,7 +473,7 @@ class NeoHookean:
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to its second argument."""
-        constants = self.single if dtype == np.float32 else self.blocks.constants
+        constants: Rows = self.blocks.constants.astype(dtype, copy=False)
         return partial(add_product, self.blocks.nodes, self.blocks.which, constants, self.state(q, projected, dtype))
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:

@@ -122,17 +122,13 @@ def side_of(q: Positions, end: Positions, i: int, points: Positions, normals: Ro
 
 
 @kernel
-def _depths_of(
-    first: int, count: int, step: int, q: Rows, points: Rows, normals: Rows, sides: Indices, depths: Rows, face: Indices
-) -> None:
+def _depths_of(first, count, step, q, points, normals, sides, depths, face):
     for i in range(first, count, step):
         depths[i], face[i] = depth(q, i, points, normals, sides[i])
 
 
 @kernel
-def _sides_of(
-    first: int, count: int, step: int, q: Rows, end: Rows, points: Rows, normals: Rows, before: Indices, sides: Indices
-) -> None:
+def _sides_of(first, count, step, q, end, points, normals, before, sides):
     for i in range(first, count, step):
         sides[i] = side_of(q, end, i, points, normals, before[i])
 

@@ -12,11 +12,6 @@ from msmpetsc.scene.motion import Start, Twist
 InitialState = tuple[Positions, Rows]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 
 
-def at_rest(lattice: Lattice) -> InitialState:
-    """Return the rest shape, without a copy."""
-    return lattice.nodes, np.zeros_like(lattice.nodes)
-
-
 def initial_state(
     comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
 ) -> InitialState:
@@ -26,10 +21,10 @@ def initial_state(
     held   : (l,) bool, nodes that stay at rest where they are
     bounds : (b, 2, 3) each body's bounding box at rest [m]
     """
+    velocity = np.zeros_like(lattice.nodes)
     if not any(starts):
-        return at_rest(lattice)
-    (q, velocity), body = at_rest(lattice), lattice.body
-    q = q.copy()
+        return lattice.nodes, velocity
+    q, body = lattice.nodes.copy(), lattice.body
     for number, start in enumerate(starts):
         if start is not None:
             own = np.flatnonzero(body == number)

@@ -1,7 +1,7 @@
 """What each of R ranks would hold of a lattice that is built on one: counted without MPI.
 
 Ranks own equal parts of cells and of nodes along the Morton curve; those that R ranks make themselves, by a sample
-(comm.SortedKeys), are as large within a tenth.
+(comm.SortedKeys), are as large within an eighth.
 """
 
 from collections.abc import Sequence

@@ -11,7 +11,7 @@ from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT
+from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
 from msmpetsc.solve.petsc.library import view_entries
 from msmpetsc.solve.petsc.memory import Memory
 
@@ -59,6 +59,7 @@ class ContactBlocks:
             x, y = self.unknowns.columns(x), self.unknowns.columns_to_write(y)
             for rows, blocks in self.parts:
                 y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
+                count_flops(18 * len(rows))
 
 
 class Viewable:
@@ -113,6 +114,7 @@ class TrueHessian(Viewable):
         ``secants`` the true curvature of some friction (contact.obstacles.penalty)."""
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
+            count_flops(self.elasticity.flops.hessian)
             if self.contact:
                 self.contact.linearise(contact, q, True, secants)
             self.surface = contact.surface.hessian(q, projected) if contact and contact.surface else None
@@ -128,6 +130,7 @@ class TrueHessian(Viewable):
                 with CONTACT:
                     self.surface.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+            count_flops(self.elasticity.flops.product)
             if self.contact:
                 self.contact.add(x, y)
 

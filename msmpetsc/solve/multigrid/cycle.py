@@ -28,7 +28,7 @@ from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import memory
-from msmpetsc.solve.petsc.events import FINE
+from msmpetsc.solve.petsc.events import FINE, count_flops
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev, square_restricts_transposed
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
@@ -36,6 +36,7 @@ LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range b
 DIAGONAL = 3.0  # times that eigenvalue where only the diagonal of D is taken
 SAFETY = 1.1  # times it where no bound is known, as some iterations of CG know it
 ITERATIONS = 10  # of these
+BLOCK = 15  # operations of a product with a 3 x 3 block
 
 
 @dataclass(frozen=True)
@@ -264,6 +265,7 @@ class ProjectedHessian(Viewable):
             if len(self.contact):
                 add_node_blocks(len(self.contact), self.contact, self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+            count_flops(self.elasticity.flops.product + (BLOCK + 3) * len(self.contact))
 
 
 class DiagonalBlocks:
@@ -275,6 +277,7 @@ class DiagonalBlocks:
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         unknowns = self.hessian.unknowns
         apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, unknowns.columns_to_write(y))
+        count_flops(BLOCK * unknowns.size)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")

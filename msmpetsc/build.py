@@ -13,8 +13,9 @@ from msmpetsc.constraints.clamp import clamped
 from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
 from msmpetsc.constraints.loads import Anchor, Load, OwnForce, RigidMotion, spread_by_mass, total_of
 from msmpetsc.constraints.reactions import Holders
+from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK
-from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
+from msmpetsc.contact.obstacles.from_scene import build_obstacles
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
@@ -87,7 +88,14 @@ class Model:
     @cached_property
     def solids(self) -> dict[int, Surface]:
         """Surfaces of obstacles that are meshes or functions, by their numbers, on rank 0 (collective at first)."""
-        return surfaces_of(self.lattice.table.comm, self.obstacles, np.array([body.bounds for body in self.bodies]))
+        solids = {number: obstacle.solid for number, obstacle in enumerate(self.obstacles)}
+        drawn = {number: solid for number, solid in solids.items() if isinstance(solid, DistanceSolid)}
+        if not drawn:
+            return {}
+        low = np.min([body.bounds[0] for body in self.bodies], axis=0)
+        high = np.max([body.bounds[1] for body in self.bodies], axis=0)
+        comm = self.lattice.table.comm
+        return on_root(comm, lambda: {number: solid.surface(low, high) for number, solid in drawn.items()}) or {}
 
 
 class Geometry:
@@ -156,8 +164,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
-    has_regions = any(any(scene.tables(kind)) for kind in NODES)
-    points = shape.nearest(lattice) if has_regions else lattice.nodes
+    points = shape.nearest(lattice) if any(any(scene.tables(kind)) for kind in NODES) else lattice.nodes
     masks = regions(scene, lattice, finder, points)
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
@@ -167,13 +174,14 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
+    loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     return Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
         lattice=clamped(scene, lattice, masks, finder, points),
         embedding=shape.embedding if scene.output.surface else None,
-        loads=_loads(comm, scene.gravity, scene.tables("force"), lattice, masks),
-        own_forces=_own_forces(scene.tables("force"), lattice, masks),
+        loads=loads,
+        own_forces=own_forces,
         anchors=anchors,
         exchanges=exchanges,
         penalties=penalties,
@@ -237,9 +245,9 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
             if shape not in shapes:
                 shapes[shape] = prepare(load(mesh.source, scene.folder), mesh.prepare, mesh.size)
             surface = prepare(shapes[shape], (), base=mesh.base)
-            _check_in_range(surface)
+            of_size = _doubtful_unit(surface, mesh.size)
             report = examine(surface)
-            warnings = *check_encloses(surface, report), *_doubtful_unit(surface, mesh.size)
+            warnings = *check_encloses(surface, report), *of_size
         except InputError as error:
             raise InputError(f"{whose}{error}") from error
         for warning in warnings:
@@ -247,8 +255,11 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
         yield compact(surface.points, surface.triangles), report  # a point of no triangle may lie in no cell
 
 
-def _check_in_range(surface: Surface) -> None:
-    """Raise InputError for a body whose volume or shape a double cannot hold."""
+def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
+    """Return a warning of a body whose longest side is unusual, unless the scene says what it is.
+
+    Raises InputError for a body whose volume or shape a double cannot hold.
+    """
     points = surface.points[np.unique(surface.triangles)]
     side, reach = np.ptp(points, axis=0).max(), np.abs(points).max()
     if side > 0 and not (SIDES[0] <= side <= SIDES[1] and reach <= FARTHEST * side):
@@ -256,11 +267,6 @@ def _check_in_range(surface: Surface) -> None:
             f"the mesh is {side:.3g} m long and reaches {reach:.3g} m from the origin: "
             "too large, too small or too far away to compute with"
         )
-
-
-def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
-    """Return a warning of a body whose longest side is unusual, unless the scene says what it is."""
-    side = np.ptp(surface.points[np.unique(surface.triangles)], axis=0).max()
     if size is not None or USUAL[0] <= side <= USUAL[1]:
         return []
     unit = "millimetres" if side > USUAL[1] else "another unit than metres"
@@ -306,8 +312,10 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, a
 
 def _loads(
     comm: MPI.Comm, gravity: Gravity | None, forces: Iterable[OfBody], lattice: Lattice, masks: Regions
-) -> list[Load]:
-    loads = []
+) -> tuple[list[Load], tuple[OwnForce, ...]]:
+    """Return the forces, and those that are functions. Raises InputError for a function's name that is neither
+    registered nor installed."""
+    loads, own_forces = [], []
     if gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(gravity.acceleration), 0.0, None))
     for table in forces:
@@ -318,19 +326,10 @@ def _loads(
             loads.append(Load(share, force.start, force.stop, total_of(force.total)))
         elif force.total is not None:
             loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
-    return loads
-
-
-def _own_forces(tables: Iterable[OfBody], lattice: Lattice, masks: Regions) -> tuple[OwnForce, ...]:
-    """Return the forces that are functions. Raises InputError for a name that is neither registered nor installed."""
-    forces = []
-    for table in tables:
-        force = table.table
-        if force.function is not None:
-            rows = np.flatnonzero(masks[table.key][: lattice.owned])
-            function = FORCES.find(force.function)
-            forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))
-    return tuple(forces)
+        else:
+            rows, function = np.flatnonzero(where), FORCES.find(force.function)
+            own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))
+    return loads, tuple(own_forces)
 
 
 def _contacts(

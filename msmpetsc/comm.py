@@ -103,19 +103,6 @@ def starts(counts: np.ndarray) -> np.ndarray:
 SAMPLES = 128  # a rank: keeps the ranks' parts within some percent of each other
 
 
-def sample_of(keys: np.ndarray, total: int, size: int) -> np.ndarray:
-    """Return a regular sample of a rank's ascending keys, of ``total`` that ``size`` ranks have together."""
-    step = max(1, total // (size * SAMPLES))
-    return keys[step // 2 :: step]
-
-
-def splitters_of(sample: np.ndarray, size: int) -> np.ndarray:
-    """Return the keys (size - 1,) at which the next rank's part begins: at equal steps of all ranks' samples."""
-    if size == 1 or len(sample) == 0:
-        return np.zeros(size - 1, np.int64)
-    return np.sort(sample)[np.arange(1, size) * len(sample) // size]
-
-
 class SortedKeys:
     """Distinct int64 keys in ascending order over all ranks; a key's position is its global index.
 
@@ -130,8 +117,10 @@ class SortedKeys:
     def __init__(self, comm: MPI.Comm, keys: np.ndarray):
         self.comm = comm
         keys = np.unique(np.asarray(keys, np.int64))
-        sample = sample_of(keys, comm.allreduce(len(keys)), comm.size)
-        self.splitters = splitters_of(np.concatenate(comm.allgather(sample)), comm.size)
+        step = max(1, comm.allreduce(len(keys)) // (comm.size * SAMPLES))
+        sample = np.sort(np.concatenate(comm.allgather(keys[step // 2 :: step])))
+        # the keys at which the next rank's part begins: at equal steps of all ranks' samples
+        self.splitters = sample[np.arange(1, comm.size) * len(sample) // comm.size] if len(sample) else sample
         route = Route(comm, self.owner(keys))
         self.keys = np.unique(route.send(keys))
         counts = np.array(comm.allgather(len(self.keys)), np.int64)

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host, to_host
-from msmpetsc.elasticity.cell_volume import CellGather, CellScatter, least_volumes
+from msmpetsc.elasticity.cell_volume import Cells
 from msmpetsc.elasticity.neo_hookean import NeoHookean
 from msmpetsc.elasticity.springs import Product, SpringGather, SpringScatter
 from msmpetsc.elasticity.viscosity import Viscosity
@@ -82,7 +82,7 @@ class Elasticity:
         self.owned, self.flops = lattice.owned, Flops.of_lattice(lattice)
         on_cpu = on_host(lattice.nodes)
         self.springs: SpringScatter | SpringGather | None = None
-        self.cells: CellScatter | CellGather | None = None
+        self.cells: Cells | None = None
         if lattice.solid is not None and not on_cpu:
             raise InputError('material.law = "neo-hookean" is computed on CPUs: --device cpu')
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
@@ -93,9 +93,7 @@ class Elasticity:
             self.springs = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
         if lattice.stiffening > 0:
             volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
-            self.cells = (CellScatter if on_cpu else CellGather).of_lattice(
-                lattice, RESISTANCE * resistance, ONSET * volume
-            )
+            self.cells = Cells.of_lattice(lattice, RESISTANCE * resistance, ONSET * volume)
         self.parts = [part for part in (self.solid, self.springs, self.cells, self.viscosity) if part]
 
     def energy(self, q: Positions) -> float:
@@ -136,9 +134,7 @@ class Elasticity:
 
     def resists(self, q: Positions) -> bool:
         """Return whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
-        if self.cells is None or not len(self.cells.cells):
-            return False
-        return bool(least_volumes(q, self.cells.cells).min() < self.cells.law.volume)
+        return self.cells is not None and len(self.cells.resisting(q)[1]) > 0
 
     def hessian_at(self, q: Positions, projected: bool = False, dtype: type = np.float64) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].

@@ -130,19 +130,16 @@ def _volume_change(j: float, before: float, change: float, mu: float, lame: floa
 
 
 @numba.njit(cache=True, inline="always")
-def _norms(f: Nine) -> tuple[float, float]:
-    """Return Gershgorin's bound of the greatest singular value of F, exact in a rotation, and |F|."""
+def _borne(f: Nine, j: float, slope: float, least: float) -> float:
+    """Return by what |U'| is multiplied in what it may take from mu; J above ``least`` counts as convex.
+
+    There it is Gershgorin's bound of the greatest singular value of F, exact in a rotation, elsewhere R |F|.
+    """
     xx, yy, zz = f[0] ** 2 + f[3] ** 2 + f[6] ** 2, f[1] ** 2 + f[4] ** 2 + f[7] ** 2, f[2] ** 2 + f[5] ** 2 + f[8] ** 2
     xy = abs(f[0] * f[1] + f[3] * f[4] + f[6] * f[7])
     xz = abs(f[0] * f[2] + f[3] * f[5] + f[6] * f[8])
     yz = abs(f[1] * f[2] + f[4] * f[5] + f[7] * f[8])
-    return math.sqrt(max(xx + xy + xz, yy + xy + yz, zz + xz + yz)), math.sqrt(xx + yy + zz)
-
-
-@numba.njit(cache=True, inline="always")
-def _borne(f: Nine, j: float, slope: float, least: float) -> float:
-    """Return by what |U'| is multiplied in what it may take from mu; J above ``least`` counts as convex."""
-    largest, norm = _norms(f)
+    largest, norm = math.sqrt(max(xx + xy + xz, yy + xy + yz, zz + xz + yz)), math.sqrt(xx + yy + zz)
     return largest if slope < 0.0 and j >= least else NORM * norm
 
 
@@ -265,25 +262,18 @@ def _quadratic(w: Floats, other: Floats, lane: int) -> float:
     return total
 
 
-@numba.njit(cache=True, inline="always")
-def _energy_of_lane(w: Floats, lane: int, h4: float) -> float:
-    """Return the energy [J] of a lane's cell, 0 at rest."""
-    f, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
-    n = cofactors(f)
-    j = determinant(f, n)
-    volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
-    return 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
-
-
 @numba.njit(cache=True)
 def cell_energies(blocks: Blocks, h4: float, q: Positions, energies: Rows) -> None:
-    """Write the energy of cells [J] at q (l, 3) [m] into ``energies`` (b, LANES), of the first b blocks."""
+    """Write the energy of cells [J] at q (l, 3) [m], 0 at rest, into ``energies`` (b, LANES), of the first b blocks."""
     w = np.zeros(WORK)
     for b in range(len(energies)):
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         for lane in range(LANES):
-            energies[b, lane] = _energy_of_lane(w, lane, h4)
+            f, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+            j = determinant(f, cofactors(f))
+            volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
+            energies[b, lane] = 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
 
 
 @numba.njit(cache=True)
@@ -423,15 +413,13 @@ def _add_block(
 class NeoHookean:
     """The cells around this rank's nodes, those that it owns first: what Elasticity asks of a law.
 
-    owned  : number of blocks of cells that this rank owns
-    h4     : four times the side of a cell [m]
-    single : the same blocks with constants in single precision
+    owned : number of blocks of cells that this rank owns
+    h4    : four times the side of a cell [m]
     """
 
     blocks: Blocks
     owned: int
     h4: float
-    single: Rows
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "NeoHookean":
@@ -452,7 +440,7 @@ class NeoHookean:
             blocks.append(len(of_kind))
         which, distinct = shared(np.concatenate(rows))
         cells = Blocks(np.concatenate(nodes), which, distinct)
-        return cls(cells, blocks[0], h4, distinct.astype(np.float32))
+        return cls(cells, blocks[0], h4)
 
     @property
     def corners(self) -> Indices:
@@ -485,7 +473,7 @@ class NeoHookean:
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to its second argument."""
-        constants = self.single if dtype == np.float32 else self.blocks.constants
+        constants: Rows = self.blocks.constants.astype(dtype, copy=False)
         return partial(add_product, self.blocks.nodes, self.blocks.which, constants, self.state(q, projected, dtype))
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:

@@ -6,11 +6,12 @@ the same stiffness k at small strain whatever b. Its energy is k r^2 (s^2 / 2 + 
 All positions are local, (l, 3) [m]: owned nodes then ghosts. Gradients and products are right at the owned nodes,
 for a rank has every spring of them; the ghosts' rows are not complete and not to be used.
 
-``SpringScatter`` takes each spring once and adds to both its ends: the CPU's way. ``SpringGather`` lets each node sum
-over its neighbours, one thread a node: the GPU's way, for no two threads write to the same row, so sums come out the
-same, to the last bit, every time. It stores nothing of a Hessian: reading positions again is less than reading the
-blocks of 26 springs. On a CPU (bunny of 10,000 and 30,000 cells, beam of 10,240) gathering took 1.5 times as long for a
-gradient and 6 to 10 times for a product, with stored blocks 1.5 to 2.1 times: so there are two loops.
+Energies are summed spring by spring. Of nodes' forces there are two sums: ``SpringScatter`` takes each spring once and
+adds to both its ends: the CPU's way. ``SpringGather`` lets each node sum over its neighbours, one thread a node: the
+GPU's way, for no two threads write to the same row, so sums come out the same, to the last bit, every time. It stores
+nothing of a Hessian: reading positions again is less than reading the blocks of 26 springs. On a CPU (bunny of 10,000
+and 30,000 cells, beam of 10,240) gathering took 1.5 times as long for a gradient and 6 to 10 times for a product, with
+stored blocks 1.5 to 2.1 times: so there are two loops.
 """
 
 import math
@@ -22,7 +23,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.lattice.lattice import Lattice
 
@@ -109,29 +110,74 @@ class Springs(NamedTuple):
     stiffness: Floats
     stiffening: float
 
+    @classmethod
+    def of_lattice(cls, lattice: Lattice, first: int | None = None) -> "Springs":
+        """Return the first springs of a lattice, or all, in the memory that its nodes are in."""
+        arrays = (like(lattice.nodes, a[:first]) for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
+        ends, rest_length, stiffness = arrays
+        return cls(ends, rest_length, stiffness, lattice.stiffening)
+
+
+@numba.njit(cache=True, inline="always")
+def between(q: Positions, a: int, b: int) -> Vector:
+    """Return the way from node a to node b."""
+    return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
+
+
+@kernel
+def _elastic_energy(first, count, step, q, ends, rest_length, stiffness, stiffening, sums):
+    energy = 0.0
+    for s in range(first, count, step):
+        x, y, z = between(q, ends[s, 1], ends[s, 0])
+        energy += spring_energy(x, y, z, rest_length[s], stiffness[s], stiffening)
+    if first < count:
+        sums[first] = energy
+
+
+@kernel
+def _elastic_change(first, count, step, base, moved, ends, rest_length, stiffness, stiffening, sums):
+    change = 0.0
+    for s in range(first, count, step):
+        u, v, w = between(base, ends[s, 1], ends[s, 0])
+        # how the ends moved, from node to node: a difference of springs would keep only the digits of a spring
+        dx, dy, dz = between(moved, ends[s, 1], ends[s, 0])
+        change += spring_change(u, v, w, dx, dy, dz, rest_length[s], stiffness[s], stiffening)
+    if first < count:
+        sums[first] = change
+
 
 @dataclass(frozen=True)
-class SpringScatter:
-    """The springs of a rank one after another, those that it ``owns`` first: how a CPU sums them."""
+class OwnedSprings:
+    """The springs that a rank owns: their energy, by one sum on a CPU and by one of each thread on a GPU."""
+
+    owned: Springs
+
+    def energy(self, q: Positions) -> float:
+        """Return E [J] of the springs that this rank owns."""
+        return self._sum(_elastic_energy, q)
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return E(q) - E(base) [J] of these springs, summed spring by spring so that a small change keeps its
+        digits."""
+        return self._sum(_elastic_change, base, q - base)
+
+    def _sum(self, loop: Callable[..., None], *positions: Positions) -> float:
+        count, q = len(self.owned.ends), positions[0]
+        sums = np.zeros(1 if on_host(q) else count, like=q)
+        loop(count, *positions, *self.owned, sums)
+        return float(sums.sum())
+
+
+@dataclass(frozen=True)
+class SpringScatter(OwnedSprings):
+    """The springs of a rank one after another, those that it owns first: how a CPU sums them."""
 
     springs: Springs
-    owned: Springs
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringScatter":
         """Return the springs of a lattice whose arrays are in the memory of the CPU."""
-        springs = Springs(lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening)
-        owned = slice(lattice.springs_owned)
-        own = Springs(springs.ends[owned], springs.rest_length[owned], springs.stiffness[owned], lattice.stiffening)
-        return cls(springs, own)
-
-    def energy(self, q: Positions) -> float:
-        """Return E [J] of the springs that this rank owns."""
-        return elastic_energy(q, self.owned)
-
-    def change(self, q: Positions, base: Positions) -> float:
-        """Return E(q) - E(base) [J] of the springs that this rank owns."""
-        return elastic_change(q, base, self.owned)
+        return cls(Springs.of_lattice(lattice, lattice.springs_owned), Springs.of_lattice(lattice))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
@@ -150,37 +196,6 @@ class SpringScatter:
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_bound says to ``blocks`` (l, 9) [N/m]."""
         add_elastic_diagonal(q, self.springs, blocks)
-
-
-@numba.njit(cache=True, inline="always")
-def between(q: Positions, a: int, b: int) -> Vector:
-    """Return the way from node a to node b."""
-    return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
-
-
-@numba.njit(cache=True)
-def elastic_energy(q: Positions, springs: Springs) -> float:
-    """Return the sum of 1/2 k (|p1 - p2| - r)^2 over springs (Eq. 13), and of what stiffening adds, [J]."""
-    ends, rest_length, stiffness, stiffening = springs
-    energy = 0.0
-    for s in range(len(ends)):
-        x, y, z = between(q, ends[s, 1], ends[s, 0])
-        energy += spring_energy(x, y, z, rest_length[s], stiffness[s], stiffening)
-    return energy
-
-
-@numba.njit(cache=True)
-def elastic_change(q: Positions, base: Positions, springs: Springs) -> float:
-    """Return E(q) - E(base) [J], summed spring by spring so that a small change keeps its digits."""
-    ends, rest_length, stiffness, stiffening = springs
-    change = 0.0
-    moved = q - base
-    for s in range(len(ends)):
-        u, v, w = between(base, ends[s, 1], ends[s, 0])
-        # how the ends moved, from node to node: a difference of springs would keep only the digits of a spring
-        dx, dy, dz = between(moved, ends[s, 1], ends[s, 0])
-        change += spring_change(u, v, w, dx, dy, dz, rest_length[s], stiffness[s], stiffening)
-    return change
 
 
 @numba.njit(cache=True)
@@ -233,17 +248,11 @@ def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Row
 def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
     ends, rest_length, stiffness, stiffening = springs
-    sums = np.zeros((len(blocks), 6))  # xx, xy, xz, yy, yz, zz
     for s in range(len(ends)):
         x, y, z = between(q, ends[s, 1], ends[s, 0])
         c, ex, ey, ez = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, True)
-        block = (c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez)
         for end in range(2):
-            for entry in range(6):
-                sums[ends[s, end], entry] += block[entry]
-    for i in range(len(blocks)):
-        for entry in range(9):
-            blocks[i, entry] += sums[i, SYMMETRIC[entry]]
+            add_spring_block(blocks[ends[s, end]], c, ex, ey, ez)
 
 
 @numba.njit(cache=True)
@@ -292,7 +301,7 @@ def add_spring_block(block: Floats, c: float, ex: float, ey: float, ez: float) -
 
 
 @dataclass(frozen=True)
-class SpringGather:
+class SpringGather(OwnedSprings):
     """The springs around each owned node, a column of the arrays for each: how a GPU sums them.
 
     neighbour : (w, owned) int32, local number of the node at the far end, -1 past the last
@@ -305,7 +314,6 @@ class SpringGather:
     kind: Array
     stiffness: Floats
     lengths: Floats
-    stiffening: float
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringGather":
@@ -321,26 +329,12 @@ class SpringGather:
         neighbour, kinds, stiffness = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape)
         neighbour[slot, node], kinds[slot, node] = ends[by_node, 1], kind[spring]
         stiffness[slot, node] = to_host(lattice.stiffness)[spring]
-        neighbour, kinds, stiffness, lengths = (
-            like(lattice.nodes, values) for values in (neighbour, kinds, stiffness, lengths)
-        )
-        return cls(neighbour, kinds, stiffness, lengths, lattice.stiffening)
+        arrays = (like(lattice.nodes, values) for values in (neighbour, kinds, stiffness, lengths))
+        return cls(Springs.of_lattice(lattice, lattice.springs_owned), *arrays)
 
     @property
     def _all(self) -> tuple[Indices, Array, Floats, Floats, float]:
-        return self.neighbour, self.kind, self.stiffness, self.lengths, self.stiffening
-
-    def energy(self, q: Positions) -> float:
-        """Return E [J] of the half of each spring that is nearer to an owned node: all ranks' sum is the body's."""
-        parts = np.empty(self.neighbour.shape[1], like=q)
-        _energy_around(len(parts), q, *self._all, parts)
-        return float(parts.sum())
-
-    def change(self, q: Positions, base: Positions) -> float:
-        """Return E(q) - E(base) [J] of the halves of springs that ``energy`` counts."""
-        parts = np.empty(self.neighbour.shape[1], like=q)
-        _change_around(len(parts), q, base, *self._all, parts)
-        return float(parts.sum())
+        return self.neighbour, self.kind, self.stiffness, self.lengths, self.owned.stiffening
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to the owned rows of ``gradient``."""
@@ -357,34 +351,6 @@ class SpringGather:
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _diagonal_around(self.neighbour.shape[1], q, *self._all, blocks)
-
-
-@kernel
-def _energy_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, parts):
-    for i in range(first, count, step):
-        energy = 0.0
-        for s in range(neighbour.shape[0]):
-            j = neighbour[s, i]
-            if j < 0:
-                break
-            x, y, z = q[i, 0] - q[j, 0], q[i, 1] - q[j, 1], q[i, 2] - q[j, 2]
-            energy += spring_energy(x, y, z, lengths[kind[s, i]], stiffness[s, i], stiffening)
-        parts[i] = 0.5 * energy
-
-
-@kernel
-def _change_around(first, count, step, q, base, neighbour, kind, stiffness, lengths, stiffening, parts):
-    for i in range(first, count, step):
-        mx, my, mz = q[i, 0] - base[i, 0], q[i, 1] - base[i, 1], q[i, 2] - base[i, 2]
-        change = 0.0
-        for s in range(neighbour.shape[0]):
-            j = neighbour[s, i]
-            if j < 0:
-                break
-            u, v, w = base[i, 0] - base[j, 0], base[i, 1] - base[j, 1], base[i, 2] - base[j, 2]
-            dx, dy, dz = mx - (q[j, 0] - base[j, 0]), my - (q[j, 1] - base[j, 1]), mz - (q[j, 2] - base[j, 2])
-            change += spring_change(u, v, w, dx, dy, dz, lengths[kind[s, i]], stiffness[s, i], stiffening)
-        parts[i] = 0.5 * change
 
 
 @kernel

@@ -43,27 +43,20 @@ class StressField:
     def __call__(self, q: Positions) -> dict[str, Any]:
         """Return the fields at q (l, 3) [m]: of owned nodes, and by ``cell_...`` of the cells that this rank owns.
 
-        A stress is a row (6,) of xx, yy, zz, xy, yz, xz [Pa]; strain energies are [J/m^3] of volume at rest.
+        A stress is a row (6,) of xx, yy, zz, xy, yz, xz [Pa]; strain energies are [J/m^3] of volume at rest. Below J_0,
+        where U is no solid's any more, J_0 stands for J, so that the stress stays finite.
         """
-        stress = self.cauchy(q)
+        state = self.solid.state(q, False).reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
+        f, slope = state[:, :9].reshape(-1, 3, 3), state[:, 9] * self.solid.h4**2 / self.cells.volume
+        share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
+        stress: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
+        stress[:, :3] += slope[:, None]
         energy = np.empty((len(self.solid.blocks.nodes), LANES))
         cell_energies(self.solid.blocks, self.solid.h4, q, energy)
         energies = energy.ravel()[self.lanes] / self.cells.volume
         own = slice(self.cells_owned)
         of_nodes = _fields(self.around @ stress, self.around @ energies)
         return of_nodes | {f"cell_{name}": rows for name, rows in _fields(stress[own], energies[own]).items()}
-
-    def cauchy(self, q: Positions) -> Rows:
-        """Return the Cauchy stress (d, 6) [Pa] of the lattice's ``local_cells`` at q (l, 3) [m].
-
-        Below J_0, where U is no solid's any more, J_0 stands for J, so that the stress stays finite.
-        """
-        state = self.solid.state(q, False).reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
-        f, slope = state[:, :9].reshape(-1, 3, 3), state[:, 9] * self.solid.h4**2 / self.cells.volume
-        share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
-        sigma: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
-        sigma[:, :3] += slope[:, None]
-        return sigma
 
 
 def _fields(stress: Rows, energy: Floats) -> dict[str, Any]:

@@ -21,7 +21,6 @@ independent coordinates: exact in a whole cell (Flanagan and Belytschko 1981; Be
 It is three sums like (h_xy, h_xz) [C_yy C_yz; C_yz C_zz] (h_xy, h_xz)^T, and so not negative, as a covariance is not.
 """
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Rows
@@ -77,26 +76,9 @@ def volume_ratios(forms: Rows, corners: Rows, cell_size: float) -> Floats:
 
     corners : (c, 8, 3) positions [m]
     """
-    ratios = np.empty(len(forms))
-    _volume_ratios_of(forms, corners, SUMS, 1 / (4 * cell_size), ratios)
+    slopes, _ = slopes_and_modes(forms)
+    ratios: Floats = np.linalg.det(slopes @ corners / (4 * cell_size))
     return ratios
-
-
-@numba.njit(cache=True)
-def _volume_ratios_of(forms: Rows, corners: Rows, sums: Rows, scale: float, ratios: Floats) -> None:
-    for i in range(len(forms)):
-        m, f = forms[i], np.zeros((3, 3))
-        for a in range(8):
-            xy, xz, yz, xyz = sums[3, a], sums[4, a], sums[5, a], sums[6, a]
-            x = scale * (sums[0, a] + m[1] * xy + m[2] * xz + m[5] * xyz)  # the columns of slopes_and_modes
-            y = scale * (sums[1, a] + m[0] * xy + m[2] * yz + m[4] * xyz)
-            z = scale * (sums[2, a] + m[0] * xz + m[1] * yz + m[3] * xyz)
-            for r in range(3):
-                f[0, r] += x * corners[i, a, r]
-                f[1, r] += y * corners[i, a, r]
-                f[2, r] += z * corners[i, a, r]
-        across = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1], f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
-        ratios[i] = f[0, 0] * across[0] + f[0, 1] * across[1] + f[0, 2] * (f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0])
 
 
 def laplacians(forms: Rows, volume: Floats) -> Rows:

@@ -12,11 +12,6 @@ from msmpetsc.scene.motion import Start, Twist
 InitialState = tuple[Positions, Rows]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 
 
-def at_rest(lattice: Lattice) -> InitialState:
-    """Return the rest shape, without a copy."""
-    return lattice.nodes, np.zeros_like(lattice.nodes)
-
-
 def initial_state(
     comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
 ) -> InitialState:
@@ -26,17 +21,19 @@ def initial_state(
     held   : (l,) bool, nodes that stay at rest where they are
     bounds : (b, 2, 3) each body's bounding box at rest [m]
     """
+    velocity = np.zeros_like(lattice.nodes)
     if not any(starts):
-        return at_rest(lattice)
-    (q, velocity), body = at_rest(lattice), lattice.body
-    q = q.copy()
+        return lattice.nodes, velocity
+    q, body = lattice.nodes.copy(), lattice.body
     for number, start in enumerate(starts):
         if start is not None:
             own = np.flatnonzero(body == number)
             owned = int((own < lattice.owned).sum())
             q[own] = moved(start, lattice.nodes[own], lattice.global_numbers[own], bounds[number])
             q[own[held[own]]] = lattice.nodes[own[held[own]]]
-            middle = centre_of_mass(comm, q[own], lattice.mass[own[:owned]])
+            mass = lattice.mass[own[:owned]]
+            total: Floats = comm.allreduce(np.append(mass @ q[own[:owned]], mass.sum()))
+            middle = total[:3] / total[3]  # the centre of mass
             velocity[own] = np.array(start.velocity) + np.cross(start.spin, q[own] - middle)
     velocity[held] = 0
     return q, velocity
@@ -79,13 +76,3 @@ def uniform(numbers: Indices) -> Rows:
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return ((z ^ (z >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
-
-
-def centre_of_mass(comm: MPI.Comm, q: Positions, mass: Floats) -> Floats:
-    """Return the centre of mass (3,) [m] of all ranks' nodes (collective).
-
-    q, mass : (l, 3) [m]; (owned,) [kg]
-    """
-    total: Floats = comm.allreduce(np.append(mass @ q[: len(mass)], mass.sum()))
-    centre: Floats = total[:3] / total[3]
-    return centre

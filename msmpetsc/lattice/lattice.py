@@ -154,6 +154,8 @@ def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology |
     h, net, is_solid = cages.grids.cell_size, topology or topology_of(cages), material.poisson is not None
     kept, cells_owned = _kept_cells(net.cells, len(net.octants), material.stiffening > 0 or is_solid)
     law = _solid(net, h, material, kept) if is_solid else _of_springs(net, h, material)
+    grids = cages.grids
+    nodes_of_bodies = np.bincount(grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids))
     return Lattice(
         table=net.table,
         cell_size=h,
@@ -172,16 +174,9 @@ def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology |
         local_cells=net.cells[kept],
         cells_owned=cells_owned,
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],
-        first_of_body=_first_of_body(cages, net.ijk[: len(law.mass)]),
+        first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid,
     )
-
-
-def _first_of_body(cages: Cages, ijk: Indices) -> Indices:
-    """Return the global number (b,) of the first node of each body; ijk (owned, 3) of the owned nodes (collective)."""
-    bodies = len(cages.grids.grids)
-    nodes = cages.table.comm.allreduce(np.bincount(cages.grids.body_of(ijk), minlength=bodies))
-    return starts(nodes)
 
 
 class Topology(NamedTuple):
@@ -268,7 +263,8 @@ def _made_of(net: Topology, material: LatticeMaterial) -> CellMaterial:
     """Return what the cells around a rank's nodes are made of, all alike where no function tells."""
     if material.of_cells:
         return material.of_cells(net.ijk[net.cells[:, 0]])
-    return CellMaterial.uniform(len(net.cells), material.density, material.spring, material.poisson or 0.0)
+    of_all = material.density, material.spring, material.poisson or 0.0
+    return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
 
 
 def _solid(net: Topology, h: float, material: LatticeMaterial, kept: Indices) -> LawConstants:

@@ -31,11 +31,6 @@ class CellMaterial:
     spring: Floats
     poisson: Floats
 
-    @classmethod
-    def uniform(cls, count: int, density: float, spring: float, poisson: float) -> "CellMaterial":
-        """Return that of cells that are all alike."""
-        return cls(np.full(count, density), np.full(count, spring), np.full(count, poisson))
-
 
 def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: Indices, cells: Indices) -> Floats:
     """Return the spring stiffness [N/m] of an isotropic lattice with Young's modulus E [Pa] at small strain.

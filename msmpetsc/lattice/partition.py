@@ -1,7 +1,7 @@
 """What each of R ranks would hold of a lattice that is built on one: counted without MPI.
 
-The ranks cut cells and nodes, both in Morton order, as comm.SortedKeys does: at splitters of a sample. The sample
-depends on what each rank brings to it, slabs of cells and then the corners of its cells, so that is repeated too.
+Ranks own equal parts of cells and of nodes along the Morton curve; those that R ranks make themselves, by a sample
+(comm.SortedKeys), are as large within an eighth.
 """
 
 from collections.abc import Sequence
@@ -9,10 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Indices
-from msmpetsc.comm import sample_of, splitters_of
-from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
-from msmpetsc.geometry.interior import Slab
+from msmpetsc.backend.arrays import Array
+from msmpetsc.geometry.cages import BodySurface, choose_cell_size, fill
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.scene.body import CagesTable
 
@@ -67,11 +65,11 @@ class Partition:
         f = cells / self.cells.sum()
         nodes = cells + (self.nodes.sum() - self.cells.sum()) * f ** (2 / 3)
         springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * self.cells.sum()) * f ** (2 / 3)
-        before, after = np.cbrt(self.nodes.mean()), np.cbrt(nodes / self.ranks)
-        cut = self.cut * _cut_springs(after) / _cut_springs(before)
+        around = _shell(np.cbrt(nodes / self.ranks)) / _shell(np.cbrt(self.nodes.mean()))
+        cut = self.cut * around
         inner = self.inner * (springs - cut.sum() / 2) / max(self.inner.sum(), 1)
-        ghosts = self.ghosts * _shell(after) / _shell(before)
-        return Partition(self.cells * f, self.nodes * nodes / self.nodes.sum(), ghosts, inner, cut, self.neighbours)
+        nodes_of_ranks = self.nodes * nodes / self.nodes.sum()
+        return Partition(self.cells * f, nodes_of_ranks, self.ghosts * around, inner, cut, self.neighbours)
 
 
 def _shell(side: float) -> float:
@@ -79,50 +77,26 @@ def _shell(side: float) -> float:
     return (side + 2) ** 3 - side**3
 
 
-def _cut_springs(side: float) -> float:
-    """Return the number of springs from a cube of side^3 nodes to those around: 26 a node, less twice those within."""
-    return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
-
-
 def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
     """Return the partition among ``ranks`` ranks, and the cells of the lattice that it was counted on.
 
     That lattice has about ``most`` cells where more are wanted, and its numbers are scaled.
     """
-    h = wanted.cell_size
-    area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
-    guess: float
-    if wanted.count is not None:
-        guess = wanted.count
-    else:
-        assert h is not None  # the schema has one of the two
-        guess = _cells(enclosed, 3 / 4 * area, h)  # as choose_cell_size does
-    if h and guess <= most:
-        size = h
-    else:
-        size = choose_cell_size(bodies, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
-    cages = fill(bodies, size, wanted.method, MOST, wanted.boundary)
-    partition = count_partition(bodies, cages, build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
+    h, cells = wanted.cell_size, float(wanted.count or 0)
+    if h is not None:  # inside the surface, and sticking out of it, as choose_cell_size has it
+        area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
+        cells = enclosed / h**3 + 3 / 4 * area / h**2
+    if h is None or cells > most:
+        h = choose_cell_size(bodies, int(min(cells, most)), wanted.method, MOST, wanted.boundary)
+    cages = fill(bodies, h, wanted.method, MOST, wanted.boundary)
+    partition = count_partition(build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
     counted = int(partition.cells.sum())
-    if guess > most:
-        cells = wanted.count
-        if cells is None:
-            assert h is not None
-            volume = enclosed if all(body.report.closed for body in bodies) else counted * size**3
-            cells = round(_cells(volume, (counted * size**3 - volume) / size, h))
-        partition = partition.scaled(cells)
-    return partition, counted
+    return partition.scaled(round(cells)) if cells > most else partition, counted
 
 
-def _cells(volume: float, area: float, h: float) -> float:
-    """Return how many cells of side h [m] fill a volume [m^3] and stick out of an area [m^2]."""
-    return volume / h**3 + area / h**2
-
-
-def count_partition(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice, ranks: int) -> Partition:
-    """Return the partition among ``ranks`` ranks; cages and lattice are whole, built on one rank."""
-    cell_rank = _ranks_of_cells(bodies, cages, ranks)
-    rank = _ranks_of_nodes(lattice, cell_rank, ranks)
+def count_partition(lattice: Lattice, ranks: int) -> Partition:
+    """Return the partition among ``ranks`` ranks of a lattice that is whole, built on one rank."""
+    cell_rank, rank = (np.arange(n) * ranks // n for n in (len(lattice.cells), lattice.owned))
     of_end = rank[lattice.springs]
     across = of_end[:, 0] != of_end[:, 1]
     to, node = of_end[across].ravel(), lattice.springs[across][:, ::-1].ravel()
@@ -137,32 +111,3 @@ def count_partition(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattic
         "neighbours": np.unique(holder * ranks + owner) // ranks,
     }
     return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
-
-
-def _ranks_of_cells(bodies: Sequence[BodySurface], cages: Cages, ranks: int) -> Indices:
-    """Return the rank (c,) of each cell; each rank first finds those of its slab along each body's longest side."""
-    grids, ijk, slab = cages.grids, cages.ijk, np.empty(len(cages.kind), np.int64)
-    of_cell = grids.body_of(ijk)
-    for number, (body, grid) in enumerate(zip(bodies, grids.grids, strict=True)):
-        axis, own = int(np.argmax(np.ptp(body.bounds, axis=0))), of_cell == number
-        slab[own] = Slab.owner((ijk[own] - grids.first(number))[:, axis], ranks, int(grid.shape[axis]))
-    keys = cages.table.keys
-    return _cut(keys, [keys[part] for part in _parts(slab, ranks)], ranks)
-
-
-def _ranks_of_nodes(lattice: Lattice, cell_rank: Indices, ranks: int) -> Indices:
-    """Return the rank (n,) of each node; each rank first finds the corners of its cells."""
-    keys = lattice.table.keys
-    return _cut(keys, [keys[np.unique(lattice.cells[part])] for part in _parts(cell_rank, ranks)], ranks)
-
-
-def _parts(rank: Indices, ranks: int) -> list[Indices]:
-    """Return what each rank has, in ascending order."""
-    return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank, minlength=ranks))[:-1])
-
-
-def _cut(keys: Indices, brought: list[Indices], ranks: int) -> Indices:
-    """Return the rank of each of the ascending keys, when the ranks have ``brought`` these to the sort."""
-    total = sum(map(len, brought))
-    sample = np.concatenate([sample_of(part, total, ranks) for part in brought])
-    return np.searchsorted(splitters_of(sample, ranks), keys, side="right")

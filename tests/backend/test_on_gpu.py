@@ -174,7 +174,7 @@ def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case:
 
 SMALLEST = {
     "sides": np.array([2, 1, 1]) * CELL,
-    "start": {"velocity": [0.3, 0, -3.0]},
+    "start": {"velocity": [0.3, 0, -3.0], "scale": [1, 1, 0.45]},  # cells resist
 }  # 12 threads: a simulated one is slow
 SIMULATED = {
     "pressed": {

@@ -44,30 +44,29 @@ def scene(ball: Path, tmp_path: Path) -> Path:
 
 def counted(scene: Path, cells: int, ranks: int) -> Partition:
     """What count_partition says."""
-    read = load_scene(scene, [f"cages.count={cells}"])
-    bodies = read_bodies(SELF, read)
-    cages = fill_cages(bodies, read)
-    return count_partition(bodies, cages, build_model(SELF, read).lattice, ranks)
+    return count_partition(build_model(SELF, load_scene(scene, [f"cages.count={cells}"])).lattice, ranks)
 
 
-def assert_counts_are_those_of_real_ranks(scene: Path, cells: int, rel: float) -> None:
+def assert_counts_are_near_those_of_real_ranks(scene: Path, cells: int, rel: float) -> None:
     held = scene.with_name("held.json")
     run(3, WORKER, scene, held, f"cages.count={cells}", status=0)
     real = json.loads(held.read_text())
-    found = counted(scene, cells, 3)
-    assert {name: getattr(found, name).tolist() for name in real} == real
+    found = {name: getattr(counted(scene, cells, 3), name) for name in real}
+    assert all(sum(found[name]) == sum(real[name]) for name in ("cells", "nodes"))
+    for name, rows in found.items():
+        np.testing.assert_allclose(rows, real[name], rtol=0.15, err_msg=name)
     assert min(real["ghosts"]) > 0 and sum(real["cells"]) == pytest.approx(cells, rel=rel)
 
 
-def test_the_counts_are_those_of_real_ranks(scene: Path, tmp_path: Path):
+def test_the_counts_are_near_those_of_real_ranks(scene: Path, tmp_path: Path):
     """Of several bodies, too: each has slabs of its own, along its own longest side."""
-    assert_counts_are_those_of_real_ranks(scene, 3000, 0.01)
+    assert_counts_are_near_those_of_real_ranks(scene, 3000, 0.01)
     turned = "{ rotate = { axis = [0, 1, 0], degrees = 90 } }"
     (tmp_path / "bar.obj").write_text((ROOT / "scenes/studies/beam.obj").read_text())
     bodies = [f"{{ mesh = {{ source = 'bar.obj', prepare = [{turn}] }} }}" for turn in ("", turned)]
     text = scene.read_text().replace('mesh = { source = "ball.ply" }', f"body = [{', '.join(bodies)}]")
     scene.write_text(text)
-    assert_counts_are_those_of_real_ranks(scene, 2000, 0.2)
+    assert_counts_are_near_those_of_real_ranks(scene, 2000, 0.2)
 
 
 def test_what_is_scaled_is_near_what_is_counted(scene: Path):

@@ -9,7 +9,7 @@ import trimesh
 from block_scene import block_scene, play
 from crossings import count_crossings
 
-from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
+from msmpetsc.contact.surface.barrier import Acting, Barrier, BarrierLaw, energy_of, gradient_of, hessian_of
 from msmpetsc.geometry.surface import Surface
 
 LONG, HIGH, BOTTOM, HALF = 0.5, 0.25, 0.0625, 0.07  # [m]: of a block, of the groove's bottom, and its half width
@@ -69,17 +69,17 @@ def test_the_derivatives_in_a_crease_are_those_of_its_energy():
     direction = np.random.default_rng(0).normal(size=points.shape)
     candidates, step = barrier.candidates(points, 0.01), 1e-7
 
-    def at(share: float) -> tuple[ContactSets, np.ndarray]:
+    def at(share: float) -> tuple[list[Acting], np.ndarray]:
         moved = points + share * step * direction
-        return barrier.contacts(candidates, moved), moved
+        return barrier.pushing(barrier.contacts(candidates, moved)), moved
 
-    slope = (barrier.energy(*at(1)) - barrier.energy(*at(-1))) / (2 * step)
-    gradient = barrier.gradient(*at(0))
+    slope = (energy_of(*at(1)) - energy_of(*at(-1))) / (2 * step)
+    gradient = gradient_of(*at(0))
     assert slope == pytest.approx(np.vdot(gradient, direction), rel=1e-5) and np.abs(gradient).max() > 0
-    bend = (barrier.gradient(*at(1)) - barrier.gradient(*at(-1))) / (2 * step)
-    product = sum(barrier.hessian(*at(0), False)) @ direction.ravel()
+    bend = (gradient_of(*at(1)) - gradient_of(*at(-1))) / (2 * step)
+    product = sum(hessian_of(*at(0), False)) @ direction.ravel()
     np.testing.assert_allclose(product, bend.ravel(), atol=1e-5 * np.abs(product).max())
-    assert 0 < barrier.least(*at(0)) < DISTANCE / 4
+    assert 0 < barrier.least(barrier.contacts(candidates, points), points) < DISTANCE / 4
 
 
 def test_walls_are_clear_as_long_as_they_cannot_come_near():

@@ -100,7 +100,7 @@ def build(
     middle = cells[:, 0].mean()
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:
-        uniform = CellMaterial.uniform(len(ijk), density, young, poisson or 0.25)
+        uniform = CellMaterial(*(np.full(len(ijk), value) for value in (density, young, poisson or 0.25)))
         return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * young)
 
     more = {"stiffening": stiffening, "poisson": poisson}

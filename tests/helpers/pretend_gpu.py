@@ -19,8 +19,8 @@ from msmpetsc.solve.petsc import device, memory
 
 # what CuPy 13 has of NumPy's functions, of those that the steps call
 KNOWN = [
-    "array_equal", "asarray", "bincount", "concatenate", "copyto", "einsum", "empty", "empty_like", "flatnonzero",
-    "linalg.norm", "tile", "vdot", "where", "zeros", "zeros_like",
+    "array_equal", "asarray", "bincount", "concatenate", "copyto", "cross", "einsum", "empty", "empty_like",
+    "flatnonzero", "linalg.norm", "tile", "vdot", "where", "zeros", "zeros_like",
 ]  # fmt: skip
 FEW = 9  # numbers are no array that grows with a body
 counted = Counter()

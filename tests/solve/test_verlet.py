@@ -14,7 +14,6 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
-from msmpetsc.lattice.initial_state import at_rest
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Solver
@@ -30,7 +29,7 @@ EXPLICIT = {"integrator": "verlet"}
 
 
 def integrator(lattice: Lattice, substep: float | None = None) -> Verlet:
-    model = Model(None, lattice, None, [], [], [], [], at_rest(lattice))
+    model = Model(None, lattice, None, [], [], [], [], (lattice.nodes, np.zeros_like(lattice.nodes)))
     time = Time(step=T, duration=1.0, substep=substep, **EXPLICIT)
     return Verlet(COMM, Environment(model), time, Solver(), "")
 

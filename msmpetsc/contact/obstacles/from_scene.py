@@ -1,15 +1,14 @@
 """From a scene's tables to obstacles."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Rows
+from msmpetsc.backend.arrays import Floats
 from msmpetsc.comm import log, on_root, together
 from msmpetsc.constraints.loads import Motion
-from msmpetsc.contact.obstacles.distance import DistanceSolid, FunctionSolid
+from msmpetsc.contact.obstacles.distance import FunctionSolid
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Solid
 from msmpetsc.errors import InputError
@@ -45,19 +44,6 @@ def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Flo
                     raise InputError(f"{key}.function: no signed distance: {wrong}")
         obstacles.append(Obstacle(solid, path, table.start, table.stop, key, outside))
     return obstacles
-
-
-def surfaces_of(comm: MPI.Comm, obstacles: Sequence[Obstacle], bounds: Rows) -> dict[int, Surface]:
-    """Return on rank 0 the surfaces of obstacles that are meshes or functions, by their numbers (collective).
-
-    bounds : (b, 2, 3) corners of the box around each body at rest [m]
-    """
-    numbered = enumerate(obstacle.solid for obstacle in obstacles)
-    solids = {number: solid for number, solid in numbered if isinstance(solid, DistanceSolid)}
-    if not solids:
-        return {}
-    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-    return on_root(comm, lambda: {number: solid.surface(low, high) for number, solid in solids.items()}) or {}
 
 
 def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:

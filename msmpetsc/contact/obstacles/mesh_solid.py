@@ -1,6 +1,5 @@
 """The inside of a closed surface mesh as a solid."""
 
-from collections.abc import Callable
 from weakref import finalize
 
 import igl
@@ -12,10 +11,6 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.solids import TINY
 from msmpetsc.geometry.surface import Surface
-
-# of triangles (n, 3, 3), each with a point (n, 3); trimesh says no types
-NEAREST_POINTS: Callable[[Rows, Positions], Positions] = closest_point
-BARYCENTRIC: Callable[[Rows, Positions], Rows] = points_to_barycentric
 
 ON_AN_EDGE = 1e-9  # barycentric
 ROUNDED = 1e-14  # of the largest coordinate: a nearest point that is no farther gives no direction
@@ -60,7 +55,7 @@ class MeshSolid(DistanceSolid):
         return depths, face
 
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        out = NEAREST_POINTS(self.points[self.triangles[face]], q) - q
+        out = closest_point(self.points[self.triangles[face]], q) - q
         depth = np.linalg.norm(out, axis=1)
         on_surface = depth <= ROUNDED * np.abs(self._bounds).max()
         normals = out / np.maximum(depth, TINY)[:, None]
@@ -68,7 +63,7 @@ class MeshSolid(DistanceSolid):
 
     def _pseudonormals(self, on_surface: Positions, face: Indices) -> Rows:
         """Return directions (n, 3) outwards at points (n, 3) of triangles (n,)."""
-        weights = BARYCENTRIC(self.points[self.triangles[face]], on_surface)
+        weights = points_to_barycentric(self.points[self.triangles[face]], on_surface)
         zero = weights < ON_AN_EDGE
         count, normals = zero.sum(axis=1), self._normals[face]
         edge, corner = count == 1, count > 1

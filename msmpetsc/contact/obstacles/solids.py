@@ -52,65 +52,64 @@ class Solid(ABC):
         return self
 
 
-@numba.njit(cache=True)
-def behind(x: Positions, points: Positions, normals: Rows, face: int) -> float:
-    """Return how far x (3,) lies behind a face [m]; negative in front of it."""
-    distance = 0.0
-    for c in range(3):
-        distance -= normals[face, c] * (x[c] - points[face, c])
-    return distance
+@numba.njit(cache=True, inline="always")
+def behind(q: Positions, i: int, points: Positions, normals: Rows, face: int) -> float:
+    """Return how far the position q[i] (3,) lies behind a face [m]; negative in front of it."""
+    distance = -normals[face, 0] * (q[i, 0] - points[face, 0])
+    distance -= normals[face, 1] * (q[i, 1] - points[face, 1])
+    return distance - normals[face, 2] * (q[i, 2] - points[face, 2])
 
 
-@numba.njit(cache=True)
-def depth(x: Positions, points: Positions, normals: Rows, side: int) -> tuple[float, int]:
-    """Return how deep x (3,) lies behind the face of its ``side`` [m], and that face.
+@numba.njit(cache=True, inline="always")
+def depth(q: Positions, i: int, points: Positions, normals: Rows, side: int) -> tuple[float, int]:
+    """Return how deep q[i] (3,) lies behind the face of its ``side`` [m], and that face.
 
     Without a side: how deep in the solid, not positive outside, and the nearest face.
     """
     if side > 0:
-        return behind(x, points, normals, side - 1), side - 1
+        return behind(q, i, points, normals, side - 1), side - 1
     least, face = np.inf, 0
     for f in range(len(points)):
-        distance = behind(x, points, normals, f)
+        distance = behind(q, i, points, normals, f)
         if distance < least:
             least, face = distance, f
     return least, face
 
 
 @numba.njit(cache=True)
-def _stays(x: Positions, points: Positions, normals: Rows, face: int) -> bool:
-    """Return whether x lies behind a face and has not slid off it past another.
+def _stays(q: Positions, i: int, points: Positions, normals: Rows, face: int) -> bool:
+    """Return whether q[i] lies behind a face and has not slid off it past another.
 
     The opposite face is left aside: that of a thin plate may be passed.
     """
-    if behind(x, points, normals, face) <= 0.0:
+    if behind(q, i, points, normals, face) <= 0.0:
         return False
     for f in range(len(points)):
         along = 0.0
         for c in range(3):
             along += normals[f, c] * normals[face, c]
-        if along > OPPOSITE and behind(x, points, normals, f) <= 0.0:
+        if along > OPPOSITE and behind(q, i, points, normals, f) <= 0.0:
             return False
     return True
 
 
 @numba.njit(cache=True)
-def side_of(x: Positions, end: Positions, points: Positions, normals: Rows, side: int) -> int:
-    """Return 1 + the face by which a node is in contact on its straight way from x to ``end`` (3,), 0 if it meets none.
+def side_of(q: Positions, end: Positions, i: int, points: Positions, normals: Rows, side: int) -> int:
+    """Return 1 + the face by which a node is in contact on its straight way from q[i] to end[i], 0 if it meets none.
 
     side : by which it was before: it keeps that until it is out of the solid
 
     It is the node that counts here, however far it sticks out of the surface: with a side, but no
     depth yet, it is on its way in, or out again.
     """
-    if side > 0 and _stays(x, points, normals, side - 1):
+    if side > 0 and _stays(q, i, points, normals, side - 1):
         return side
-    inside, face = depth(x, points, normals, 0)
+    inside, face = depth(q, i, points, normals, 0)
     if inside > 0.0:
         return face + 1
     enter, leave, side = -1.0, 1.0, 0  # fractions of the way
     for f in range(len(points)):
-        first, last = behind(x, points, normals, f), behind(end, points, normals, f)
+        first, last = behind(q, i, points, normals, f), behind(end, i, points, normals, f)
         if first <= 0.0:
             if last < 0.0 or last == first:
                 return 0
@@ -123,25 +122,15 @@ def side_of(x: Positions, end: Positions, points: Positions, normals: Rows, side
 
 
 @kernel
-def _depths_of(
-    first: int, count: int, step: int, q: Rows, points: Rows, normals: Rows, sides: Indices, depths: Rows, face: Indices
-) -> None:
-    if len(points) > 1:
-        for i in range(first, count, step):
-            depths[i], face[i] = depth(q[i], points, normals, sides[i])
-        return
-    a, b, c = normals[0, 0], normals[0, 1], normals[0, 2]
-    for i in range(first, count, step):  # a plane, in a tenth of the time
-        distance = -(a * (q[i, 0] - points[0, 0])) - b * (q[i, 1] - points[0, 1])
-        depths[i], face[i] = distance - c * (q[i, 2] - points[0, 2]), 0
+def _depths_of(first, count, step, q, points, normals, sides, depths, face):
+    for i in range(first, count, step):
+        depths[i], face[i] = depth(q, i, points, normals, sides[i])
 
 
 @kernel
-def _sides_of(
-    first: int, count: int, step: int, q: Rows, end: Rows, points: Rows, normals: Rows, before: Indices, sides: Indices
-) -> None:
+def _sides_of(first, count, step, q, end, points, normals, before, sides):
     for i in range(first, count, step):
-        sides[i] = side_of(q[i], end[i], points, normals, before[i])
+        sides[i] = side_of(q, end, i, points, normals, before[i])
 
 
 @dataclass(frozen=True)

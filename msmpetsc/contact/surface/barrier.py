@@ -13,7 +13,7 @@ ipctk is used on one thread, so that sums are the same each time; its arrays are
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -127,31 +127,29 @@ class Barrier:
         pairs.build(candidates, self.mesh, np.asfortranarray(points), distance)
         return pairs
 
-    def pushing(self, contacts: ContactSets) -> list[tuple["ipctk.BarrierPotential", "ipctk.NormalCollisions"]]:
+    def pushing(self, contacts: ContactSets) -> "list[Acting]":
         """Return the sets that are not empty, each with its barrier."""
-        return [(p, pairs) for p, pairs in zip(self.potentials, contacts, strict=True) if not pairs.empty()]
+        kinds = zip(self.potentials, contacts, strict=True)
+        return [Acting(potential, pairs, self.mesh) for potential, pairs in kinds if not pairs.empty()]
 
-    def energy(self, contacts: ContactSets, points: Positions) -> float:
-        """Return the barriers' energy [J]."""
-        points = np.asfortranarray(points)
-        return float(sum(potential(pairs, self.mesh, points) for potential, pairs in self.pushing(contacts)))
+    def rubbing(self, contacts: ContactSets, start: Positions, stick: float) -> "list[Acting]":
+        """Return Coulomb's friction between parts of the surface in one step, lagged: of the contacts where the step
+        starts, with their push there. It is a potential of the slip S - S_n, of the same law as an obstacle's
+        (obstacles.friction).
 
-    def gradient(self, contacts: ContactSets, points: Positions) -> Rows:
-        """Return its gradient (p, 3) [N]."""
-        gradient, points = np.zeros(points.size), np.asfortranarray(points)
-        for potential, pairs in self.pushing(contacts):
-            gradient += potential.gradient(pairs, self.mesh, points)
-        return gradient.reshape(-1, 3)
-
-    def hessian(self, contacts: ContactSets, points: Positions, projected: bool) -> "list[csc_matrix]":
-        """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
-        kinds, points = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
-        kind = kinds.CLAMP if projected else kinds.NONE
-        return [potential.hessian(pairs, self.mesh, points, kind) for potential, pairs in self.pushing(contacts)]
+        contacts : where the step starts, the points at ``start`` (p, 3) [m]
+        stick    : slip [m] below which it fades to nothing
+        """
+        friction, rubbing = self.ipctk.FrictionPotential(stick), []
+        for potential, pairs, mesh, _ in self.pushing(contacts):
+            tangential = self.ipctk.TangentialCollisions()  # its normals and pushes stay
+            tangential.build(mesh, np.asfortranarray(start), pairs, potential, self.law.friction)
+            rubbing.append(Acting(friction, tangential, mesh, start))
+        return rubbing
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite where there are no contacts."""
-        return min((self._least(pairs, points) for _, pairs in self.pushing(contacts)), default=np.inf)
+        return min((self._least(pairs, points) for _, pairs, *_ in self.pushing(contacts)), default=np.inf)
 
     def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
@@ -197,43 +195,40 @@ class Barrier:
         return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
 
 
-class SurfaceFriction:
-    """Coulomb's friction between parts of the surface in one step, lagged: of the contacts where the step starts, with
-    their push there. It is a potential of the slip S - S_n, of the same law as an obstacle's (obstacles.friction).
+class Acting(NamedTuple):
+    """A potential [J] of pairs: a barrier of the points S (p, 3) [m], or friction of their slip from ``start``."""
 
-    contacts : where the step starts, the points at ``start`` (p, 3) [m]
-    stick    : slip [m] below which it fades to nothing
-    """
+    potential: Any
+    pairs: Any
+    mesh: "ipctk.CollisionMesh"
+    start: Positions | None = None
 
-    def __init__(self, barrier: Barrier, contacts: ContactSets, start: Positions, stick: float):
-        library, self.mesh, self.start = barrier.ipctk, barrier.mesh, start
-        self.contacts: list[ipctk.TangentialCollisions] = []
-        for potential, pairs in barrier.pushing(contacts):
-            self.contacts.append(library.TangentialCollisions())
-            self.contacts[-1].build(
-                self.mesh, np.asfortranarray(start), pairs, potential, barrier.law.friction
-            )  # its normals and pushes stay
-        self.potential = library.FrictionPotential(stick)
+    def at(self, points: Positions) -> tuple[Any, "ipctk.CollisionMesh", Positions]:
+        """Return what the potential takes for its value."""
+        return self.pairs, self.mesh, np.asfortranarray(points if self.start is None else points - self.start)
 
-    def energy(self, points: Positions) -> float:
-        """Return the potential [J] of points that came to S (p, 3) [m]."""
-        slip = self._slip(points)
-        return float(sum(self.potential(pairs, self.mesh, slip) for pairs in self.contacts))
 
-    def gradient(self, points: Positions) -> Rows:
-        """Return its gradient (p, 3) [N]."""
-        slip, gradient = self._slip(points), np.zeros(points.size)
-        for pairs in self.contacts:
-            gradient += self.potential.gradient(pairs, self.mesh, slip)
-        return gradient.reshape(-1, 3)
+def energy_of(acting: list[Acting], points: Positions) -> float:
+    """Return the sum of potentials [J] at points S (p, 3) [m]."""
+    return float(sum(each.potential(*each.at(points)) for each in acting))
 
-    def hessian(self, points: Positions) -> "list[csc_matrix]":
-        """Return the terms (3p, 3p) [N/m] of its Hessian, which is positive semidefinite."""
-        slip = self._slip(points)
-        return [self.potential.hessian(pairs, self.mesh, slip) for pairs in self.contacts]
 
-    def _slip(self, points: Positions) -> Rows:
-        return np.asfortranarray(points - self.start)
+def gradient_of(acting: list[Acting], points: Positions) -> Rows:
+    """Return the gradient (p, 3) [N] of potentials."""
+    gradient = np.zeros(points.size)
+    for each in acting:
+        gradient += each.potential.gradient(*each.at(points))
+    return gradient.reshape(-1, 3)
+
+
+def hessian_of(acting: list[Acting], points: Positions, projected: bool) -> "list[csc_matrix]":
+    """Return the terms (3p, 3p) [N/m] of the Hessian; ``projected`` leaves out the negative part of each pair, of which
+    friction has none."""
+    import ipctk
+
+    kinds = ipctk.PSDProjectionMethod
+    clamped = [kinds.CLAMP if projected and each.start is None else kinds.NONE for each in acting]
+    return [each.potential.hessian(*each.at(points), kind) for each, kind in zip(acting, clamped, strict=True)]
 
 
 def _kept(share: float) -> float:

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs, energy_of
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -215,7 +215,7 @@ class Contacts:
         touch = Touch()
         if self.barrier and moment.contacts is not None and moment.points is not None and moment.count:
             least = self.barrier.least(moment.contacts, moment.points)
-            touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))
+            touch = Touch(moment.count, least, energy_of(self.barrier.pushing(moment.contacts), moment.points))
         of_all: Touch = self.comm.bcast(touch)
         return of_all
 

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
-from msmpetsc.contact.surface.barrier import SurfaceFriction
+from msmpetsc.contact.surface.barrier import Acting, energy_of, gradient_of, hessian_of
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.points import Carried
 
@@ -73,21 +73,21 @@ class SurfaceHessian:
 class SurfaceContact:
     """Self-contact in one step. All methods are collective; positions are (owned or more, 3) [m].
 
-    rubs     : there is friction
-    friction : of the step, on rank 0
+    rubs    : there is friction
+    rubbing : friction of the step, on rank 0
     """
 
     def __init__(self, contacts: Contacts, start: Positions, time_step: float):
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
-        self.friction: SurfaceFriction | None = None
+        self.rubbing: list[Acting] = []
         self._hessians: dict[bool, tuple[ContactsAt, SurfaceHessian]] = {}  # with and without their negative parts
         if contacts.law.friction > 0:
             moment, barrier = contacts.find(start), contacts.barrier
             self.rubs = moment.count > 0
             if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
                 stick = contacts.law.stick * time_step
-                self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
+                self.rubbing = barrier.rubbing(moment.contacts, moment.points, stick)
 
     def _acting(self, q: Positions) -> ContactsAt | None:
         """Return the contacts at q, with the points for friction; None where nothing acts."""
@@ -115,13 +115,14 @@ class SurfaceContact:
         return self._energy(after) - self._energy(before)
 
     def _energy(self, moment: ContactsAt | None) -> float:
-        barrier = self.contacts.barrier
-        energy = 0.0
-        if moment is None or barrier is None or moment.points is None:
+        if moment is None or moment.points is None:
             return 0.0
-        if moment.contacts is not None:
-            energy += barrier.energy(moment.contacts, moment.points)
-        return energy + (self.friction.energy(moment.points) if self.friction else 0.0)
+        return energy_of(self._pushing(moment), moment.points) + energy_of(self.rubbing, moment.points)
+
+    def _pushing(self, moment: ContactsAt) -> list[Acting]:
+        """Return the barriers that act, on rank 0."""
+        barrier = self.contacts.barrier
+        return barrier.pushing(moment.contacts) if barrier and moment.contacts is not None else []
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
@@ -134,14 +135,9 @@ class SurfaceContact:
 
     def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
         """Return on rank 0 the points (k,) that are pushed, and the gradient there (k, 3) [N]."""
-        barrier = self.contacts.barrier
-        if barrier is None or moment.points is None:
+        if self.contacts.barrier is None or moment.points is None:
             return None
-        forces = np.zeros_like(moment.points)
-        if moment.contacts is not None:
-            forces += barrier.gradient(moment.contacts, moment.points)
-        if self.friction:
-            forces += self.friction.gradient(moment.points)
+        forces = gradient_of(self._pushing(moment), moment.points) + gradient_of(self.rubbing, moment.points)
         touched = np.flatnonzero(forces.any(axis=1))
         return touched, forces[touched]
 
@@ -173,11 +169,9 @@ class SurfaceContact:
 
     def _curvature(self, moment: ContactsAt, projected: bool) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
-        barrier = self.contacts.barrier
-        if barrier is None or moment.points is None:
+        if self.contacts.barrier is None or moment.points is None:
             return None
-        parts = barrier.hessian(moment.contacts, moment.points, projected) if moment.contacts is not None else []
-        parts += self.friction.hessian(moment.points) if self.friction else []
+        parts = hessian_of([*self._pushing(moment), *self.rubbing], moment.points, projected)
         whole = csr_array(sum(parts))
         touched = np.flatnonzero(np.diff(whole.indptr).reshape(-1, 3).any(axis=1))
         numbers = (3 * touched[:, None] + np.arange(3)).ravel()

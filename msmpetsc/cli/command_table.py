@@ -205,19 +205,18 @@ COMMANDS = {
         "find the cheapest options that meet an error of the surface",
         (
             "msmpetsc plan my.toml --surface-error 0.1 --write",
-            "msmpetsc plan my.toml --surface-error 0.03 --frames 10 --chart out/plan.png",
+            "msmpetsc plan my.toml --surface-error 0.03 --frames 10",
         ),
         (
             SCENE,
             argument(
-                "--surface-error", type=float, metavar="E", required=True,
-                help="error of the surface, of its largest displacement: cells, step and solver together",
+                "--surface-error", type=float, metavar="E", default=0.1,
+                help="error of the surface, of its largest displacement: cells, step and solver together (0.1)",
             ),
             whole("--frames", "N", "of the scene's steps, the first N (20)", default=20),
             ranks("MPI ranks of the trials"),
             switch("--write", "put the answer into the scene file"),
             whole("--cells", "N", "of the finest trial; the scene's count"),
-            argument("--chart", type=checked_file, metavar="OUT.png", help="draw error over cost of all trials"),
             JSON,
         ),
         description="Try lattices, integrators, time steps and errors of a step on the first frames of a scene, and "

@@ -9,7 +9,6 @@ from contextlib import closing, nullcontext, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 
-from msmpetsc.app.checks import PICTURE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import launcher
@@ -28,14 +27,8 @@ def run(args: argparse.Namespace) -> int:
     target = args.surface_error
     if not 0 < target < 1:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
-    refuse_other_format("--chart", args.chart, PICTURE_NAMES)
     with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
         plan = size_all(args, target)
-        if args.chart:
-            from msmpetsc.study.charts.pareto import plan_picture
-
-            plan_picture(plan, target, args.chart)
-            print(f"drawn: {args.chart}")
         print_size(plan, target)
         command = print_command(args, plan.choice, target) if plan.met else None
     record = {

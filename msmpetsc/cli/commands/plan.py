@@ -31,9 +31,10 @@ def run(args: argparse.Namespace) -> int:
         plan = size_all(args, target)
         print_size(plan, target)
         command = print_command(args, plan.choice, target) if plan.met else None
+    tried = [{"method": each.method.integrator, "cells": each.cells, "cost": each.cost} for each in plan.tried]
     record = {
         "met": plan.met, "target": target, "choice": asdict(plan.choice), "error": plan.choice.budget.total,
-        "bounds": plan.bounds, "tried": [each._asdict() for each in plan.tried], "command": command,
+        "bounds": plan.bounds, "tried": tried, "command": command,
     }  # fmt: skip
     if args.json:
         print(json.dumps(record, indent=1, default=str))  # of paths the names

@@ -88,8 +88,8 @@ def print_size(plan: SizePlan, target: float) -> None:
     if choice.method.integrator == STATIC:
         cost = f"{choice.cost * choice.method.time_step:.3g} computing seconds a state"
     print(f"{cost}, surface error {choice.budget.total:.1e}")
-    print(f"{'part':16} {'error':>9} {'of the cost':>11}")
+    print(f"{'part':16} {'error':>9}")
     for name, error in vars(choice.budget).items():
-        print(f"{name:16} {error:9.1e} {100 * getattr(choice.shares, name):10.0f}%")
+        print(f"{name:16} {error:9.1e}")
     for bound in plan.bounds:
         print(f"what bounds it: {bound}")

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """The measures of a tree of msmpetsc: rooms, functions, names, density of lines, findings.
 
-    scripts/house.py [FOLDER] [--before FOLDER] [--quick] [-o PAGE]
+    scripts/house.py [FOLDER] [--quick] [-o PAGE]
 
-FOLDER is a clone, this one if none is given; --before puts an older one's column beside it. --quick leaves out
-mypy, whose rules are this clone's. A walk counts the functions, and the modules that they stand
-in, which take a value of such a type: a Scene, or the request as Namespace or Request.
+FOLDER is a clone, this one if none is given. --quick leaves out mypy, whose rules are this clone's. A walk counts the
+functions, and the modules that they stand in, which take a value of such a type: a Scene, or the request as Namespace
+or Request.
 """
 
 import ast
@@ -167,14 +167,11 @@ def measures(folder: Path, quick: bool) -> dict[str, object]:
 def main() -> None:
     options = lab.parser(__doc__)
     options.add_argument("folder", nargs="?", type=Path, default=ROOT, metavar="FOLDER", help="a clone (this one)")
-    options.add_argument("--before", type=Path, metavar="FOLDER", help="an older clone for the first column")
     options.add_argument("--quick", action="store_true", help="read files only")
     args = options.parse_args()
-    folders = {"before": args.before, "after": args.folder} if args.before else {"now": args.folder}
-    columns = {title: measures(folder.resolve(), args.quick) for title, folder in folders.items()}
+    found = measures(args.folder.resolve(), args.quick)
     with lab.page(args):
-        names = list(dict.fromkeys(name for column in columns.values() for name in column))
-        lab.table({"measure": name} | {title: of.get(name) for title, of in columns.items()} for name in names)
+        lab.table({"measure": name, "now": value} for name, value in found.items())
 
 
 if __name__ == "__main__":

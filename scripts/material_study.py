@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Both laws against elasticity at small strain, Poisson's ratio 1/4.
 
-    scripts/material_study.py [beam wave flight round turned ball] [-o PAGE]
+    scripts/material_study.py [beam wave round turned ball] [-o PAGE]
 
-Of boxes that lie along the grid: a clamped beam, a wave, free flight. Of bodies that do not, whole boundary cells
+Of boxes that lie along the grid: a clamped beam, a wave. Of bodies that do not, whole boundary cells
 beside those by their fill, and the neo-Hookean solid: clamped bars, round and turned, and the frequency of a ball; of
 bars the mean over places of the grid, and in brackets how far these are apart. Static problems and eigenfrequencies
-use the Hessian of E at rest, the wave and the free flight the product's own steps. All errors are relative.
+use the Hessian of E at rest, the wave the product's own steps. All errors are relative.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -22,7 +22,6 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.sparse import coo_array, csc_array, diags
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
-from scipy.spatial.transform import Rotation
 from scipy.special import spherical_jn
 
 from msmpetsc.elasticity.energy import Elasticity
@@ -189,7 +188,7 @@ def lattice_beam(across: int, poisson: float | None = SPRINGS) -> tuple[float, f
     return clamped.sag(BEAM * WIDTH), clamped.frequency()
 
 
-# ---- steps of the product: a compression wave in a bar, and free flight
+# ---- steps of the product: a compression wave in a bar
 
 
 def steps(
@@ -238,48 +237,6 @@ def wave_speeds(times: np.ndarray, v: np.ndarray) -> tuple[float, float, float]:
         peak.append(times[near[1]] - b / (2 * a))
     of_centre, of_peak = np.diff(STATIONS) * CELL / np.diff([centre, peak])[:, 0] / SPEED - 1
     return of_centre, of_peak, v[:, 1].max() / v[:, 0].max()
-
-
-SHAKE = 0.1  # of the runs whose momentum is shown [m/s]
-
-
-def free_flight(
-    time_step: float, shake: float = 0.0, error: float = 1e-10, poisson: float | None = SPRINGS
-) -> tuple[float, float, float]:
-    """Drift of momentum and loss of angular momentum in a second, and the loss of a rigid body (``rigid_loss``).
-
-    A block of 4 x 3 x 2 cells of 0.1 m thrown at 1 m/s, spinning at 2 rad/s about its shortest side.
-
-    shake : standard deviation of random node velocities [m/s]. A body that stays symmetric about its middle keeps
-            its momentum whatever the solver does, a shaken one need not
-    """
-    lattice = box((4, 3, 2), 0.1, poisson)
-    mass, spin, throw, count = lattice.mass, 2.0, np.array([0.6, -0.48, 0.64]), round(1 / time_step)
-    middle, turn = mass @ lattice.nodes / mass.sum(), Rotation.from_rotvec([0, 0, -spin * time_step])
-    velocity = throw + shake * np.random.default_rng(0).standard_normal(lattice.nodes.shape)
-    q, before = lattice.nodes, turn.apply(lattice.nodes - middle) + middle - velocity * time_step
-
-    def momenta(q: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, float]:
-        each = mass[:, None] * (q - before) / time_step
-        return each.sum(axis=0), np.cross(q - mass @ q / mass.sum(), each)[:, 2].sum()
-
-    start, spin_start = momenta(q, before)
-    *_, last = steps(lattice, time_step, q, before, count * [np.zeros_like(q)], error)
-    end, spin_end = momenta(*last)
-    drift = float(np.linalg.norm(end - start) / np.linalg.norm(start))
-    return drift, 1 - spin_end / spin_start, rigid_loss(spin * time_step, count)
-
-
-def rigid_loss(angle: float, steps: int) -> float:
-    """Angular momentum that implicit Euler takes from a rigid body turning by ``angle`` a step, as a share.
-
-    Central forces make no torque, so sum_i x_(n+1) x M (x_(n+1) - 2 x_n + x_(n-1)) = 0: with a_n the n-th turn
-    sin(a_n + a_(n-1)) = 2 sin a_n. The momentum goes as sin a_n; da/dn = -a^3 for small ones.
-    """
-    last = angle
-    for _ in range(steps):
-        last = np.arctan2(np.sin(last), 2 - np.cos(last))
-    return 1 - np.sin(last) / np.sin(angle)
 
 
 # ---- bodies that do not lie along the grid
@@ -358,17 +315,6 @@ def wave_rows(poisson: float | None) -> lab.Rows:
         yield {"c t / h": courant} | speeds | {"height left": f"{height:.2f}"}
 
 
-def flight_rows(poisson: float | None) -> lab.Rows:
-    sizes, losses = [1 / 50, 1 / 100, 1 / 200, 1 / 400], []
-    columns = ("angular momentum in 1 s", "rigid body under implicit Euler")
-    for t in sizes:
-        losses.append(free_flight(t, poisson=poisson)[1:])
-        row = {"t [s]": f"1/{1 / t:.0f}", "momentum": f"{free_flight(t, SHAKE, poisson=poisson)[0]:.0e}"}
-        yield row | {name: percent(-loss, 3) for name, loss in zip(columns, losses[-1], strict=True)}
-    slopes = (f"{slope(sizes, of_size):.2f}" for of_size in np.transpose(losses))
-    yield {"t [s]": "slope"} | dict(zip(columns, slopes, strict=True))
-
-
 def of_both(rows: Callable[[float | None], lab.Rows]) -> lab.Rows:
     """Rows of both laws."""
     for name, poisson in LAWS.items():
@@ -401,7 +347,6 @@ def ball_rows() -> lab.Rows:
 TABLES: dict[str, Callable[[], lab.Rows]] = {
     "beam": lambda: of_both(beam_rows),
     "wave": lambda: of_both(wave_rows),
-    "flight": lambda: of_both(flight_rows),
     "round": lambda: bar_rows(round_bar(), ROUND_SAG, (2 / 3, 0.4, 1 / 3, 1 / 4, 1 / 6)),
     "turned": lambda: bar_rows(turned_bar(), SQUARE_SAG, (0.5, 1 / 3, 1 / 4, 1 / 6)),
     "ball": ball_rows,

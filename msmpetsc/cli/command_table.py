@@ -16,9 +16,10 @@ Argument = tuple[tuple[str, ...], dict[str, Any]]  # names and keywords, as argp
 class Command:
     """A command.
 
-    exclusive : arguments of which only one may be given
-    alone     : why it is for one process, if it is
-    module    : in ``commands``, that carries it out; that of its name if empty
+    exclusive   : arguments of which only one may be given
+    on_ranks    : whether mpiexec may start it; the others are for one process
+    starts_runs : whether it starts runs of its own
+    module      : in ``commands``, that carries it out; that of its name if empty
     """
 
     help: str
@@ -26,7 +27,8 @@ class Command:
     arguments: tuple[Argument, ...] = ()
     exclusive: tuple[Argument, ...] = ()
     description: str | None = None
-    alone: str = ""
+    on_ranks: bool = False
+    starts_runs: bool = False
     module: str = ""
 
 
@@ -92,7 +94,6 @@ def whole(name: str, value: str, about: str, **keywords: Any) -> Argument:
     return argument(name, type=at_least_1, metavar=value, help=about, **keywords)
 
 
-RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 SHELLS = ("bash", "zsh", "fish")
 SCENE = argument("scene", type=checked_path, metavar="SCENE", help="scene file (TOML)")
 SET = argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000")
@@ -159,7 +160,6 @@ COMMANDS = {
         ),
         description="Measure a mesh and write a commented scene that runs at once, or copy one that comes with "
         "msmpetsc; beside it the schema by which editors complete its keys.",
-        alone="it measures a mesh on one process",
     ),
     "run": Command(
         "simulate a scene",
@@ -175,13 +175,13 @@ COMMANDS = {
             argument("--list-presets", action=Shown, const=listed_presets, help="say what each preset is for"),
         ),
         description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options (one dash) may follow.",
+        on_ranks=True,
     ),
     "inspect": Command(
         "say what a scene would need on so many ranks",
         ("msmpetsc inspect my.toml --ranks 64", "msmpetsc inspect my.toml --json"),
         (SCENE, ranks("MPI ranks (1)"), SET, JSON),
         description="Count cells, nodes, springs, ghosts and messages of each rank, and expect its memory.",
-        alone="it counts for --ranks R on one process",
     ),
     "study": Command(
         "sweep methods over scenes",
@@ -199,30 +199,29 @@ COMMANDS = {
         ),
         "Run the cases of a study, each in its own process, into a table and a report. "
         "Stopped, the same command goes on.",
-        alone=RUNS_ITSELF,
+        starts_runs=True,
     ),
     "plan": Command(
         "find the cheapest options that meet an error of the surface",
         (
             "msmpetsc plan my.toml --surface-error 0.1 --write",
-            "msmpetsc plan my.toml --surface-error 0.03 --frames 10 --chart out/plan.png",
+            "msmpetsc plan my.toml --surface-error 0.03 --frames 10",
         ),
         (
             SCENE,
             argument(
-                "--surface-error", type=float, metavar="E", required=True,
-                help="error of the surface, of its largest displacement: cells, step and solver together",
+                "--surface-error", type=float, metavar="E", default=0.1,
+                help="error of the surface, of its largest displacement: cells, step and solver together (0.1)",
             ),
             whole("--frames", "N", "of the scene's steps, the first N (20)", default=20),
             ranks("MPI ranks of the trials"),
             switch("--write", "put the answer into the scene file"),
             whole("--cells", "N", "of the finest trial; the scene's count"),
-            argument("--chart", type=checked_file, metavar="OUT.png", help="draw error over cost of all trials"),
             JSON,
         ),
         description="Try lattices, integrators, time steps and errors of a step on the first frames of a scene, and "
         "say which is the cheapest that meets the error. Exit status 3: none does.",
-        alone=RUNS_ITSELF,
+        starts_runs=True,
     ),
     "compare": Command(
         "say whether two results agree",
@@ -235,7 +234,6 @@ COMMANDS = {
         ),
         description="Compare two results at the times that both have; of different lattices their surfaces alone. "
         "Exit status 0: they agree; 1: they differ; 2: they cannot be compared.",
-        alone="it reads two files, which one process does alone",
     ),
     "render": Command(
         "draw a result as a picture, a film or a page; or a scene or a mesh before anything is run",
@@ -249,7 +247,6 @@ COMMANDS = {
         RENDER,
         description="Draw some moments of a result side by side (*.png), a film (*.mp4, *.gif, *.webp), or a page for "
         "a browser in which the body turns and its frames play (*.html). A scene or a mesh is drawn as it lies.",
-        alone="it draws on one process",
     ),
     "export": Command(
         "write frames of a result in another format",
@@ -265,7 +262,6 @@ COMMANDS = {
         ),
         description="Write frames of a result for another program; the name's ending says in which format: .glb "
         "and .usd hold frames in time, .obj, .ply, .stl and .vtu one frame.",
-        alone="it writes on one process",
     ),
     "series": Command(
         "print energies, forces and places of probes of a result, a row a frame",
@@ -277,7 +273,6 @@ COMMANDS = {
         ),
         description="Write as CSV, for each frame, energies, momentum, loads, the reaction of each pin and anchor, the "
         "push of each obstacle and of contacts on each body, and where the scene's probes are.",
-        alone="it reads one file, which one process does alone",
     ),
     "check": Command(
         "store a scene's numbers; say whether they still hold",
@@ -298,7 +293,7 @@ COMMANDS = {
         ),
         description="Run the first steps of scenes, each solved to 1e-9, and hold counts, energies, momentum and "
         "places against those that --update stored. Exit status 0: all are as stored; 1: something differs.",
-        alone=RUNS_ITSELF,
+        starts_runs=True,
     ),
     "fetch": Command(
         "download named meshes, or list them",
@@ -307,23 +302,22 @@ COMMANDS = {
             argument("names", nargs="*", metavar="NAME", help="a model, see --list"),
             switch("--list", "list the models and where they lie"),
         ),
-        alone="it downloads on one process",
     ),
     "keys": Command(
         "list the keys of a scene, or of one of its tables: unit, default, range, meaning",
         ("msmpetsc keys", "msmpetsc keys material", "msmpetsc keys pin.region"),
         (argument("table", nargs="?", metavar="TABLE", help="a table or a key: material, pin.region, time.step"),),
-        alone="it prints on one process",
     ),
     "schema": Command(
         "print the JSON schema of a scene, for editors", ("msmpetsc schema > msmpetsc.schema.json",),
-        alone="it prints on one process", module="keys",
+        module="keys",
     ),
     "doctor": Command(
         "say what is installed, and how to get what is not",
         ("msmpetsc doctor",),
         description="Examine PETSc, MPI, the device, HDF5, the kernels' cache, packages and meshes. "
         "Exit status 1: a run lacks something that it needs.",
+        on_ranks=True,
     ),
     "completion": Command(
         "print the script by which a shell completes commands, options and files",
@@ -332,5 +326,6 @@ COMMANDS = {
             "msmpetsc completion fish > ~/.config/fish/completions/msmpetsc.fish",
         ),
         (argument("shell", choices=SHELLS),),
+        on_ranks=True,
     ),
 }  # fmt: skip

@@ -7,16 +7,12 @@ import signal
 import sys
 import traceback
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
 from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.command_table import COMMANDS, RUNS_ITSELF
+from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, MsmpetscError, as_expected
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
 
 DRAWING = ("render", "export", "compare")  # which the extra "render" is enough for
 
@@ -37,10 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
             with ending_together(comm, "render" if args.command in DRAWING else "run"):
                 if refused is not None:
                     raise refused
-                command = COMMANDS[args.command]
-                if command.alone:
-                    start_alone(comm, args.command, command.alone)
-                return import_module(f"msmpetsc.cli.commands.{command.module or args.command}").run(args)
+                return carry_out(args, comm.size)
         except MsmpetscError as error:
             if comm.rank == 0:
                 if args.verbose:
@@ -57,15 +50,14 @@ def main(arguments: list[str] | None = None) -> int:
             return STATUS_BUG
 
 
-def start_alone(comm: "MPI.Comm", command: str, why: str) -> None:
-    """Raise InputError where mpiexec has started more than one of a command that is for one process.
-
-    SIGTERM to one that runs others ends those, too, as Ctrl-C does.
-    """
-    if comm.size > 1:
-        raise InputError(f"{command} is started without mpiexec: {why}")
-    if why == RUNS_ITSELF:
+def carry_out(args: argparse.Namespace, ranks: int) -> int:
+    """Carry out a command on so many ranks; return its exit status. Raises InputError where it is for one."""
+    command = COMMANDS[args.command]
+    if ranks > 1 and not command.on_ranks:
+        raise InputError(f"{args.command} is for one process: start it without mpiexec")
+    if command.starts_runs:  # SIGTERM ends those, too, as Ctrl-C does
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+    return import_module(f"msmpetsc.cli.commands.{command.module or args.command}").run(args)
 
 
 def entry_point() -> None:

@@ -187,7 +187,7 @@ def run_study(
 ) -> list[Row]:
     """Run what is not done yet of a study file, as many cases at a time as ``jobs`` or else the file says; all rows.
 
-    The folder gets table.csv, table.h5, traces.json, study.toml, references/. Cases that are done and still in the
+    The folder gets table.csv, traces.json, study.toml, references/. Cases that are done and still in the
     file are kept, those of its parts too; ``restart`` forgets them. With a ``part`` only that is run, in a folder of
     its own, and only its rows are returned. Raises InputError before anything is run.
     """
@@ -198,7 +198,7 @@ def run_study(
     own = part.folder(folder) if part else folder
     own.mkdir(parents=True, exist_ok=True)
     if restart:
-        for name in ("table.csv", "table.h5", "traces.json"):
+        for name in ("table.csv", "traces.json"):
             (own / name).unlink(missing_ok=True)
         for name in ("runs", "references", PARTS):
             shutil.rmtree(own / name, ignore_errors=True)

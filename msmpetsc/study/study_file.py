@@ -185,7 +185,6 @@ class Order(Table):
     """A scene whose sweep over time steps is drawn as the order of the integrators; it needs a reference."""
 
     scene: Name
-    frequency: Positive | None = None  # [Hz] of its slowest vibration, for implicit Euler's loss
 
 
 class Study(Table):

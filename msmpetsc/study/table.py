@@ -1,4 +1,4 @@
-"""The table of a study: a row a case, written as CSV and HDF5, read as a pandas DataFrame, and its rows chosen.
+"""The table of a study: a row a case, written as CSV, read as a pandas DataFrame, and its rows chosen.
 
 pandas is imported where it is used: the commands that need no table do not wait for it.
 """
@@ -8,94 +8,31 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import h5py
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from msmpetsc.errors import EXTRAS, InputError, missing_package
-from msmpetsc.fields import FRAME_FIELDS
 from msmpetsc.results.disk import write_whole
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 Row = dict[str, Any]  # one case, by column; None where nothing was measured
-
-
-class Column(NamedTuple):
-    """A column of the table; kind: str, int or float, of which only a float can be missing."""
-
-    kind: type
-    unit: str
-    about: str
-
-
-def _of_frames(name: str, more: str = "") -> Column:
-    field = FRAME_FIELDS[name]
-    return Column(float, field.unit, field.long_name + more)
-
-
-COLUMNS = {
-    "study": Column(str, "", "name of the study"),
-    "case": Column(str, "", "what defines the case, as a number"),
-    "scene": Column(str, "", "the scene's name in the study"),
-    "map": Column(str, "", "the map that it is a point of"),
-    "x": Column(str, "", "place on the map's horizontal axis"),
-    "y": Column(str, "", "place on the map's vertical axis, or the name of its case"),
-    "integrator": Column(str, "", "implicit-euler, bdf2, verlet or static"),
-    "preset": Column(str, "", "solver preset"),
-    "options": Column(str, "", "PETSc options"),
-    "label": Column(str, "", "what its curve is called"),
-    "ranks": Column(int, "1", "MPI ranks"),
-    "repeats": Column(int, "1", "runs, of which medians are taken"),
-    "time_step": Column(float, "s", "time step; of verlet, the time between frames"),
-    "substep": Column(float, "s", "verlet: longest substep asked for"),
-    "error": Column(float, "1", "relative error of a step aimed at"),
-    "max_iterations": Column(float, "1", "outer iterations allowed in a step"),
-    "status": Column(str, "", "ok, failed or timeout"),
-    "reason": Column(str, "", "why it has no figures"),
-    "outcome": Column(str, "", "of a place of a map: how it went, in a word"),
-    "cells": Column(float, "1", "valid cells"),
-    "nodes": Column(float, "1", "nodes"),
-    "unknowns": Column(float, "1", "nodes that are not held"),
-    "springs": Column(float, "1", "springs"),
-    "frames": Column(float, "1", "frames stored"),
-    "steps": Column(float, "1", "steps done"),
-    "time_frame": Column(float, "s", "mean time of a step, the first left out, median of the repeats"),
-    "time_frame_min": Column(float, "s", "the least of the repeats; none of a single run"),
-    "time_frame_max": Column(float, "s", "the greatest of the repeats; none of a single run"),
-    "fps": Column(float, "1/s", "steps a second: 1 / time_frame"),
-    "time_second": Column(float, "1", "computing seconds a simulated second"),
-    "time_setup": Column(float, "s", "whole run: mesh, cages, lattice"),
-    "time_factor": Column(float, "s", "whole run: preconditioner"),
-    "time_local": Column(float, "s", "whole run: residuals and energies"),
-    "time_ksp": Column(float, "s", "whole run: linear solves"),
-    "time_output": Column(float, "s", "whole run: files"),
-    "iterations": Column(float, "1", "outer iterations, mean of a step"),
-    "most_iterations": Column(float, "1", "outer iterations, the most of a step"),
-    "ksp_its": Column(float, "1", "KSP iterations, mean of a step"),
-    "products": Column(float, "1", "products with the Hessian, mean of a step"),
-    "substeps": _of_frames("substeps"),
-    "fallbacks": _of_frames("fallbacks"),
-    "inverted": _of_frames("inverted", " in the last frame"),
-    "energy_gained": _of_frames("energy_gained"),
-    "self_contacts": _of_frames("self_contacts", ", the most of a frame"),
-    "self_distance": _of_frames("self_distance", ", the least of all frames"),
-    "energy_left": Column(float, "1", "total energy at the end over that at the start, where no load acts"),
-    "shape_error": Column(float, "1", "distance of the last frame from the rest shape, moved as a rigid body"),
-    "explicit_limit": Column(float, "s", "longest stable explicit step of the lattice at rest"),
-    "memory": Column(float, "byte", "peak of resident memory, sum of the ranks"),
-    "estimated_error": Column(float, "1", "step error as estimated, rms"),
-    "true_error": Column(float, "1", "step error, rms of the steps measured"),
-    "energy_error": Column(float, "1", "the same in energy"),
-    "trajectory_error": Column(float, "1", "distance from the reference run"),
-    "surface_error": Column(float, "1", "distance of the surface from that of a reference run of other cells"),
-    "machine": Column(str, "", "where it ran"),
-    "versions": Column(str, "", "of the programs"),
-    "command": Column(str, "", "the line that repeats the case"),
-}
-TEXT = tuple(name for name, column in COLUMNS.items() if column.kind is str)
+# units and meanings stand in scenes/studies/README.md
+COLUMNS = (
+    "study", "case", "scene", "map", "x", "y", "integrator", "preset", "options", "label",
+    "ranks", "repeats", "time_step", "substep", "error", "max_iterations", "status", "reason",
+    "outcome", "cells", "nodes", "unknowns", "springs", "frames", "steps", "time_frame",
+    "time_frame_min", "time_frame_max", "fps", "time_second", "time_setup", "time_factor",
+    "time_local", "time_ksp", "time_output", "iterations", "most_iterations", "ksp_its",
+    "products", "substeps", "fallbacks", "inverted", "energy_gained", "self_contacts",
+    "self_distance", "energy_left", "shape_error", "explicit_limit", "memory", "estimated_error",
+    "true_error", "energy_error", "trajectory_error", "surface_error", "machine", "versions",
+    "command",
+)  # fmt: skip
+TEXT = (
+    "study", "case", "scene", "map", "x", "y", "integrator", "preset", "options", "label",
+    "status", "reason", "outcome", "machine", "versions", "command",
+)  # fmt: skip
 NUMBERS = tuple(name for name in COLUMNS if name not in TEXT)
 ONCE_NOTE = (
     "Each was run once: how much its time varies is not known, so that close times decide nothing; "
@@ -111,14 +48,8 @@ def require_extra() -> None:
 
 
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
-    """Write table.csv and table.h5, each replaced whole."""
-    table = as_table(rows)
-    write_whole(folder / "table.csv", table.map(_text).to_csv(index=False, lineterminator="\r\n"))
-    with h5py.File("table.h5", "w", driver="core", backing_store=False) as file:  # on a full disk HDF5 may crash
-        _fill(file, table)
-        file.flush()
-        content = file.id.get_file_image()
-    write_whole(folder / "table.h5", content)
+    """Write table.csv, replaced whole."""
+    write_whole(folder / "table.csv", as_table(rows).map(_text).to_csv(index=False, lineterminator="\r\n"))
 
 
 def read_table(folder: Path) -> "DataFrame":
@@ -149,7 +80,7 @@ def as_table(rows: Sequence[Row]) -> "DataFrame":
     """Return rows as a table with all columns; a number that is missing is NaN, a text empty."""
     from pandas import DataFrame
 
-    table = DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(NUMBERS, float))
+    table = DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(NUMBERS, float))
     return table.astype(dict.fromkeys(TEXT, object)).fillna(dict.fromkeys(TEXT, ""))
 
 
@@ -180,17 +111,6 @@ def _text(value: Any) -> str:
             return ""
         return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(float(value))
     return " ".join(str(value).split())
-
-
-def _fill(file: h5py.File, table: "DataFrame") -> None:
-    """Write one dataset a column along one dimension, so that xarray finds them; what is missing is NaN."""
-    file["row"] = np.arange(len(table))
-    file["row"].make_scale("row")
-    kinds = {str: h5py.string_dtype(), int: "i8", float: "f8"}
-    for name, column in COLUMNS.items():
-        file.create_dataset(name, data=table[name].to_numpy(), dtype=kinds[column.kind], shape=(len(table),))
-        file[name].dims[0].attach_scale(file["row"])
-        file[name].attrs.update({"units": column.unit, "long_name": column.about})
 
 
 def succeeded(table: "DataFrame") -> "DataFrame":

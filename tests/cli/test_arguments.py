@@ -114,8 +114,8 @@ def test_no_format_is_written_under_the_name_of_another(folder, monkeypatch, arg
 
 
 ALONE = {
-    "compare": (["good.h5", "good.h5"], "compare is started without mpiexec: it reads two files"),
-    "plan": (["scene.toml", "--surface-error", "0.1"], "plan is started without mpiexec: it starts its runs"),
+    "compare": (["good.h5", "good.h5"], "compare is for one process: start it without mpiexec"),
+    "plan": (["scene.toml", "--surface-error", "0.1"], "plan is for one process: start it without mpiexec"),
 }
 
 

@@ -100,7 +100,6 @@ def writers(sources: Path) -> dict[str, Writer]:
             lambda path: path.write_text("[time] # mine\nstep = 0.1\nduration = 1.0\n"),
         ),
         "table.csv": Writer("study/table.py", lambda path: write_table(path.parent, [])),
-        "table.h5": Writer("study/table.py", lambda path: write_table(path.parent, [])),
         "traces.json": Writer(
             "study/runner.py",
             lambda path: StudyResults(path.parent, ["a"], traces={"a": {"trace": [0] * 5000}}).write(),

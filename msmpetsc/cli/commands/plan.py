@@ -9,7 +9,6 @@ from contextlib import closing, nullcontext, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 
-from msmpetsc.app.checks import PICTURE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import launcher
@@ -28,19 +27,14 @@ def run(args: argparse.Namespace) -> int:
     target = args.surface_error
     if not 0 < target < 1:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
-    refuse_other_format("--chart", args.chart, PICTURE_NAMES)
     with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
         plan = size_all(args, target)
-        if args.chart:
-            from msmpetsc.study.charts.pareto import plan_picture
-
-            plan_picture(plan, target, args.chart)
-            print(f"drawn: {args.chart}")
         print_size(plan, target)
         command = print_command(args, plan.choice, target) if plan.met else None
+    tried = [{"method": each.method.integrator, "cells": each.cells, "cost": each.cost} for each in plan.tried]
     record = {
         "met": plan.met, "target": target, "choice": asdict(plan.choice), "error": plan.choice.budget.total,
-        "bounds": plan.bounds, "tried": [each._asdict() for each in plan.tried], "command": command,
+        "bounds": plan.bounds, "tried": tried, "command": command,
     }  # fmt: skip
     if args.json:
         print(json.dumps(record, indent=1, default=str))  # of paths the names
@@ -94,8 +88,8 @@ def print_size(plan: SizePlan, target: float) -> None:
     if choice.method.integrator == STATIC:
         cost = f"{choice.cost * choice.method.time_step:.3g} computing seconds a state"
     print(f"{cost}, surface error {choice.budget.total:.1e}")
-    print(f"{'part':16} {'error':>9} {'of the cost':>11}")
+    print(f"{'part':16} {'error':>9}")
     for name, error in vars(choice.budget).items():
-        print(f"{name:16} {error:9.1e} {100 * getattr(choice.shares, name):10.0f}%")
+        print(f"{name:16} {error:9.1e}")
     for bound in plan.bounds:
         print(f"what bounds it: {bound}")

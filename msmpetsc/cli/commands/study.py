@@ -8,7 +8,7 @@ from msmpetsc.errors import InputError, printable
 from msmpetsc.study.cases import shown_command
 from msmpetsc.study.metrics import counted
 from msmpetsc.study.runner import StudyPart, list_study, run_study
-from msmpetsc.study.table import as_table, failed, mapped, swept, timed
+from msmpetsc.study.table import as_table, failed, mapped, swept
 
 
 def run(args: argparse.Namespace) -> int:
@@ -56,10 +56,5 @@ def log_failures(rows: list[dict]) -> None:
     lost = len(failed(swept(table)))
     if lost:
         log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
-    sweeps = timed(swept(table))
-    once = (sweeps["repeats"] == 1).sum()
-    if once:
-        count = f"{once} cases were" if once > 1 else "1 case was"
-        log.info("%s run once: how much their times vary is not known", count)
     for name, group in mapped(table).items():
         log.info("map %s: %s", name, counted(group["outcome"]))

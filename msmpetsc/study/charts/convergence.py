@@ -1,24 +1,9 @@
 """Convergence within one step, over iterations and seconds; and in time, over the time step."""
 
-import math
-
 import numpy as np
 from pandas import DataFrame, concat, to_numeric
 
-from msmpetsc.study.charts.plot import (
-    COUNT,
-    DASH,
-    ERROR,
-    FAINT,
-    PLAIN,
-    SECONDS,
-    Chart,
-    CurveStyle,
-    Styles,
-    axis_from_zero,
-    channel,
-    log_axis,
-)
+from msmpetsc.study.charts.plot import COUNT, ERROR, SECONDS, Chart, Styles, axis_from_zero, log_axis
 from msmpetsc.study.table import Row, grouped, measured, records, succeeded
 
 KIND = "Convergence within one step"
@@ -78,10 +63,8 @@ ORDER = "Convergence in time"
 ORDER_CAPTION = (
     "The steps are solved to many digits, so that what is seen is the error of the time step alone. Of verlet the step "
     "is the substep. In the legend: the slope of the error, fitted to the shorter half of the steps; a start that is "
-    "not smooth lowers it, for there are always vibrations that the steps are too long for. Energy left: where no load "
-    "acts; overtones lose theirs sooner than the slowest vibration, whose closed form is dashed."
+    "not smooth lowers it, for there are always vibrations that the steps are too long for."
 )
-CLOSED = "(1 + ω²t²)^(\N{MINUS SIGN}n), implicit Euler, slowest vibration"
 TOLD = ("step", "steps", "trajectory_error", "energy_left", "iterations")
 
 
@@ -106,43 +89,19 @@ def order_charts(table: DataFrame, styles: Styles, study: dict) -> list[Chart]:
     for entry in study.get("order", ()):
         rows = ok[ok["scene"] == entry.get("scene")]
         if len(measured(rows, "trajectory_error")):
-            charts.append(order_chart(entry["scene"], rows, styles, entry.get("frequency")))
+            charts.append(order_chart(entry["scene"], rows, styles))
     return charts
 
 
-def order_chart(scene: str, rows: DataFrame, styles: Styles, frequency: float | None) -> Chart:
-    """Return the error in the left panel, the energy in the right one, where it was measured."""
+def order_chart(scene: str, rows: DataFrame, styles: Styles) -> Chart:
+    """Return the error over the time step."""
     slopes = {label: order(group) for label, group in grouped(rows, "label").items()}
     names = {label: f"{label}: slope {slope:.2f}" if slope else label for label, slope in slopes.items()}
     rows = with_step(rows.assign(curve=rows["label"].map(names)))
     own = {name: styles[label] for label, name in names.items()}
     chart = Chart(f"order_{scene}", ORDER, f"{ORDER}: {scene}", ORDER_CAPTION, own)
-    shown, left = measured(rows, "trajectory_error"), measured(rows, "energy_left")
+    shown = measured(rows, "trajectory_error")
     y = log_axis("trajectory error", shown["trajectory_error"], ERROR)
     panel = chart.panel("error of the motion", log_axis("time step", shown["step"], SECONDS), y)
     panel.curves(shown, ("step", "trajectory_error"), TOLD, "curve")
-    if len(left):
-        draw_energy(chart, left, frequency)
     return chart
-
-
-def draw_energy(chart: Chart, rows: DataFrame, frequency: float | None) -> None:
-    """Draw the energy left over the step, and implicit Euler's closed form if it is known."""
-    top = 1.15 * min(2, max(1, rows["energy_left"].max()))
-    y = channel("energy left / energy at the start", PLAIN, np.arange(0, top, 0.2), domain=[0, top])
-    panel = chart.panel("energy left at the end", log_axis("time step", rows["step"], SECONDS), y)
-    euler = rows[rows["integrator"] == "implicit-euler"]
-    if frequency and len(euler):
-        chart.styles[CLOSED] = CurveStyle(FAINT, DASH)
-        panel.line(*closed_form(euler, frequency), strokeDash=[6, 4])
-    panel.curves(rows, ("step", "energy_left"), TOLD, "curve")
-
-
-def closed_form(rows: DataFrame, frequency: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps t [s] and the energy (1 + w^2 t^2)^(-n) that implicit Euler leaves.
-
-    n = T / t steps; frequency [Hz].
-    """
-    t = np.geomspace(rows["time_step"].min(), rows["time_step"].max(), 100)
-    end = (rows["steps"] * rows["time_step"]).max()
-    return t, (1 + (2 * math.pi * frequency * t) ** 2) ** (-end / t)

@@ -6,7 +6,6 @@ of the lattice: explicit and implicit runs of any time step can be compared by i
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,21 +14,16 @@ from pandas import DataFrame, concat
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import (
     COUNT,
-    DASH,
     ERROR,
-    FAINT,
     INK,
     RING,
     SECONDS,
     Chart,
     CurveStyle,
     Styles,
-    curve_styles,
     log_axis,
     points,
-    save_png,
 )
-from msmpetsc.study.sizing.answer import SizePlan
 from msmpetsc.study.table import ONCE_NOTE, Row, grouped, is_repeated, measured, reach, records, spread, succeeded
 
 KIND = "Speed against accuracy"
@@ -44,7 +38,8 @@ CAPTION = (
 )
 
 
-TOLD = ("least", "greatest", "time_step", "substep", "error", "max_iterations", "iterations", "ranks")
+STEPPING = ("time_step", "substep")
+TOLD = ("least", "greatest", *STEPPING, "error", "max_iterations", "iterations", "ranks")
 
 
 class ErrorMeasure(NamedTuple):
@@ -96,22 +91,12 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
     return rows.iloc[front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))]
 
 
-def winners(rows: DataFrame, measure: ErrorMeasure, level: float) -> list[Row]:
-    """Return the cheapest row with an error of at most this level, then those that its repeats do not tell from it.
-
-    Nothing is interpolated; each method comes once; nothing comes where nothing reaches the level.
-    """
+def cheapest(rows: DataFrame, measure: ErrorMeasure, level: float) -> Row | None:
+    """Return the measured row of the least cost with an error of at most this level; None where nothing reaches it."""
     reached = measured(rows, *measure.columns)
     reached = reached[reached[measure.error] <= level]
-    if reached.empty:
-        return []
-    reached = reached.assign(**spread(reached, measure.cost)).sort_values(measure.cost, kind="stable")
-    best = reached.iloc[:1]
-    if not is_repeated(best):
-        return records(best)
-    ends = reach(reached, measure.cost)
-    near = reached[ends["least"] <= ends["greatest"].iloc[0]]
-    return records(near.drop_duplicates("label"))
+    best = reached.assign(**spread(reached, measure.cost)).sort_values(measure.cost, kind="stable").head(1)
+    return next(iter(records(best)), None)
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -139,7 +124,7 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
     chart = Chart(name, KIND, title, CAPTION, legend)
     for measure, shown in panels:
         draw_panel(chart, shown, measure)
-        lines = [cheapest_line(measure, level, winners(shown, measure, level)) for level in LEVELS]
+        lines = [cheapest_line(measure, level, cheapest(shown, measure, level)) for level in LEVELS]
         chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_repeated(shown) else [ONCE_NOTE])
     return chart
 
@@ -164,30 +149,14 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel.rings(front, measure.columns)
 
 
-def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
-    """Say which method is the cheapest that reached this level, and which may be just as cheap."""
+def cheapest_line(measure: ErrorMeasure, level: float, row: Row | None) -> str:
+    """Say which case is the cheapest that reached this level."""
     start = f"{formatting.error(level)} or less:"
-    if not best:
+    if row is None:
         return f"{start} nothing measured reaches it."
-    row, *near = best
-    facts = [f"reached {formatting.error(row[measure.error])}"]
-    if row["error"]:
-        facts.insert(0, f"asked for {formatting.error(row['error'])}")
-    if measure is TRAJECTORY:
-        facts.append(stepping(row))
     unit = measure.y_label.removeprefix("computing time ")
-    sentence = f"{start} {row['label']}, {cost_of(row, measure)} {unit} ({', '.join(facts)})"
-    rivals = ", ".join(f"{rival['label']} {cost_of(rival, measure)}" for rival in near)
-    return f"{sentence}; within its noise: {rivals}." if near else f"{sentence}."
-
-
-def stepping(row: Row) -> str:
-    """Return how a case steps; an explicit one has substeps within the time between frames."""
-    if row["integrator"] != "verlet":
-        return formatting.entry(row, "time_step")
-    if row["substep"]:
-        return f"substeps of {formatting.seconds(row['substep'])}"
-    return "longest stable substeps"
+    told = ", ".join(filter(None, (formatting.entry(row, name) for name in (measure.error, "error", *STEPPING))))
+    return f"{start} {row['label']}, {cost_of(row, measure)} {unit} ({told})."
 
 
 def cost_of(row: Row, measure: ErrorMeasure) -> str:
@@ -198,7 +167,7 @@ def cost_of(row: Row, measure: ErrorMeasure) -> str:
     return f"{cost} [{formatting.seconds(row['least'])} to {formatting.seconds(row['greatest'])}]"
 
 
-# The error of the surface over what it costs: of a study, and of the trials of a plan
+# The error of the surface over what it costs
 
 SIZES = "Surface error over cost"
 SIZES_CAPTION = (
@@ -255,23 +224,3 @@ def reached(rows: DataFrame, level: float) -> str:
     logs = np.log(between.to_numpy(float)).T
     cells, seconds = (float(np.exp(np.interp(np.log(level), logs[0], column))) for column in logs[1:])
     return f"{formatting.count(round(cells))} cells ({formatting.seconds(seconds)})"
-
-
-def plan_picture(plan: SizePlan, target: float, path: Path) -> None:
-    """Write a PNG of the trials' expected errors over their costs; the choice is ringed."""
-    tried = [(trial.method, trial.cost, trial.error, trial.cells) for trial in plan.tried]
-    rows = DataFrame(tried, columns=["label", *SIZE, "cells"]).assign(command="")
-    chosen = DataFrame([(plan.choice.cost, plan.choice.budget.total)], columns=list(SIZE))
-    styles = curve_styles(sorted(set(rows["label"]))) | {"asked for": CurveStyle(FAINT, DASH)}
-    chart = Chart(path.stem, SIZES, f"{SIZES}: the trials of a plan", "", styles)
-    costs, errors = (np.append(rows[column], chosen[column]) for column in SIZE)
-    y = log_axis("surface error, estimated", np.append(errors, target), ERROR)
-    panel = chart.panel("tried, and ringed what is chosen", log_axis(TRAJECTORY.y_label, costs, SECONDS), y)
-    panel.line(panel.x["scale"]["domain"], [target, target], strokeDash=[6, 4])
-    values = points(rows, SIZE, (*SIZE, "cells"))
-    panel.mark(values)
-    cells = [value | {"text": formatting.count(count)} for value, count in zip(values, rows["cells"], strict=True)]
-    look = {"type": "text", "dx": 6, "dy": -6, "align": "left", "fontSize": 9, "color": FAINT}
-    panel.draw(cells, look, text={"field": "text"})
-    panel.rings(chosen, SIZE)
-    save_png(chart, path.parent)

@@ -35,7 +35,7 @@ SHAPES = (
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
 DASH = "M-1.7,-.12H-.2V.12H-1.7ZM.2,-.12H1.7V.12H.2Z"
 WIDTH, HEIGHT = 1080, 280  # [px] of all panels of a chart, and of one
-SIZES, MANY = (75, 25), 40  # [px^2] of a marker, and of one where there are more in a curve
+MARKER = 50  # [px^2]
 LETTER = 8  # [px]: mean width in a legend
 CONFIG: dict[str, Any] = {
     "background": "white",
@@ -154,8 +154,8 @@ class Axes:
     def mark(self, values: list[dict[str, Any]], hollow: bool = False) -> None:
         """Draw a marker at each of ``points``, which tells its numbers."""
         color = nominal(self.styles, "color")
-        own = {"fill": color, "size": {"field": "size", "type": "quantitative", "scale": None}}
-        look: dict[str, Any] = {"type": "point", "stroke": "white", "strokeWidth": 0.6}
+        own = {"fill": color}
+        look: dict[str, Any] = {"type": "point", "size": MARKER, "stroke": "white", "strokeWidth": 0.6}
         if hollow:
             own = {"stroke": color}
             look = {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
@@ -168,13 +168,9 @@ class Axes:
 
 
 def points(rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> list[dict[str, Any]]:
-    """Return each row as a point with its place, its curve, what it tells and its size."""
-    sizes = rows.groupby(curve)[curve].transform("size").gt(MANY).map(SIZES.__getitem__)
-    of_rows = zip(*(rows[name] for name in (*columns, curve)), tips(rows, told, curve), sizes, strict=True)
-    return [
-        {"x": x, "y": y, "curve": name, "tip": tip, "size": size, "n": n}
-        for n, (x, y, name, tip, size) in enumerate(of_rows)
-    ]
+    """Return each row as a point with its place, its curve and what it tells."""
+    of_rows = zip(*(rows[name] for name in (*columns, curve)), tips(rows, told, curve), strict=True)
+    return [{"x": x, "y": y, "curve": name, "tip": tip, "n": n} for n, (x, y, name, tip) in enumerate(of_rows)]
 
 
 @dataclass

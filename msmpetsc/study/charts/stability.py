@@ -4,7 +4,6 @@ import json
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 from pandas import DataFrame
 
 from msmpetsc.study import formatting
@@ -17,7 +16,6 @@ CAPTION = (
     "How each run went, the worst that befell it. A number is the mean of the iterations a step, where every step was "
     "solved; of verlet, its substeps. Point at a cell for its numbers and the command that repeats it."
 )
-LIMIT = "longest stable explicit step, 2 / ω"
 # from the worst to the best: they differ in lightness and hue, and each cell has its symbol
 COLORS = {
     "crashed": "#000000", "timeout": "#7a4a1e", "refused": "#9a9a9a", "not finite": "#332288", "energy": "#882255",
@@ -30,7 +28,6 @@ SYMBOLS = {
 DARK = {"crashed", "timeout", "not finite", "energy", "diverged"}  # their symbols are white
 COLUMNS = 6  # panels side by side
 CELL = 24  # [px]: height
-ENDS = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
 TOLD = (
     "outcome", "steps", "iterations", "most_iterations", "inverted", "shape_error", "energy_gained", "substeps",
     "fallbacks", "explicit_limit", "reason",
@@ -43,16 +40,6 @@ class Scale(NamedTuple):
     name: str
     values: tuple[str, ...]
     texts: tuple[str, ...]
-    key: str = ""
-
-    def position(self, value: float) -> float:
-        """Return the position of a number, in cells, by its logarithm; NaN outside of all cells."""
-        logs = np.log(np.array(self.values, float))
-        if len(logs) < 2 or value <= 0:
-            return math.nan
-        ends = (1.5 * logs[0] - 0.5 * logs[1], *logs, 1.5 * logs[-1] - 0.5 * logs[-2])
-        positions = (-0.5, *range(len(logs)), len(logs) - 0.5)
-        return float(np.interp(math.log(value), ends, positions, left=math.nan, right=math.nan))
 
 
 def entry(value: str, unit: str) -> str:
@@ -74,7 +61,7 @@ def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]
     texts = [entry(value, axis.get("unit", "")) for value in values]
-    return Scale(axis.get("name", column), tuple(values), tuple(texts), axis.get("key", ""))
+    return Scale(axis.get("name", column), tuple(values), tuple(texts))
 
 
 def stability_charts(table: DataFrame, study: dict) -> list[Chart]:
@@ -125,7 +112,7 @@ def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
-    """Draw cells that tell their numbers, the explicit limit, and over it their symbols."""
+    """Draw cells that tell their numbers, and their symbols."""
     words = {
         of.name: rows[column].map(dict(zip(of.values, of.texts, strict=True))) for column, of in (("x", x), ("y", y))
     }
@@ -139,13 +126,10 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
         for row, tip in zip(records(placed), tips(placed, (*words, *TOLD)), strict=True)
     ]  # fmt: skip
     own = {"type": "nominal", "scale": None}  # colours that stand in a column
-    color = {"field": "color"} | own
-    panel.draw(values, {"type": "rect"}, fill=color, description={"field": "tip"}, **ENDS)
-    draw_limit(panel, rows, x, y)
-    look = {"type": "text", "fontSize": 10.5}
+    ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
+    panel.draw(values, {"type": "rect"}, fill={"field": "color"} | own, description={"field": "tip"}, **ends)
     text = {"text": {"field": "text"}, "x": {"field": "i"} | panel.x, "y": {"field": "j"} | panel.y}
-    panel.draw(values, look, **text, stroke=color, strokeWidth={"value": 5})  # keeps the limit off them
-    panel.draw(values, look, **text, color={"field": "ink"} | own)
+    panel.draw(values, {"type": "text", "fontSize": 10.5}, **text, color={"field": "ink"} | own)
 
 
 def symbol(row: Row) -> str:
@@ -156,19 +140,3 @@ def symbol(row: Row) -> str:
     if count < 1000:
         return f"{count:.0f}"
     return f"{count / 1000:.{int(count < 9950)}f}k"
-
-
-def draw_limit(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
-    """Draw the explicit limit across the axis of time steps, for each value of the other axis."""
-    if "time.step" not in (x.key, y.key):
-        return
-    (along, steps), (other, across) = (("x", x), ("y", y)) if x.key == "time.step" else (("y", y), ("x", x))
-    limits = rows[rows["explicit_limit"] > 0].groupby(other)["explicit_limit"].median()
-    places = [(index, steps.position(limits.get(value, 0.0))) for index, value in enumerate(across.values)]
-    lines = [
-        {along: at, f"{along}2": at, other: index - 0.5, f"{other}2": index + 0.5} for index, at in places if at == at
-    ]
-    if lines:
-        panel.styles[LIMIT] = CurveStyle(INK, "M-1.7,-.15H1.7V.15H-1.7Z")
-    panel.draw(lines, {"type": "rule", "color": "white", "strokeWidth": 3.4}, **ENDS)
-    panel.draw(lines, {"type": "rule", "color": INK, "strokeWidth": 1.7}, **ENDS)

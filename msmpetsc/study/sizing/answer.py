@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import tomlkit
 
@@ -34,15 +34,6 @@ class SizeTrial:
         return self.cells ** (-1 / 3)
 
 
-class Tried(NamedTuple):
-    """A trial as a point over cost and expected error."""
-
-    method: str
-    cells: float
-    cost: float
-    error: float
-
-
 @dataclass
 class SizePlan:
     """The answer."""
@@ -50,7 +41,7 @@ class SizePlan:
     choice: Choice  # the cheapest that meets the error, or of the smallest error there is
     met: bool  # whether it is expected to meet the error
     bounds: list[str] = field(default_factory=list)  # what keeps the error from being smaller, or sure, in words
-    tried: list[Tried] = field(default_factory=list)
+    tried: list[SizeTrial] = field(default_factory=list)
 
 
 def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:

@@ -61,7 +61,6 @@ class Choice:
     cells: int
     budget: Budget
     cost: float  # computing seconds a simulated second
-    shares: Budget  # of its rise, were a smaller error asked for
 
 
 @dataclass(frozen=True)
@@ -105,11 +104,7 @@ class CostModel:
         growth = self.growth(self.cells, cells) * (cells / self.cells) ** (shorter / 3)
         cost = stepping.cost * solving.cost * growth
         method = replace(stepping.method, step_error=solving.step_error)
-        same = [each for each in self.steppings if each.method.integrator == stepping.method.integrator]
-        of_cells = 3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order
-        parts = (of_cells, _steepness(same, stepping), _steepness(self.solvings, solving))
-        total = sum(parts) or 1.0
-        return Choice(method, int(cells), budget, cost, Budget(*(part / total for part in parts)))
+        return Choice(method, int(cells), budget, cost)
 
     def growth(self, before: float, after: float) -> float:
         """Return how many times the cost is of so many cells, read off the lattices tried."""
@@ -126,15 +121,3 @@ class CostModel:
     def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
         """Return how its steps may be solved; explicit ones are not."""
         return [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings
-
-
-def _steepness(tried: Sequence[Stepping | Solving], chosen: Stepping | Solving) -> float:
-    """Return how fast cost rises as the error falls, d log cost / -d log error, towards the next smaller error tried.
-
-    Where none is smaller, from the next greater one; 0 of one alone.
-    """
-    others = sorted((each.error, each.cost) for each in tried if each.error > 0 and each.error != chosen.error)
-    if chosen.error <= 0 or not others:
-        return 0.0
-    error, cost = next((other for other in reversed(others) if other[0] < chosen.error), others[0])
-    return max(0.0, math.log(cost / chosen.cost) / math.log(chosen.error / error))

@@ -14,7 +14,7 @@ from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tried, inverted_bound, size_bounds, time_bound
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, inverted_bound, size_bounds, time_bound
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 
@@ -77,7 +77,6 @@ class Sizer:
         self.bounds: list[str] = []
         self.cell_bound = ""  # what is not sure of the cells' error
         self.trials: list[SizeTrial] = []
-        self.step_errors: dict[Candidate, float] = {}  # of the time step alone
 
     def plan(self) -> SizePlan:
         """Make the trials and choose, on few cells first. Raises InputError where too few runs end well."""
@@ -112,7 +111,7 @@ class Sizer:
             lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
             model = replace(model, law=self._law(lattices))
         plan, model = self._checked(model, lattices)
-        return replace(plan, bounds=[*plan.bounds, *self._bounds(plan, model, lattices)], tried=self._tried(model))
+        return replace(plan, bounds=[*plan.bounds, *self._bounds(plan, model, lattices)], tried=self.trials)
 
     # Time
 
@@ -120,8 +119,9 @@ class Sizer:
         """Return integrators and steps with the error of the step alone; the finest stands for the true motion."""
         if self.is_static:  # whose states have no such error
             state = self._run(self._method(STATIC, self.step), cells)
-            self.step_errors = {state.method: 0.0} if state else {}
-            return [Stepping(method, 0.0, state.cost) for method in self.step_errors if state]
+            if state is None:
+                raise InputError(f"{self.scene}: the trial failed on {cells} cells, see above")
+            return [Stepping(state.method, 0.0, state.cost)]
         ladder, sizes = self._explicit(cells)
         if not ladder:
             ladder, sizes = self._implicit(cells)
@@ -142,7 +142,6 @@ class Sizer:
         for integrator in IMPLICIT:
             if explicit or integrator != finest.method.integrator:
                 chosen_from += self._others(integrator, chosen_from, finest=finest, left=left, cells=cells)
-        self.step_errors = {each.method: each.error for each in (*known, *chosen_from)}
         return chosen_from
 
     def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
@@ -323,18 +322,6 @@ class Sizer:
             bounds += size_bounds(model, self.target, bool(self.bounds))
             bounds += time_bound(model, self.target, times, lambda until: _apart(lattices[-2], lattices[-1], until))
         return bounds
-
-    def _tried(self, model: CostModel) -> list[Tried]:
-        """Return cost and expected error of each trial, where the error of its step is known."""
-        solved = {each.step_error: each.error for each in model.solvings} | {None: 0.0}
-        tried = []
-        for each in self.trials:
-            method = each.method
-            time_error = self.step_errors.get(self._as_tried(method))
-            if time_error is not None:  # as it is not of explicit trials the next of which took too long
-                error = time_error + solved[method.step_error] + model.law.error(each.edge)
-                tried.append(Tried(method.integrator, each.cells, each.cost, error))
-        return tried
 
     # Runs
 

@@ -133,7 +133,6 @@ RENDER = (
         help="of --colour error: the result that it is counted from",
     ),
     switch("--axes", "draw a box around the body, with lengths"),
-    switch("--scale-bar", "put a length into the legend"),
     argument("--show", metavar="cells,springs", help="cut the body open: boundary cells red, interior ones blue"),
     argument("--fps", type=float, metavar="N", help="pictures a second; alone: every frame is one picture"),
     argument("--speed", type=float, metavar="S", help="simulated seconds a second (1, which is real time)"),

@@ -14,7 +14,6 @@ from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
 
 CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its lines, size and middle
-LABEL = 11  # [px]
 
 
 @cache
@@ -32,17 +31,6 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
     return np.array(picture)
 
 
-def labelled(picture: np.ndarray, labels: list[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Return a picture (height, width, 3) with labels: texts, where they begin (2,) [px from the
-    top left], and the ways (2,) that lead from there out of what is labelled."""
-    drawn = Image.fromarray(picture)
-    for text, at, way in labels:
-        half = np.array([typeface(LABEL).getlength(text), LABEL]) / 2
-        middle = np.clip(at + half * way, half, np.array(drawn.size) - half)
-        ImageDraw.Draw(drawn).text(tuple(middle), text, INK, typeface(LABEL), anchor="mm")
-    return np.array(drawn)
-
-
 def rounded(low: float, high: float) -> tuple[str, str]:
     """Return the ends of a span as they are written: to a thousandth of it or finer, 0 in place of -1e-5."""
     span = max(high - low, abs(high) * 1e-12, 1e-300)
@@ -53,14 +41,13 @@ def rounded(low: float, high: float) -> tuple[str, str]:
 
 LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
 FINE = 3  # a legend is drawn so many times larger, and shrunk
-NICE = (1, 2, 5)  # lengths of a scale bar, times powers of ten
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry: a bar of colours, a swatch, an arrow, a line or a length in front of a text.
+    """One entry: a bar of colours, a swatch, an arrow or a line in front of a text.
 
-    kind  : "bar", "swatch", "glass", "arrow", "line" or "length"
+    kind  : "bar", "swatch", "glass", "arrow" or "line"
     width : of what stands in front of the text [px]
     low, high : numbers at the ends of a bar
     """
@@ -94,17 +81,6 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     if entries and any(len(still.overlays.obstacles) for still in stills):
         entries.append(Entry("glass", "obstacle", GLASS))
     return entries
-
-
-def scale_bar(scale: float, most: float) -> Entry:
-    """Return a length that is round and as long as it may be; scale: [px/m]; most: [px]."""
-    longest = most / scale
-    power = 10.0 ** np.floor(np.log10(longest))
-    length = max(step * power for step in NICE if step * power <= longest * (1 + 1e-9))
-    for size, unit in ((1e3, "km"), (1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm")):
-        if length >= size * (1 - 1e-9):
-            return Entry("length", f"{length / size:.3g} {unit}", width=length * scale)
-    return Entry("length", f"{length:.3g} m", width=length * scale)
 
 
 def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> np.ndarray:
@@ -159,9 +135,6 @@ def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, f
         draw.polygon(
             [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)], entry.colour
         )
-    if entry.kind == "length":
-        for x in (left, right):
-            draw.line((x, middle - half / 2, x, middle + half / 2), entry.colour, 2 * FINE)
     for text in filter(None, (entry.high, entry.text)):
         right += gap
         draw.text((right, middle), text, INK, font, anchor="lm")

@@ -16,7 +16,7 @@ from msmpetsc.errors import InputError, printable
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
-from msmpetsc.view.annotations import CAPTION, Entry, caption_picture, entries_of, legend_picture, scale_bar
+from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.mesh import drawn
@@ -59,15 +59,12 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
     width, height = size
     letters = min(1.0, max(height / USUAL, SMALLEST))
     entries = entries_of(composition, stills)
-    bar = [Entry("length", "")] if composition.style.scale_bar else []
-    room = height - round(letters * CAPTION) - len(legend_picture([*entries, *bar], width, letters))
+    legend = legend_picture(entries, width, letters)
+    room = height - round(letters * CAPTION) - len(legend)
     if room < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
     before, picture = None, np.empty(0)
     with Renderer(composition, stills, (width, room)) as renderer:
-        if bar:
-            bar = [scale_bar(renderer.scale / letters, width / letters / 5)]
-        legend = legend_picture([*entries, *bar], width, letters)
         for still in counted(stills, "pictures"):
             if still is not before:
                 caption = caption_picture(still.caption, width, letters)

@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
+from PIL import Image, ImageDraw
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
-from msmpetsc.view.annotations import labelled, rounded
+from msmpetsc.view.annotations import rounded, typeface
 from msmpetsc.view.camera import Camera
-from msmpetsc.view.colours import ARROW, BODY, BOX, FIXED, GLASS, GLASS_EDGE, GROUND, SHADOW, SPRING, rgb
+from msmpetsc.view.colours import ARROW, BODY, BOX, FIXED, GLASS, GLASS_EDGE, GROUND, INK, SHADOW, SPRING, rgb
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut
 from msmpetsc.view.overlays import Ground, Overlays, corners_of
 
 GLASS_OPACITY = 0.22
 FADING, AROUND = 0.55, 72  # share of a ground's radius from which on it fades; corners of its rim
-# of a box: four along z, y and x each, between corners 4i + 2j + k
-EDGES = np.array([(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)])
+LABEL = 11  # [px]: size of what is written at the box
 LABEL_GAP = 8  # [px] between an edge and what is written at it
 
 
@@ -66,7 +66,7 @@ class Renderer:
             picture = self._plotter.screenshot(return_img=True)
         if picture is None or not picture.any():
             raise InputError("nothing can be drawn: the graphics library gives a black picture")
-        return labelled(picture, self._labels(still.camera)) if has_axes else picture
+        return self._with_extents(picture, still.camera) if has_axes else picture
 
     def _face(self, camera: Camera) -> None:
         """Look through a camera, without perspective."""
@@ -79,23 +79,22 @@ class Renderer:
         view.parallel_scale = self._size[1] / self.scale / 2
         view.clipping_range = (far / 100, 2 * far)
 
-    def _labels(self, camera: Camera) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return what is written at three edges of the box: its extent along each, with place and way out."""
-
-        def pixels(points: np.ndarray) -> np.ndarray:
-            return (camera.flat(points) - self._centre) * [1, -1] * self.scale + self._size / 2
-
-        labels = []
-        box = self._composition.box
-        middles = pixels(corners_of(box)[EDGES].mean(axis=1)).reshape(3, 4, 2)  # of those along z, y and x
-        outward = middles - pixels(box.mean(axis=0)[None])
-        for axis, ways, ends in zip((2, 1, 0), outward, middles, strict=True):
+    def _with_extents(self, picture: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return the picture with the coordinates that the box spans, each at the outermost edge along its axis."""
+        box, drawn = self._composition.box, Image.fromarray(picture)
+        corners = (camera.flat(corners_of(box)) - self._centre) * [1, -1] * self.scale + self._size / 2  # [px]
+        for axis, name in enumerate("xyz"):
+            middles = corners.reshape(2, 2, 2, 2).mean(axis=axis).reshape(4, 2)
+            ways = middles - middles.mean(axis=0)
             # of two that are as far, as opposite ones are, the one to the right and above
             farthest = int(np.argmax(np.linalg.norm(ways, axis=1) + ways @ (1e-6, -2e-6)))
-            way = ways[farthest] / np.linalg.norm(ways[farthest])
             low, high = rounded(*box[:, axis])
-            labels.append((f"{'xyz'[axis]}: {low} to {high} m", ends[farthest] + LABEL_GAP * way, way))
-        return labels
+            text = f"{name}: {low} to {high} m"
+            half = np.array([typeface(LABEL).getlength(text), LABEL]) / 2
+            way = ways[farthest] / np.linalg.norm(ways[farthest])
+            middle = np.clip(middles[farthest] + (LABEL_GAP + half) * way, half, self._size - half)
+            ImageDraw.Draw(drawn).text(tuple(middle), text, INK, typeface(LABEL), anchor="mm")
+        return np.array(drawn)
 
     def _draw(self, still: Still) -> None:
         """Draw the body and what stands beside it."""

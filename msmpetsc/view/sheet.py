@@ -16,7 +16,7 @@ from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture, scale_bar
+from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
 from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_result
@@ -26,7 +26,6 @@ from msmpetsc.view.renderer import Renderer
 PANEL, NARROWEST = np.array([400, 870]), 240  # [px]: at most, and the least that a caption needs
 ROW = 2000  # [px]: wider ones are broken into several
 HIGHEST = 32767  # [px]: where 16 bits end, and with them what many programs show
-LONGEST_BAR = 0.4  # of a panel's width: a scale bar
 COUNT = 5  # moments, where nothing is said
 
 
@@ -86,8 +85,6 @@ def draw_moments(
             sheet[number // columns, :, number % columns] = np.concatenate(captioned)
     sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
     entries = entries_of(composition, stills)
-    if style.scale_bar:
-        entries.append(scale_bar(renderer.scale, LONGEST_BAR * width))
     with whole_file(path) as part:
         Image.fromarray(np.concatenate([sheet, legend_picture(entries, columns * width)])).save(part)
 

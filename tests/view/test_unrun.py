@@ -46,12 +46,9 @@ def test_a_scene_shows_pins_forces_and_cells(tmp_path):
         assert counts[1] > 300 and counts[1] > 2 * counts[0]
 
 
-def test_a_mesh_alone_shows_its_box_and_a_length(tmp_path, ball):
+def test_a_mesh_alone_shows_its_box(tmp_path, ball):
     picture = drawn(ball, tmp_path / "x.png")
     assert picture[..., 2].shape[0] > 400 and near(picture, (0x8A, 0x92, 0x9B), 40) > 500
-    bar = picture[-34:]
-    (columns,) = np.nonzero((bar < 120).all(axis=2)[15:19].all(axis=0))
-    assert np.ptp(columns[columns < columns[0] + 400]) > 50
 
 
 @pytest.mark.parametrize(

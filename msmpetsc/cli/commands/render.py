@@ -64,7 +64,7 @@ def style_of(args: argparse.Namespace) -> Style:
         number = getattr(args, option)
         if number is not None and not (0 < number <= FASTEST[option]):
             raise InputError(f"--{option} must be above 0, and {FASTEST[option]:g} at most, not {number:g}")
-    return Style(eye, args.colour, _size(args.size), args.axes, args.scale_bar, shown)
+    return Style(eye, args.colour, _size(args.size), args.axes, shown)
 
 
 def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
@@ -93,7 +93,7 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     moments = [Moment(0, (subject.title, about[0]), style.shown)]
     if len(subject.rest.cells) and not style.shown:
         moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
-    draw_moments(subject, path, moments, replace(style, size=style.size or STILL, axes=True, scale_bar=True))
+    draw_moments(subject, path, moments, replace(style, size=style.size or STILL, axes=True))
 
 
 def _draw_motion(

@@ -1,18 +1,15 @@
 """Films: the frames of a result one after the other, for 3 to 8 s, or one body turned around."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from fractions import Fraction
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
-from subprocess import DEVNULL, PIPE, Popen
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError, printable
+from msmpetsc.errors import InputError
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
@@ -26,7 +23,7 @@ from msmpetsc.view.renderer import Renderer
 LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
 USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
 TURN = 6.0  # [s] that the eye takes to go around a body that stands still
-QUALITY = 10  # as ffmpeg's -crf counts: 0 without loss, 51 the worst
+QUALITY = 8  # of 10, as imageio-ffmpeg counts
 
 
 def write_film(
@@ -49,9 +46,7 @@ def write_film(
         low, high, _ = composition.room(stills)
         width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
         size = 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
-    with written(path, size, playback.fps) as add:
-        for picture in _pictures(composition, stills, size):
-            add(picture)
+    write_pictures(path, _pictures(composition, stills, size), size, playback.fps)
 
 
 def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[np.ndarray]:
@@ -73,59 +68,42 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
             yield picture
 
 
-@contextmanager
-def written(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Yield what adds a picture (height, width, 3) to a film, named when it is whole."""
-    write = _video if path.suffix.lower() == ".mp4" else _images
-    with whole_file(path) as part, write(part, size, fps) as add:
-        yield add
+def write_pictures(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
+    """Write pictures (height, width, 3) as a film, named when it is whole. Raises InputError."""
+    with whole_file(path) as part:
+        if path.suffix.lower() == ".mp4":
+            _write_video(part, pictures, size, fps)
+        else:
+            _write_images(part, pictures, fps)
 
 
-@contextmanager
-def _video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError with the last that ffmpeg says.
+def _write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
+    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError for a film that is not whole.
 
-    imageio-ffmpeg's own writer does not ask how ffmpeg ended: on a full disk it leaves a film that nothing can open.
+    That is asked of the film itself, for imageio-ffmpeg does not ask how ffmpeg ended.
     """
     import imageio_ffmpeg
 
-    pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size)]
-    rate = ["-r", str(Fraction(fps).limit_denominator())]
-    film = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(QUALITY)]
-    careful = ["-v", "error", "-xerror", "-y"]  # its older versions end a film that they could not close as done
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), *careful, *pictures, *rate, "-i", "-", *film, str(path)]
-    # signals stay as they are here: what is too long for the system is told like what has no room, and Ctrl-C is ours
-    system: dict[str, Any] = dict(restore_signals=False, start_new_session=True)
-    with TemporaryFile() as said, Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=said, **system) as ffmpeg:
-        stream: Any = ffmpeg.stdin
-        broken = False
-        try:
-            yield lambda picture: stream.write(np.ascontiguousarray(picture))
-        except BrokenPipeError:  # it has ended, and says why
-            broken = True
-        except BaseException:
-            ffmpeg.kill()
-            raise
-        finally:
-            with suppress(BrokenPipeError):
-                stream.close()
-        if ffmpeg.wait() or broken:
-            said.seek(0)
-            reason = said.readline().decode(errors="replace").rpartition("] ")[2].strip()
-            raise OSError(printable(reason) or f"ffmpeg ended with status {ffmpeg.returncode}")
+    options: dict[str, Any] = dict(codec="libx264", quality=QUALITY, macro_block_size=2, ffmpeg_log_level="quiet")
+    sent = 0
+    try:
+        with closing(imageio_ffmpeg.write_frames(str(path), size, fps=fps, **options)) as writer:
+            writer.send(None)
+            for picture in pictures:
+                writer.send(np.ascontiguousarray(picture))
+                sent += 1
+        count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    except (OSError, RuntimeError):
+        count = -1
+    if count != sent:
+        raise OSError("ffmpeg did not write all of it: the disk may be full")
 
 
-@contextmanager
-def _images(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[np.ndarray], None]]:
+def _write_images(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     """Write a GIF or an animated WebP, for ever over; Pillow takes the pictures together."""
-    pictures: list[Image.Image] = []
-    is_gif = path.suffix.lower() == ".gif"
-
-    def add(picture: np.ndarray) -> None:
-        image = Image.fromarray(picture)
-        pictures.append(image.quantize(256, dither=Image.Dither.NONE) if is_gif else image)
-
-    yield add
-    options: dict[str, Any] = {} if is_gif else dict(quality=80, method=4)
-    first, *rest = pictures
-    first.save(path, save_all=True, append_images=rest, duration=1000 / fps, loop=0, **options)
+    images = [Image.fromarray(picture) for picture in pictures]
+    options: dict[str, Any] = dict(quality=80, method=4)
+    if path.suffix.lower() == ".gif":
+        images = [image.quantize(256, dither=Image.Dither.NONE) for image in images]
+        options = {}
+    images[0].save(path, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0, **options)

@@ -34,7 +34,7 @@ from msmpetsc.study.sizing.choice import Candidate
 from msmpetsc.study.table import write_table
 from msmpetsc.view.composition import Style
 from msmpetsc.view.drawable import drawable_of_result
-from msmpetsc.view.film import written
+from msmpetsc.view.film import write_pictures
 from msmpetsc.view.page import write_page
 from msmpetsc.view.sheet import contact_sheet
 
@@ -62,9 +62,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def film(path: Path) -> None:
     pictures = np.random.default_rng(1).integers(0, 255, (3, 64, 64, 3), np.uint8)
-    with written(path, (64, 64), 10) as add:
-        for picture in pictures:
-            add(picture)
+    write_pictures(path, pictures, (64, 64), 10)
 
 
 def page(result: Path, path: Path) -> None:

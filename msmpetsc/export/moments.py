@@ -4,12 +4,14 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from trimesh.geometry import mean_vertex_normals
 
 from msmpetsc.errors import InputError
 from msmpetsc.fields import FRAME_FIELDS, LATTICE, STRESS
 from msmpetsc.results.reader import Result
 
 Mesh = Literal["surface", "lattice"]
+TINY = 1e-300  # [m^2]
 
 
 class Moments:
@@ -90,12 +92,9 @@ def green_strain(rest: np.ndarray, cells: np.ndarray, points: np.ndarray) -> np.
 
 def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
-    a, b, c = (points[triangles[:, corner]].astype(float) for corner in range(3))
-    of_faces = np.cross(b - a, c - a)
-    corners = triangles.ravel()
-    sums = [np.bincount(corners, np.repeat(of_faces[:, axis], 3), len(points)) for axis in range(3)]
-    vectors = np.stack(sums, axis=1)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    flat = length[:, 0] == 0  # a point of no triangle, or of folded ones: any direction is as good
-    vectors[flat], length[flat] = (0, 0, 1), 1
-    return (vectors / length).astype(np.float32)
+    corners = points[triangles].astype(float)
+    of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    of_faces /= np.abs(of_faces).max(initial=TINY)  # trimesh takes what is very small for nothing
+    vectors = mean_vertex_normals(len(points), triangles, of_faces)
+    vectors[~vectors.any(axis=1)] = (0, 0, 1)  # a point of no triangle, or of folded ones: any direction is as good
+    return vectors.astype(np.float32)

@@ -9,9 +9,9 @@ import numpy as np
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.results.comparison import common_times, refuse_different_meshes
-from msmpetsc.results.gaps import SurfaceGaps, gaps_to_obstacles
 from msmpetsc.results.reader import Result
 from msmpetsc.view.drawable import Drawable
+from msmpetsc.view.gaps import SurfaceGaps, gaps_to_obstacles
 
 BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"

@@ -21,7 +21,6 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
-from msmpetsc.results.gaps import TINY, unit_vectors
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
 from msmpetsc.view import colours
@@ -29,6 +28,7 @@ from msmpetsc.view.annotations import entries_of
 from msmpetsc.view.colours import Colouring
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import FARTHEST, Drawable
+from msmpetsc.view.gaps import TINY, unit_vectors
 from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, drawn
 from msmpetsc.view.overlays import Overlays
 from msmpetsc.view.playback import usual_speed

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.results.gaps import SurfaceGaps, gaps_to_obstacles
 from msmpetsc.scene.obstacles import ObstacleTable
+from msmpetsc.view.gaps import SurfaceGaps, gaps_to_obstacles
 
 SIDE, GAP, REACH = 0.1, 0.001, 0.002  # [m]
 

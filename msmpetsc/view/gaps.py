@@ -3,11 +3,12 @@
 It goes by positions and the scene alone, so that it is the same for obstacles that reflect and that press.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
+from trimesh.triangles import closest_point
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.constraints.loads import Motion, within
@@ -42,10 +43,7 @@ class SurfaceGaps:
         gaps = np.full(len(points), np.inf)
         number, which, normals = self._facing(points)
         if len(number):
-            from trimesh.triangles import closest_point
-
-            nearest: Callable[..., Positions] = closest_point
-            ways = nearest(points[self.triangles[which]], points[number]) - points[number]
+            ways = closest_point(points[self.triangles[which]], points[number]) - points[number]
             ahead = (ways * normals[number]).sum(axis=1) > -CROSSED * self.reach
             np.minimum.at(gaps, number[ahead], np.linalg.norm(ways[ahead], axis=1))
         gaps[gaps > self.reach] = np.inf
@@ -118,8 +116,6 @@ def _gaps_to(surface: Surface, points: Positions) -> Floats:
         return np.full(len(points), np.inf)
     import igl  # for scenes with such obstacles
 
-    squares, number, nearest = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)
-    a, b, c = (surface.points[surface.triangles[number, corner]] for corner in range(3))
-    behind = ((points - nearest) * np.cross(b - a, c - a)).sum(axis=1) < 0
-    gaps: Floats = np.where(behind, -1, 1) * np.sqrt(squares)
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    gaps: Floats = igl.signed_distance(points, surface.points, surface.triangles, kind)[0]
     return gaps

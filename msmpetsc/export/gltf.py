@@ -16,89 +16,71 @@ from msmpetsc.export.moments import Moments, normals
 
 FLOAT, UNSIGNED = 5126, 5125  # component types
 POINTS, TRIANGLES = 34962, 34963  # uses of a buffer view: vertex data, indices
-MOST_BYTES = 2**32 - 1
+MOST_BYTES = 2**32 - 2**20  # less what is no vertex
 Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # a quarter turn about x
 CLAY = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0}, "doubleSided": True}
 
 
 class Chunk:
-    """The binary chunk's table of contents, filled before the numbers are written one after another.
+    """The binary chunk, to which numbers of four bytes are added one after another.
 
     accessors, views : as the JSON chunk lists them
-    size             : of all so far [byte], a multiple of four
+    parts, size      : its bytes so far, and how many
     """
 
     def __init__(self) -> None:
         self.accessors: list[dict[str, Any]] = []
         self.views: list[dict[str, Any]] = []
+        self.parts: list[bytes] = []
         self.size = 0
 
-    def add(self, count: int, kind: str, bounds: np.ndarray | None = None, use: int | None = None) -> int:
-        """Make room for so many SCALAR or VEC3, all of four bytes; return the accessor's number.
+    def add(self, rows: np.ndarray, use: int | None = None, bounds: bool = False) -> int:
+        """Add numbers (n,) or vectors (n, 3), float32 or uint32; return the accessor's number.
 
-        bounds : (2, 1) or (2, 3) least and greatest values, which points, targets and times must say
+        bounds : whether to say the least and greatest values, as points, targets and times must
         """
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.size}
-        view["byteLength"] = count * 4 * (3 if kind == "VEC3" else 1)
         component = UNSIGNED if use == TRIANGLES else FLOAT
-        accessor: dict[str, Any] = {"bufferView": len(self.views), "componentType": component, "count": count}
-        accessor["type"] = kind
-        if bounds is not None:
-            accessor |= {"min": bounds[0].tolist(), "max": bounds[1].tolist()}
+        accessor: dict[str, Any] = {"bufferView": len(self.views), "componentType": component, "count": len(rows)}
+        accessor["type"] = "VEC3" if rows.ndim == 2 else "SCALAR"
+        if bounds:
+            ends = np.reshape([rows.min(axis=0), rows.max(axis=0)], (2, -1)).tolist()
+            accessor |= {"min": ends[0], "max": ends[1]}
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
         self.views.append(view | ({"target": use} if use else {}))
         self.accessors.append(accessor)
-        self.size += view["byteLength"]
+        self.parts.append(rows.tobytes())
+        self.size += rows.nbytes
         return len(self.accessors) - 1
+
+    def add_shape(self, points: np.ndarray, normals: np.ndarray) -> dict[str, int]:
+        """Add points and normals, (v, 3) float32 each; return their accessors."""
+        return {"POSITION": self.add(points, POINTS, bounds=True), "NORMAL": self.add(normals, POINTS)}
 
 
 def write_glb(moments: Moments, path: Path) -> None:
-    """Write the frames; every frame is read twice, for the file begins with the bounds of all.
-
-    Raises InputError where the file would be longer than its format allows.
-    """
+    """Write the frames. Raises InputError where the file would be longer than its format allows."""
     first, *others = moments.frames
     base = moments.points(first).astype(np.float32)
+    upright = normals(base, moments.cells)
     chunk = Chunk()
-    indices = chunk.add(moments.cells.size, "SCALAR", use=TRIANGLES)
-    shape = _vectors(chunk, base)
-    targets = [_vectors(chunk, _target(moments, frame, base)[0]) for frame in others]
+    indices = chunk.add(moments.cells.astype("<u4").ravel(), TRIANGLES)
+    shape = chunk.add_shape(base, upright)
+    targets = []
+    for frame in others:
+        points = moments.points(frame).astype(np.float32)
+        targets.append(chunk.add_shape(points - base, normals(points, moments.cells) - upright))
+        if chunk.size > MOST_BYTES:
+            raise InputError(f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)")
     document = _document(shape, indices, targets, moments.run.path.stem)
     if others:
-        times = (moments.times - moments.times[0]).astype(np.float32)
-        _animate(document, chunk, times, len(others))
+        document["animations"] = [_animation(chunk, moments.times, len(others))]
     document |= {"accessors": chunk.accessors, "bufferViews": chunk.views, "buffers": [{"byteLength": chunk.size}]}
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + chunk.size
-    if total > MOST_BYTES:
-        raise InputError(
-            f"{path} would have {total / 2**30:.3g} GiB, and glTF ends at 4: choose fewer frames (--frames)"
-        )
     with open(path, "wb") as file:
-        file.write(struct.pack("<4sIII4s", b"glTF", 2, total, len(text), b"JSON") + text)
+        file.write(struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + chunk.size, len(text), b"JSON") + text)
         file.write(struct.pack("<I4s", chunk.size, b"BIN\0"))
-        file.write(moments.cells.astype("<u4").tobytes())
-        file.write(base.tobytes() + normals(base, moments.cells).tobytes())
-        for frame in others:
-            moved, turned = _target(moments, frame, base)
-            file.write(moved.tobytes() + turned.tobytes())
-        if others:
-            file.write(times.tobytes() + np.eye(len(others) + 1, len(others), -1, np.float32).tobytes())
-
-
-def _target(moments: Moments, frame: int, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far a frame's points and normals are from the first's, (v, 3) float32 each."""
-    points = moments.points(frame).astype(np.float32)
-    return points - base, normals(points, moments.cells) - normals(base, moments.cells)
-
-
-def _vectors(chunk: Chunk, points: np.ndarray) -> dict[str, int]:
-    """Make room for points, of which the file says the bounds, and their normals."""
-    bounds = np.array([points.min(axis=0), points.max(axis=0)])
-    return {
-        "POSITION": chunk.add(len(points), "VEC3", bounds, POINTS),
-        "NORMAL": chunk.add(len(points), "VEC3", use=POINTS),
-    }
+        file.writelines(chunk.parts)
 
 
 def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]], name: str) -> dict[str, Any]:
@@ -118,9 +100,10 @@ def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]]
     }
 
 
-def _animate(document: dict[str, Any], chunk: Chunk, times: np.ndarray, targets: int) -> None:
-    """Let each target have its frame's time alone, in straight lines from one to the next."""
-    bounds = np.array([times[:1], times[-1:]])
-    sampler = {"input": chunk.add(len(times), "SCALAR", bounds), "output": chunk.add(len(times) * targets, "SCALAR")}
+def _animation(chunk: Chunk, times: np.ndarray, targets: int) -> dict[str, Any]:
+    """Return what lets each target have its frame's time (t,) [s] alone, in straight lines from one to the next."""
+    since = (times - times[0]).astype(np.float32)
+    weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
+    sampler = {"input": chunk.add(since, bounds=True), "output": chunk.add(weights), "interpolation": "LINEAR"}
     channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
-    document["animations"] = [{"samplers": [sampler | {"interpolation": "LINEAR"}], "channels": [channel]}]
+    return {"samplers": [sampler], "channels": [channel]}

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from trimesh.geometry import mean_vertex_normals
 
 from msmpetsc.errors import InputError
 from msmpetsc.fields import FRAME_FIELDS, LATTICE, STRESS
 from msmpetsc.results.reader import Result
 
 Mesh = Literal["surface", "lattice"]
-TINY = 1e-300  # [m^2]
 
 
 class Moments:
@@ -94,7 +92,7 @@ def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
     corners = points[triangles].astype(float)
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    of_faces /= np.abs(of_faces).max(initial=TINY)  # trimesh takes what is very small for nothing
-    vectors = mean_vertex_normals(len(points), triangles, of_faces)
+    sums = [np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T]
+    vectors = np.stack(sums, axis=1)
     vectors[~vectors.any(axis=1)] = (0, 0, 1)  # a point of no triangle, or of folded ones: any direction is as good
-    return vectors.astype(np.float32)
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)

@@ -136,7 +136,6 @@ RENDER = (
     argument("--show", metavar="cells,springs", help="cut the body open: boundary cells red, interior ones blue"),
     argument("--fps", type=float, metavar="N", help="pictures a second; alone: every frame is one picture"),
     argument("--speed", type=float, metavar="S", help="simulated seconds a second (1, which is real time)"),
-    switch("--turntable", "go around the body once; of the last frame unless --frames is given"),
     SET,
 )  # fmt: skip
 COMMANDS = {
@@ -240,7 +239,6 @@ COMMANDS = {
             "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5",
             "msmpetsc render out/my.h5 -o out/my.mp4 --speed 0.1",
             "msmpetsc render out/my.h5 -o out/my.html --colour strain",
-            "msmpetsc render out/my.h5 -o out/turn.gif --turntable --size 480x360",
             "msmpetsc render my.toml --show cells",
         ),
         RENDER,

@@ -8,7 +8,7 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
-from msmpetsc.view.camera import Camera, camera_facing, turned
+from msmpetsc.view.camera import Camera, camera_facing
 from msmpetsc.view.colours import Colouring, colouring_of, plain_colouring, scaled
 from msmpetsc.view.drawable import FARTHEST, Drawable
 from msmpetsc.view.mesh import Cut, cut_open
@@ -38,11 +38,10 @@ class Style:
 
 @dataclass(frozen=True)
 class Still:
-    """One picture: the number of its frame, its camera, what stands beside the body, two lines
-    below it, and what is shown of the lattice."""
+    """One picture: the number of its frame, what stands beside the body, two lines below it, and what is shown of the
+    lattice."""
 
     index: int
-    camera: Camera
     overlays: Overlays
     caption: tuple[str, str] = ("", "")
     cut: Cut | None = None
@@ -53,7 +52,7 @@ class Composition:
     """All frames that are drawn of a subject, as far as must be known before the first.
 
     extremes  : (e, 3) points that reach farthest in some direction at some frame [m]
-    camera    : the first, before it turns
+    camera    : of all stills
     colouring : with its scale; None for a plain body
     fixed     : whether any of the surface is ever pinned or led
     """
@@ -71,34 +70,30 @@ class Composition:
         return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
     def cut(self, shown: tuple[str, ...]) -> Cut | None:
-        """Return what is shown of the lattice, as the first camera sees it."""
+        """Return what is shown of the lattice, as the camera sees it."""
         return cut_open(self.subject, self.camera, shown) if shown else None
 
-    def stills(self, frames: Sequence[int], turns: float = 0.0, words: str = "") -> list[Still]:
-        """Return the still of each frame, with its time and words below; equal ones in a row are one.
-
-        From the first to the last the eye goes so many times around the body.
-        """
+    def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
+        """Return the still of each frame, with its time and words below; equal ones in a row are one."""
         cut = self.cut(self.style.shown)
         made: list[Still] = []
-        for number, index in enumerate(frames):
-            if made and made[-1].index == index and not turns:
+        for index in frames:
+            if made and made[-1].index == index:
                 made.append(made[-1])
                 continue
-            camera = turned(self.camera, 2 * np.pi * turns * number / len(frames))
-            overlays = overlays_at(self.subject, index, self.extremes, camera)
-            made.append(Still(index, camera, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
+            overlays = overlays_at(self.subject, index, self.extremes, self.camera)
+            made.append(Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
         return made
 
     def room(self, stills: Sequence[Still]) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return lower left (2,) and upper right (2,) of all stills in their pictures' planes, with a margin, and how
+        """Return lower left (2,) and upper right (2,) of all stills in the picture's plane, with a margin, and how
         deep they reach [m]. Of a ground it is what lies below the bodies, their shadows."""
         margin = (LABELS if self.style.axes else MARGIN) * np.ptp(self.box, axis=0).max()
         ends, corners = [], [self.extremes]
         for still in stills:
             shown = still.overlays
             below = [ground.below(self.extremes) for ground in shown.grounds]
-            flat = still.camera.flat(np.concatenate([self.extremes, *below, *shown.arrows, shown.obstacles]))
+            flat = self.camera.flat(np.concatenate([self.extremes, *below, *shown.arrows, shown.obstacles]))
             ends += [flat.min(axis=0) - margin, flat.max(axis=0) + margin]
             corners += [shown.obstacles, *(ground.corners for ground in shown.grounds)]
         depth = float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))

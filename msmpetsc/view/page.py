@@ -28,10 +28,10 @@ from msmpetsc.view.annotations import entries_of
 from msmpetsc.view.colours import Colouring
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import FARTHEST, Drawable
+from msmpetsc.view.film import usual_speed
 from msmpetsc.view.gaps import TINY, unit_vectors
 from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, drawn
 from msmpetsc.view.overlays import Overlays
-from msmpetsc.view.playback import usual_speed
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate

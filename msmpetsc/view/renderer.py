@@ -12,7 +12,6 @@ from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
 from msmpetsc.view.annotations import rounded, typeface
-from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import ARROW, BODY, BOX, FIXED, GLASS, GLASS_EDGE, GROUND, INK, SHADOW, SPRING, rgb
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut
@@ -42,6 +41,7 @@ class Renderer:
             for position, intensity in (((-0.5, 1.1, 1.3), 0.85), ((1, 0.15, 0.65), 0.35)):
                 self._plotter.add_light(pv.Light(position=position, intensity=intensity, light_type="camera light"))
             self._plotter.enable_anti_aliasing("ssaa")
+            self._face()
 
     def __enter__(self) -> "Renderer":
         return self
@@ -56,7 +56,6 @@ class Renderer:
         with quiet_opengl():
             self._plotter.suppress_rendering = True  # or all that is added would be drawn once more, half done
             self._plotter.clear_actors()
-            self._face(still.camera)
             self._draw(still)
             if has_axes:
                 box = _hexahedron(corners_of(self._composition.box))
@@ -66,10 +65,11 @@ class Renderer:
             picture = self._plotter.screenshot(return_img=True)
         if picture is None or not picture.any():
             raise InputError("nothing can be drawn: the graphics library gives a black picture")
-        return self._with_extents(picture, still.camera) if has_axes else picture
+        return self._with_extents(picture) if has_axes else picture
 
-    def _face(self, camera: Camera) -> None:
-        """Look through a camera, without perspective."""
+    def _face(self) -> None:
+        """Look through the camera, without perspective."""
+        camera = self._composition.camera
         view, far = self._plotter.camera, 4 * self._depth
         across, upward = self._centre
         behind = self._composition.box.mean(axis=0) @ camera.to_eye
@@ -79,10 +79,13 @@ class Renderer:
         view.parallel_scale = self._size[1] / self.scale / 2
         view.clipping_range = (far / 100, 2 * far)
 
-    def _with_extents(self, picture: np.ndarray, camera: Camera) -> np.ndarray:
+    def _with_extents(self, picture: np.ndarray) -> np.ndarray:
         """Return the picture with the coordinates that the box spans, each at the outermost edge along its axis."""
         box, drawn = self._composition.box, Image.fromarray(picture)
-        corners = (camera.flat(corners_of(box)) - self._centre) * [1, -1] * self.scale + self._size / 2  # [px]
+        corners = (self._composition.camera.flat(corners_of(box)) - self._centre) * [
+            1,
+            -1,
+        ] * self.scale + self._size / 2  # [px]
         for axis, name in enumerate("xyz"):
             middles = corners.reshape(2, 2, 2, 2).mean(axis=axis).reshape(4, 2)
             ways = middles - middles.mean(axis=0)
@@ -116,7 +119,7 @@ class Renderer:
             _draw_lattice(self._plotter, still.cut, subject.nodes(still.index))
         self._draw_obstacles(still.overlays)
         for tail, tip in still.overlays.arrows:  # nearer to the eye is the same point of the picture
-            _draw_arrow(self._plotter, tail + 2 * self._depth * still.camera.to_eye, tip - tail)
+            _draw_arrow(self._plotter, tail + 2 * self._depth * self._composition.camera.to_eye, tip - tail)
 
     def _draw_obstacles(self, overlays: Overlays) -> None:
         for box in map(_hexahedron, overlays.glass):

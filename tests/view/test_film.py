@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
+from ball_result import HEIGHTS
 from one_process import input_error
 from PIL import Image, ImageSequence
 
@@ -13,7 +13,7 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.view.camera import camera_facing, turned
-from msmpetsc.view.playback import playback_of, usual_speed
+from msmpetsc.view.film import playback_of, usual_speed
 
 pytestmark = pytest.mark.timeout(60)
 TIMES = np.arange(11) / 10  # of the ball's frames [s]
@@ -111,19 +111,6 @@ def test_a_turning_camera_stays_upright():
     assert np.cross(quarter.right, quarter.upward) == pytest.approx(quarter.to_eye)
 
 
-def test_on_the_turntable_every_side_is_seen_once(tmp_path):
-    """The ball is held on its east: seen from the east it is dark, from the west it is not, and the turn goes on."""
-    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + EAST_HELD)
-    film = tmp_path / "x.gif"
-    render(path, "-o", film, "--turntable", "--fps", 2, "--size", "320x320", "--eye", "1,0,0", "--frames", "0")
-    pictures = [picture[:250] for picture in pictures_of(film)]  # above caption and legend
-    assert len(pictures) == 12  # six seconds
-    dark = [(picture[..., 0] < 58).sum() for picture in pictures]  # the plain body has more red in its deepest shade
-    assert dark[6] < 0.05 * dark[0] and dark[0] > 1000
-    assert dark[3] == pytest.approx(dark[9], rel=0.15)  # from south and north alike
-    assert dark[6] < dark[3] < dark[0]
-
-
 def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
     """The bar of colours goes from the palest to the darkest, and without colours there is none."""
     for name, words in {"plain": [], "coloured": ["--colour", "displacement"]}.items():
@@ -149,12 +136,10 @@ def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
         (["--show", "cell"], "did you mean 'cells'"),
         (["--size", "101x100"], "--size takes two even numbers"),
         (["--fps", "10"], r"--fps is for \*.mp4"),
-        (["--turntable"], r"--turntable is for \*.mp4"),
         (["-o", "x.mp4", "--fps", "0"], "--fps must be above 0"),
         (["-o", "x.mp4", "--speed", "nan"], "--speed must be above 0"),
         (["-o", "x.mp4", "--count", "3"], r"--count is for \*.png"),
         (["-o", "x.html", "--size", "100x100"], r"--size is for \*.png"),
-        (["-o", "x.gif", "--turntable", "--speed", "2"], "--speed needs --frames"),
         (["-o", "x.gif", "--size", "64x64", "--colour", "speed"], "too small for caption and legend"),
     ],
 )

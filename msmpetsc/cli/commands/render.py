@@ -16,10 +16,9 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style
 from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result, drawable_of_surface
-from msmpetsc.view.film import TURN, write_film
+from msmpetsc.view.film import playback_of, write_film
 from msmpetsc.view.mesh import SHOWN
 from msmpetsc.view.page import write_page
-from msmpetsc.view.playback import Playback, playback_of
 from msmpetsc.view.sheet import Moment, contact_sheet, draw_moments
 
 SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
@@ -29,10 +28,8 @@ ONLY = {  # options by the endings of what they are for
     "size": (*PICTURE_NAMES, *MOVIE_NAMES),
     "fps": MOVIE_NAMES,
     "speed": MOVIE_NAMES,
-    "turntable": MOVIE_NAMES,
 }
 FASTEST = {"fps": 240, "speed": 1e6}
-TURN_FPS = 30  # pictures a second of a body that is turned around
 
 
 def run(args: argparse.Namespace) -> int:
@@ -74,9 +71,13 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
         return
     with plain_damage(args.subject), Result(args.subject) as run, opened_reference(args.reference, run) as reference:
         subject = drawable_of_result(run)
-        everything: Frames = [slice(-1, None) if args.turntable else slice(None)]
+        everything: Frames = [slice(None)]
         numbers = frames_of(subject.name, args.frames or everything, len(subject.times))
-        _draw_motion(args, subject, path, numbers, style, reference)
+        if path.suffix.lower() in PAGE_NAMES:
+            write_page(subject, path, numbers, style, reference)
+        else:
+            playback = playback_of(subject.times[numbers], args.fps, args.speed)
+            write_film(subject, path, numbers, style, playback, reference)
 
 
 def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
@@ -84,34 +85,16 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     for option in ("frames", "count", "speed", "reference"):
         if getattr(args, option) is not None:
             raise InputError(f"--{option} is for results, and {args.subject} is none")
-    if path.suffix.lower() in MOVIE_NAMES and not args.turntable:
-        raise InputError(f"{args.subject} has no motion to film: --turntable turns it around")
+    if path.suffix.lower() in MOVIE_NAMES:
+        raise InputError(f"{args.subject} has no motion to film: *.html turns it around")
     subject, about = drawable_of_file(args.subject, args.set)
     if path.suffix.lower() not in PICTURE_NAMES:
-        _draw_motion(args, subject, path, [0], style, None)
+        write_page(subject, path, [0], style)
         return
     moments = [Moment(0, (subject.title, about[0]), style.shown)]
     if len(subject.rest.cells) and not style.shown:
         moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
     draw_moments(subject, path, moments, replace(style, size=style.size or STILL, axes=True))
-
-
-def _draw_motion(
-    args: argparse.Namespace, subject: Drawable, path: Path, frames: list[int], style: Style, reference: Result | None
-) -> None:
-    """Draw a film or a page of these frames."""
-    if path.suffix.lower() in PAGE_NAMES:
-        write_page(subject, path, frames, style, reference)
-        return
-    if args.turntable and len(frames) == 1:
-        if args.speed is not None:
-            raise InputError("--speed needs --frames, two or more: time stands still on this turntable")
-        fps = args.fps or TURN_FPS
-        playback = Playback(np.zeros(round(TURN * fps), int), fps, 0.0)
-    else:
-        playback = playback_of(subject.times[frames], args.fps, args.speed)
-    playback = replace(playback, turns=float(args.turntable))
-    write_film(subject, path, frames, style, playback, reference)
 
 
 def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:

@@ -44,7 +44,9 @@ def camera_facing(points: np.ndarray, gravity: Sequence[float] | None, eye: Sequ
     """
     up = unit(-np.array(gravity)) if gravity and any(gravity) else np.array([0.0, 0.0, 1.0])
     if eye is None:
-        return turned(Camera(*_across(points, up), up, ELEVATION), YAW)
+        right, away = _across(points, up)
+        cosine, sine = np.cos(YAW), np.sin(YAW)
+        return Camera(cosine * right + sine * away, cosine * away - sine * right, up, ELEVATION)
     height = unit(eye) @ up
     level = unit(eye) - height * up
     if np.linalg.norm(level) < 1e-6:
@@ -66,10 +68,3 @@ def unit(vector: ArrayLike) -> np.ndarray:
     scaled = np.asarray(vector, float)
     scaled = scaled / np.abs(scaled).max()  # the squares of very large or small components leave the range
     return scaled / np.linalg.norm(scaled)
-
-
-def turned(camera: Camera, angle: float) -> Camera:
-    """Return the camera after the eye went an angle [rad] around the upright axis, to its right."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    right, away = camera.right, camera.away
-    return Camera(cosine * right + sine * away, cosine * away - sine * right, camera.up, camera.elevation)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from msmpetsc.errors import InputError
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage
@@ -25,7 +24,6 @@ from msmpetsc.view.renderer import Renderer
 
 PANEL, NARROWEST = np.array([400, 870]), 240  # [px]: at most, and the least that a caption needs
 ROW = 2000  # [px]: wider ones are broken into several
-HIGHEST = 32767  # [px]: where 16 bits end, and with them what many programs show
 COUNT = 5  # moments, where nothing is said
 
 
@@ -76,7 +74,7 @@ def draw_moments(
     low, high, _ = composition.room(stills)
     scale = ((style.size or PANEL) / (high - low)).min()  # [px/m]
     width, height = (int(side) for side in np.maximum([NARROWEST, 1], np.round(scale * (high - low))))  # [px]
-    rows = _rows_of(len(stills), (width, height + CAPTION))
+    rows = -(-len(stills) // max(1, ROW // width))
     columns = -(-len(stills) // rows)
     sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
     with Renderer(composition, stills, (width, height)) as renderer:
@@ -98,19 +96,6 @@ def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int |
         return choose_moments(run, count or COUNT)
     nearest = {0, *(int(np.argmin(abs(subject.times - wanted))) for wanted in subject.scene.picture.times)}
     return {index: "" if index else "start" for index in sorted(nearest)}
-
-
-def _rows_of(panels: int, size: tuple[int, int]) -> int:
-    """Return the rows in which panels of this size [px] stand. Raises InputError for more than programs would show."""
-    width, height = size
-    in_row = max(1, ROW // width)
-    rows = -(-panels // in_row)
-    if rows * height > HIGHEST:
-        raise InputError(
-            f"{panels} moments are too many for one picture: of panels of {width} by {height} pixels "
-            f"at most {HIGHEST // height * in_row} fit into {in_row * width} by {HIGHEST}"
-        )
-    return rows
 
 
 def choose_moments(run: Result, count: int) -> dict[int, str]:

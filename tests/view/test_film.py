@@ -12,7 +12,6 @@ from PIL import Image, ImageSequence
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
-from msmpetsc.view.camera import camera_facing, turned
 from msmpetsc.view.film import playback_of, usual_speed
 
 pytestmark = pytest.mark.timeout(60)
@@ -101,14 +100,6 @@ def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, ca
     scale = (rows[0] - rows[2]) / (centres[0] - centres[2])  # pixels a metre, downwards
     assert scale < 0 and rows - rows[0] == pytest.approx(scale * (centres - centres[0]), abs=6)
     assert [path.name for path in path.parent.iterdir()] == [path.name]  # nothing half done is left
-
-
-def test_a_turning_camera_stays_upright():
-    """After a quarter to its right the eye stands where the right was, as high as before."""
-    camera = camera_facing(np.eye(3), None, (0, -3, 4))
-    quarter = turned(camera, np.pi / 2)
-    assert quarter.to_eye == pytest.approx([0.6, 0, 0.8]) and quarter.right == pytest.approx([0, 1, 0])
-    assert np.cross(quarter.right, quarter.upward) == pytest.approx(quarter.to_eye)
 
 
 def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):

@@ -280,13 +280,6 @@ def test_all_that_is_written_is_in_one_typeface(falling_ball, tmp_path, monkeypa
     assert {"x:", "y:", "z:", "t"} <= {text.partition(" ")[0] for text in written}
 
 
-def test_a_picture_too_high_is_refused(falling_ball, tmp_path, monkeypatch):
-    monkeypatch.setattr(sheet, "HIGHEST", 1000)
-    with pytest.raises(InputError, match="11 moments are too many"):
-        sheet.contact_sheet(falling_ball, tmp_path / "y.png", frames=range(11))
-    assert not (tmp_path / "y.png").exists()
-
-
 def test_a_black_picture_is_no_picture(falling_ball, tmp_path, monkeypatch):
     monkeypatch.setattr(renderer.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(InputError, match="black picture"):

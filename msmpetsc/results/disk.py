@@ -103,28 +103,19 @@ class Lock:
     def __init__(self, path: Path):
         """Take the lock. Raises InputError where another run has it."""
         self.path = path.with_name(f".{path.name}.lock")
-        self._file = -1
-        while not self._take(path):
-            pass
-
-    def _take(self, path: Path) -> bool:
-        """Lock the file, or return False where the run that had it took its name away before it was locked.
-
-        Another run may by then have locked a new file of that name.
-        """
-        self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in (EACCES, EAGAIN):  # else it is a file system without locks
-                os.close(self._file)
-                raise InputError(f"{path} is being written by another run") from None
-            return True
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
-                return True
-        os.close(self._file)
-        return False
+        while True:
+            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+            try:
+                fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno in (EACCES, EAGAIN):
+                    os.close(self._file)
+                    raise InputError(f"{path} is being written by another run") from None
+                return  # a file system without locks
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
+                    return
+            os.close(self._file)  # who had it took its name away meanwhile: another run may have locked a new one
 
     def free(self) -> None:
         """Give the lock back and remove its file."""

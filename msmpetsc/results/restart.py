@@ -1,29 +1,21 @@
 """Restart: what a result file says of its run, its last checkpoint, its lattice."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array
 from msmpetsc.checkpoint import AT_REST, Checkpoint
 from msmpetsc.comm import on_root, together
-from msmpetsc.errors import InputError, printable
+from msmpetsc.errors import InputError
+from msmpetsc.fields import CHECKPOINT
 from msmpetsc.results.comparison import rows_agree
-from msmpetsc.results.reader import (
-    Result,
-    as_python,
-    checked_dataset,
-    newest_slot,
-    object_at,
-    open_result,
-    plain_damage,
-)
+from msmpetsc.results.reader import Result, as_python, newest_slot, plain_damage
 from msmpetsc.results.transfer import scatter_rows
 
 NEAR, FARTHEST = 0.01, 1e6  # of the body's longest side
@@ -56,42 +48,42 @@ class Earlier:
         with Result(path) as result:  # which checks it
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
-            names = _checked_numbers(path, result.file)
-            count = len(result.frames.time)
-            planned = result.frames.time.planned[0]
-            slot = newest_slot(result["checkpoint/step"][:]) if count and AT_REST in (names or ()) else None
-            at_rest = slot is not None and result["checkpoint/numbers"][slot][(names or []).index(AT_REST)] == 1
-            step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
+            count, planned = len(result.frames.time), result.frames.time.planned[0]
+            newest = _newest(result)
+        step, at_rest = 0, False
+        if newest is not None and count:
+            saved = newest[1]
+            step, at_rest = saved.step, saved.numbers.get(AT_REST) == 1
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
-        return cls(path, texts, true_error, step, count, planned, bool(at_rest))
+        return cls(path, texts, true_error, step, count, planned, at_rest)
 
 
-def _checked_numbers(path: Path, file: h5py.File) -> list[str] | None:
-    """Return the names of the checkpoint's numbers, [] if it has none; None if the file has no checkpoint.
+def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
+    """Return slot, step and numbers, and names of the rows of the newest checkpoint; None for none.
 
     Raises InputError for a checkpoint that no run wrote so.
     """
-    with plain_damage(path):
-        group = object_at(path, file, "checkpoint")
-        if group is None:
-            return None
-        if not isinstance(group, h5py.Group):
-            raise InputError(f"{path} is damaged: its checkpoint is no group")
-        names: list[str] = []
-        for name in group:
-            if not name.isprintable():  # lines that tell of it would not be lines
-                raise InputError(f"{path} is damaged: its checkpoint has {printable(name, 40)!r}")
-            dataset = checked_dataset(path, file, f"checkpoint/{name}")
-            if name == "numbers":
-                names, shape = str(as_python(dataset.attrs.get("names", ""))).split(), (2, dataset.shape[-1])
-            else:
-                shape = (2,) if name == "step" else (2, len(file["lattice/nodes"]), *dataset.shape[2:])
-            kind = "i8" if name == "step" else "f8"
-            if dataset.shape != shape or dataset.dtype != kind or (name == "numbers" and len(names) != shape[1]):
-                raise InputError(f"{path} is damaged: checkpoint/{name} has shape {dataset.shape}")
-        if not {"step", "q", "q_previous"} <= set(group):
-            raise InputError(f"{path} is damaged: its checkpoint is not whole")
-        return names
+    stored = [name for name in CHECKPOINT if f"checkpoint/{name}" in run]
+    if not stored:
+        return None
+    for name in ("step", "q", "q_previous"):
+        if name not in stored:
+            raise InputError(f"{run.path} is damaged: its checkpoint is not whole")
+    steps = run["checkpoint/step"][:]
+    slot = newest_slot(steps)
+    if slot is None:
+        return None
+    names: list[str] = []
+    values = np.empty(0)
+    if "numbers" in stored:
+        values = run["checkpoint/numbers"][slot]
+        with plain_damage(run.path):
+            names = str(as_python(run.file["checkpoint/numbers"].attrs.get("names", ""))).split()
+    if len(names) != len(values):
+        raise InputError(f"{run.path} is damaged: checkpoint/numbers has {len(values)} numbers of {len(names)} names")
+    numbers = dict(zip(names, values.tolist(), strict=True))
+    rows = [name for name in stored if name not in ("step", "numbers")]
+    return slot, Checkpoint(int(steps[slot]), numbers=numbers), rows
 
 
 def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None:
@@ -99,28 +91,12 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
 
     owned : nodes of this rank; the ranks' follow each other
     """
-    with opened_on_root(comm, path) as file:
-        newest = comm.bcast(on_root(comm, lambda: _newest(path, file)))
+    with opened_on_root(comm, path) as run:
+        newest = comm.bcast(on_root(comm, lambda: _newest(run)))
         if newest is None:
             return None
-        slot, names, empty = newest
-        rows = {name: _own_rows(comm, path, file, (f"checkpoint/{name}", slot), owned) for name in names}
-        return replace(empty, rows=rows)
-
-
-def _newest(path: Path, file: h5py.File) -> tuple[int, list[str], Checkpoint] | None:
-    """Return slot, names of rows, step and numbers of the newest checkpoint; None for none."""
-    numbers = _checked_numbers(path, file)
-    if numbers is None:
-        return None
-    with plain_damage(path):
-        group = file["checkpoint"]
-        slot = newest_slot(group["step"][:])
-        if slot is None:
-            return None
-        values = group["numbers"][slot].tolist() if numbers else []
-        rows = [name for name in group if name not in ("step", "numbers")]
-        return slot, rows, Checkpoint(int(group["step"][slot]), numbers=dict(zip(numbers, values, strict=True)))
+        slot, empty, names = newest
+        return replace(empty, rows={name: _own_rows(comm, run, (f"checkpoint/{name}", slot), owned) for name in names})
 
 
 def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
@@ -153,13 +129,13 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
 
     lattice : this rank's rows by dataset, "lattice/nodes"
     """
-    with opened_on_root(comm, path) as file:
-        counts = comm.bcast(on_root(comm, lambda: {name: len(file[name]) for name in lattice if name in file}))
+    with opened_on_root(comm, path) as run:
+        counts = comm.bcast(on_root(comm, lambda: {name: len(run[name]) for name in lattice if name in run}))
         for name, count in (counts or {}).items():
             rows = lattice[name]
             same = count == comm.allreduce(len(rows))
             if same:
-                stored = _own_rows(comm, path, file, (name,), len(rows)).astype(float)
+                stored = _own_rows(comm, run, (name,), len(rows)).astype(float)
                 greatest = max(comm.allgather(np.abs(stored).max(initial=0)))
                 agree = rows_agree(np.asarray(rows, float), stored, SAME * greatest).all()
                 same = all(comm.allgather(bool(agree)))
@@ -170,22 +146,18 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
 @contextmanager
 def opened_on_root(comm: MPI.Comm, path: Path) -> Iterator[Any]:
     """Open a result file on rank 0 alone, None elsewhere (collective). Raises InputError."""
-    file = on_root(comm, lambda: open_result(path))
-    try:
-        yield file
-    finally:
-        if file is not None:
-            file.close()
+    with on_root(comm, lambda: Result(path)) or nullcontext() as run:
+        yield run
 
 
-def _own_rows(comm: MPI.Comm, path: Path, file: Any, place: tuple[str] | tuple[str, int], count: int) -> Array:
+def _own_rows(comm: MPI.Comm, run: Any, place: tuple[str] | tuple[str, int], count: int) -> Array:
     """Return this rank's `count` rows of a dataset, or of its row of a number: (count, ...) (collective)."""
     name, *index = place
     counts = comm.allgather(count)
-    dtype, shape = comm.bcast(on_root(comm, lambda: (file[name].dtype, file[name].shape[1 + len(index) :])))
+    dtype, shape = comm.bcast(on_root(comm, lambda: (run[name].dtype, run[name].shape[1 + len(index) :])))
     own = np.empty((count, *shape), dtype)
-    failure = scatter_rows(comm, own, counts, lambda part: file[name][(*index, part)])
+    failure = scatter_rows(comm, own, counts, lambda part: run[name][(*index, part)])
     with together(comm):
         if failure is not None:
-            raise InputError(f"{path} cannot be read: {failure}")
+            raise failure
     return own

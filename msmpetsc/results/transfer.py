@@ -16,6 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array
+from msmpetsc.errors import InputError
 
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
 
@@ -75,7 +76,7 @@ def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Calla
         piece = np.zeros((own.stop - own.start, *rows.shape[1:]), rows.dtype)
         try:
             piece[...] = load(part)
-        except (OSError, ValueError) as error:
+        except InputError as error:
             failure = error  # the others still wait
         if rank > 0:
             comm.Send(piece, dest=rank)

@@ -41,7 +41,7 @@ from msmpetsc.results.disk import (
     refuse_small_disk,
 )
 from msmpetsc.results.layout import Layout, of_ranks, open_to_write
-from msmpetsc.results.reader import FORMAT, FORMAT_VERSION, checked_dataset, finished, open_result, plain_damage
+from msmpetsc.results.reader import FORMAT, FORMAT_VERSION, Result, checked_dataset, finished, open_result
 from msmpetsc.results.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
 
 NOTHING = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))  # what ranks but the first have of surfaces
@@ -260,18 +260,17 @@ class ResultFile:
 
     def _copy_frames(self, file: h5py.File) -> None:
         """Take the frames of the earlier file over, as far as it has them and `keep` allows."""
-        with open_result(self.path) as earlier:
-            names = sorted(earlier["frames"].keys() & file["frames"].keys())
-            datasets = {name: checked_dataset(self.path, earlier, f"frames/{name}") for name in names}
+        with Result(self.path) as earlier:
+            datasets = {name: file["frames"][name] for name in earlier.frames if name in file["frames"]}
             for name, dataset in datasets.items():
-                if dataset.shape[1:] != file["frames"][name].shape[1:]:
-                    raise InputError(f"{self.path} is damaged: frames/{name} has shape {dataset.shape}")
-            count = finished(earlier) if self._copied is None else min(self._copied, finished(earlier))
+                if dataset.shape[1:] != earlier.frames[name].shape[1:]:
+                    raise InputError(f"{self.path} is damaged: frames/{name} has shape {earlier.frames[name].shape}")
+            count = len(earlier.frames.time)
+            if self._copied is not None:
+                count = min(self._copied, count)
             for index in range(count):
                 for name, dataset in datasets.items():
-                    with plain_damage(self.path):
-                        row = dataset[index]
-                    file["frames"][name][index] = row
+                    dataset[index] = earlier.frames[name][index]
         self.finished = count
 
     def _refuse_removed(self) -> None:

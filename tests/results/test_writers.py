@@ -177,7 +177,6 @@ ALLOWED = {
     "app/profile.py": "asks before a run whether it could write",
     "cli/commands/new.py": "under the name that the one way gave",
     "export/gltf.py": "the same",
-    "study/table.py": "into memory",
     "backend/launcher.py": "a cache",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",

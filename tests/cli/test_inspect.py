@@ -21,7 +21,6 @@ from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.system import assemble, assembly_bytes
 from msmpetsc.solve.linear.unknowns import Ghosted, Unknowns
-from msmpetsc.solve.petsc import limits
 
 WORKER = WORKERS / "shares_worker.py"
 SELF = MPI.COMM_SELF
@@ -82,16 +81,15 @@ def test_what_is_scaled_is_near_what_is_counted(scene: Path):
 def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     lattice = build_model(SELF, load_scene(scene)).lattice
     nodes, nonzeros = lattice.owned, lattice.owned + 2 * len(lattice.springs)
-    monkeypatch.setattr(limits, "LARGEST", 3 * nodes - 1)
+    monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", 3 * nodes - 1)
     for holder in (Unknowns, Ghosted):
         with pytest.raises(InputError, match=f"{nodes} nodes are more than the {3 * nodes - 1} unknowns"):
             holder(SELF, lattice)
-    monkeypatch.setattr(limits, "LARGEST", nonzeros - 1)
+    monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", nonzeros - 1)
     unknowns = Unknowns(SELF, lattice)
-    for columns in (1, 3):
-        with pytest.raises(InputError, match=f"{columns * nonzeros} nonzeros"):
-            assemble(SELF, unknowns, 0.01, columns=columns)
-    monkeypatch.setattr(limits, "LARGEST", nonzeros)
+    with pytest.raises(InputError, match=f"{nonzeros} nonzeros"):
+        assemble(SELF, unknowns, 0.01)
+    monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", nonzeros)
     assemble(SELF, unknowns, 0.01).destroy()
 
 

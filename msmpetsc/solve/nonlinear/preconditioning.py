@@ -121,7 +121,8 @@ class LatticePreconditioner:
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
-        surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+        is_asked = self.is_stale or self.joins
+        surface = contact.surface.hessian(q, True) if is_asked and contact and contact.surface else None
         joined, held = surface.split(POINTS) if surface and self.joins else (None, surface)
         is_other = joined is not self.joined
         self.joined, self.is_free, due = joined, self._is_free(q, contact), self.is_stale

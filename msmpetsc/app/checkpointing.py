@@ -122,8 +122,9 @@ class Signals:
 
     def agree(self, due: bool) -> tuple[bool, int]:
         """Return whether any rank has a checkpoint due, and the signal that any has got, or 0 (collective)."""
-        number = Stop.agreed(self.comm)
-        return self.comm.allreduce(bool(due or number), MPI.LOR), number
+        own = 2 * Stop.signal + due
+        greatest = self.comm.allreduce(own, MPI.MAX) if self.comm.size > 1 else own
+        return bool(greatest), greatest // 2
 
     def _note(self, number: int, _: FrameType | None) -> None:
         if number == signal.SIGINT and not self._stepping:

@@ -102,7 +102,7 @@ class LatticePreconditioner:
     wasted   : iterations since then that were more than that
     is_stale : a new one is due
     joins    : contact of the surface with itself joins nodes in the cycle; it is held to the ground by blocks otherwise
-    joined   : what joins them
+    joining  : all of it that joins them
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -117,20 +117,22 @@ class LatticePreconditioner:
         self.wasted = 0.0
         self.is_stale, self.is_free = True, False
         self.joins = False
-        self.joined: SurfaceHessian | None = None
+        self.joining: SurfaceHessian | None = None
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
         is_asked = self.is_stale or self.joins
         surface = contact.surface.hessian(q, True) if is_asked and contact and contact.surface else None
-        joined, held = surface.split(POINTS) if surface and self.joins else (None, surface)
-        is_other = joined is not self.joined
-        self.joined, self.is_free, due = joined, self._is_free(q, contact), self.is_stale
-        if due:
-            blocks = self._blocks(q, contact)
-            self._build(q.copy(), blocks + held.blocks if held else blocks)
-        elif is_other:
-            self.multigrid.join(joined)
+        joining = surface if self.joins else None
+        is_other = joining is not self.joining
+        self.joining, self.is_free, due = joining, self._is_free(q, contact), self.is_stale
+        if due or is_other:
+            joined, held = joining.split(POINTS) if joining else (None, surface)
+            if due:
+                blocks = self._blocks(q, contact)
+                self._build(q.copy(), blocks + held.blocks if held else blocks, joined)
+            else:
+                self.multigrid.join(joined)
         return due or is_other
 
     def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -153,9 +155,9 @@ class LatticePreconditioner:
         self.wasted += max(its - self.pace * digits, 0.0)
         self.is_stale |= self.wasted > WORTH
 
-    def _build(self, q: Positions, contact: Rows) -> None:
+    def _build(self, q: Positions, contact: Rows, joined: SurfaceHessian | None) -> None:
         with HIERARCHY:
-            self.multigrid.update(q, contact, self.joined)
+            self.multigrid.update(q, contact, joined)
         self.pace = None
         if self.is_first:
             self.pace = USUAL_PACE

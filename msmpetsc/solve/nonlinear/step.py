@@ -377,8 +377,6 @@ class Stepper:
             self.observer(iterate.q)
         if not np.isfinite(outcome.residual):
             return NOT_FINITE
-        if Stop.agreed(self.comm):
-            return reasons.DIVERGED_INNER  # _run_snes says so
         if outcome.is_enough:
             if outcome.at_rounding:
                 return reasons.CONVERGED_FNORM_ABS
@@ -387,6 +385,8 @@ class Stepper:
             if not outcome.corrected:
                 self.outcome = self.control.estimated(iterate, outcome, 0.0)
             return reasons.CONVERGED_ITS
+        if Stop.agreed(self.comm):
+            return reasons.DIVERGED_INNER  # _run_snes says so
         self._adapt()
         return reasons.ITERATING
 

@@ -53,7 +53,7 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
     "repair": ("pymeshfix",),
     "xarray": ("xarray",),
     "cuda": ("cupy",),
-    "peers": ("newton", "mujoco", "pypbd"),
+    "peers": ("newton",),
 }
 
 

@@ -2,7 +2,6 @@
 """The cost of a step, `newton` beside what it took the place of. Needs the meshes.
 
     scripts/bench.py [--only NAME ...] [--laws LAW ...] [--frames N] [--repeats N] [--ranks N] [--gpu] [--large]
-        [-o PAGE]
 
 Runs the paper's scenes, clamped beams of 9,000 and 96,000 cells and, with --large, of 995,000, each to a step error of
 1e-3 on one core: `newton` with `-pc_type jacobi` and `gamg`, with --ranks `newton` on so many, and `newton`, one after
@@ -175,10 +174,10 @@ def main() -> int:
     if args.gpu and (lacking := device.what_is_missing()):
         print(f"bench: {lacking}", file=sys.stderr)
         return 2
-    with lab.page(args):
-        if args.gpu:
-            print(f"{cuda.name()}, PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}")
-        lab.table(rows(methods_of(args), args))
+    lab.heading()
+    if args.gpu:
+        print(f"{cuda.name()}, PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}")
+    lab.table(rows(methods_of(args), args))
     return 0
 
 

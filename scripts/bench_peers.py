@@ -1,21 +1,17 @@
 #!/usr/bin/env python3
-"""One lattice in several programs: time and trajectory error of ours, Newton, MuJoCo and pyPBD.
+"""One lattice in two programs: time and trajectory error of ours and of NVIDIA's Newton.
 
-    scripts/bench_peers.py [--cells X Y Z] [--frames N] [--only WORD] [--timeout S] [-o PAGE]
+    scripts/bench_peers.py [--cells X Y Z] [--frames N] [--only WORD] [--timeout S]
 
 A beam of 40 x 15 x 15 cells of 25 mm (E = 5e5 Pa, 1000 kg/m^3), one end pinned, is let go under its weight; frames are
-of 1/60 s. Every program gets the same nodes, masses, springs and stiffnesses, a process of its own and one core, the
-same for all; reading positions is not timed. The trajectory error is the rms distance of all nodes in all frames from a
+of 1/60 s. Both programs get the same nodes, masses, springs and stiffnesses, and a process of their own on one core;
+reading positions is not timed. The trajectory error is the rms distance of all nodes in all frames from a
 run of our Verlet integrator with substeps of 50 us, relative to the rms displacement. Of ours the largest error of a
-step stands beside it.
-
-A program that is not ours is a class that takes substeps (`advance`) and gives `positions` (n, 3) [m]. Gravity points
-along -z.
+step stands beside it. Gravity points along -z.
 """
 
 import os
 from argparse import SUPPRESS, Namespace
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
@@ -33,7 +29,6 @@ CELL, FRAME, G = 0.025, 1 / 60, 9.81  # [m], [s], [m/s^2]
 REFERENCE = ['time.integrator="verlet"', "time.substep=5e-5"]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 OURS = "msmpetsc"
-ARENA = 4 << 30  # [byte] of MuJoCo: what it reckons with by itself grows as nodes times springs
 
 
 class Beam(NamedTuple):
@@ -65,8 +60,8 @@ def read_beam(path: Path) -> Beam:
 class Newton:
     """NVIDIA's Newton on the CPU."""
 
-    def __init__(self, beam: Beam, time_step: float, iterations: int | None):
-        """With VBD if a number of iterations is given, else semi-implicit."""
+    def __init__(self, beam: Beam, time_step: float, iterations: int):
+        """Make a model of the beam, stepped by VBD with so many iterations; by the semi-implicit scheme with 0."""
         import newton
 
         self.time_step = time_step
@@ -94,102 +89,20 @@ class Newton:
         return self.state.particle_q.numpy().astype(float)
 
 
-# ---- MuJoCo: a body of three sliding joints for each node, a spatial tendon for each spring
-
-
-class MuJoCo:
-    """MuJoCo with one of its integrators: EULER (semi-implicit) or DISCRETE (linearly implicit)."""
-
-    def __init__(self, beam: Beam, time_step: float, integrator: str):
-        import mujoco
-
-        self.mujoco, self.rest, self.free = mujoco, beam.nodes, ~beam.pinned
-        spec = mujoco.MjSpec()
-        spec.memory = ARENA
-        spec.option.timestep, spec.option.gravity = time_step, [0, 0, -G]
-        spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
-        self._add_nodes(spec, beam)
-        for (i, j), k, rest_length in zip(beam.springs, beam.stiffness, beam.rest_length, strict=True):
-            tendon = spec.add_tendon(stiffness=[k, 0, 0], springlength=[rest_length, rest_length])
-            tendon.wrap_site(str(i))
-            tendon.wrap_site(str(j))
-        self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-
-    def _add_nodes(self, spec: Any, beam: Beam) -> None:
-        slide = self.mujoco.mjtJoint.mjJNT_SLIDE
-        for i, (position, mass, pinned) in enumerate(zip(beam.nodes, beam.mass, beam.pinned, strict=True)):
-            if pinned:
-                spec.worldbody.add_site(name=str(i), pos=position)
-                continue
-            body = spec.worldbody.add_body(pos=position, mass=mass, inertia=[mass] * 3, explicitinertial=True)
-            body.add_site(name=str(i))
-            for axis in np.eye(3):
-                body.add_joint(type=slide, axis=axis)
-
-    def advance(self, substeps: int) -> None:
-        self.mujoco.mj_step(self.model, self.data, substeps)
-
-    def positions(self) -> np.ndarray:
-        positions = self.rest.copy()
-        positions[self.free] += self.data.qpos.reshape(-1, 3)
-        return positions
-
-
-# ---- pyPBD: particles and XPBD's distance constraints, of compliance 1/k
-
-
-class PyPBD:
-    """Position based dynamics with compliance; its gravity points along -y, so that axes are passed on as y, z, x."""
-
-    def __init__(self, beam: Beam, time_step: float, iterations: int):
-        import pypbd
-
-        self.pypbd, self.time_step, self.count = pypbd, time_step, len(beam.nodes)
-        simulation = pypbd.Simulation.getCurrent()
-        simulation.initDefault()
-        self.model, self.stepper = simulation.getModel(), simulation.getTimeStep()
-        self.particles = self.model.getParticles()
-        for position in np.roll(beam.nodes, -1, axis=1):
-            self.particles.addVertex(position)
-        for i, mass in enumerate(np.where(beam.pinned, 0, beam.mass)):
-            self.particles.setMass(i, mass)
-        for (i, j), k in zip(beam.springs.tolist(), beam.stiffness.tolist(), strict=True):
-            self.model.addDistanceConstraint_XPBD(i, j, k)  # at rest as it is
-        self.model.initConstraintGroups()
-        self.stepper.setValueUInt(pypbd.TimeStepController.MAX_ITERATIONS, iterations)
-
-    def advance(self, substeps: int) -> None:
-        self.pypbd.TimeManager.getCurrent().setTimeStepSize(substeps * self.time_step)
-        self.stepper.setValueUInt(self.pypbd.TimeStepController.NUM_SUB_STEPS, substeps)
-        self.stepper.step(self.model)
-
-    def positions(self) -> np.ndarray:
-        return np.roll([self.particles.getPosition(i) for i in range(self.count)], 1, axis=1)
-
-
-# ---- by name: the package, and how to start from a beam, a substep [s] and a number of iterations
-
-PEERS: dict[str, tuple[str, Callable[[Beam, float, int], Any]]] = {
-    "semi-implicit": ("newton", lambda beam, time_step, _: Newton(beam, time_step, None)),
-    "vbd": ("newton", Newton),
-    "euler": ("mujoco", lambda beam, time_step, _: MuJoCo(beam, time_step, "EULER")),
-    "discrete": ("mujoco", lambda beam, time_step, _: MuJoCo(beam, time_step, "DISCRETE")),
-    "xpbd": ("pypbd", PyPBD),
-}
-
-
 # ---- runs
 
 
 class Case(NamedTuple):
-    """A way to step the beam; by one of PEERS, or an integrator of ours."""
+    """A way to step the beam: an integrator of ours, or substeps of Newton's.
+
+    iterations : of VBD; 0 for the semi-implicit scheme
+    """
 
     program: str
     method: str
-    peer: str
+    integrator: str = ""
     substeps: int = 1
-    iterations: int = 1
+    iterations: int = 0
 
 
 class Trajectory(NamedTuple):
@@ -214,15 +127,10 @@ CASES = [
     Case(OURS, "implicit Euler, `newton` to 1e-3", "implicit-euler"),
     Case(OURS, "BDF2, `newton` to 1e-3", "bdf2"),
     Case(OURS, "Verlet, substeps by its limit", "verlet"),
-    Case("Newton", "SemiImplicit, 20 substeps", "semi-implicit", 20),
-    Case("Newton", "SemiImplicit, 200 substeps", "semi-implicit", 200),
-    Case("Newton", "VBD, 1 step, 10 iterations", "vbd", 1, 10),
-    Case("Newton", "VBD, 20 substeps, 5 iterations", "vbd", 20, 5),
-    Case("MuJoCo", "Euler, 20 substeps", "euler", 20),
-    Case("MuJoCo", "discrete, 1 step", "discrete", 1),
-    Case("MuJoCo", "discrete, 10 substeps", "discrete", 10),
-    Case("pyPBD", "XPBD, 5 substeps, 1 iteration", "xpbd", 5),
-    Case("pyPBD", "XPBD, 100 substeps, 1 iteration", "xpbd", 100),
+    Case("Newton", "SemiImplicit, 20 substeps", substeps=20),
+    Case("Newton", "SemiImplicit, 200 substeps", substeps=200),
+    Case("Newton", "VBD, 1 step, 10 iterations", iterations=10),
+    Case("Newton", "VBD, 20 substeps, 5 iterations", substeps=20, iterations=5),
 ]
 
 
@@ -244,8 +152,8 @@ def set_up(cells: list[int], frames: int, timeout: float) -> Setup:
 
 def ours(case: Case, setup: Setup) -> Trajectory | str:
     """Run a case of our own; why it failed if it did. Verlet's steps solve nothing and have no error."""
-    changes = [*setup.changes, f'time.integrator="{case.peer}"']
-    run = lab.run(SCENE, FOLDER / f"{case.peer}.h5", (), changes, timeout=setup.timeout)
+    changes = [*setup.changes, f'time.integrator="{case.integrator}"']
+    run = lab.run(SCENE, FOLDER / f"{case.integrator}.h5", (), changes, timeout=setup.timeout)
     if run.failure:
         return run.failure
     frames = run.frames("wall_time", "step_error")
@@ -258,9 +166,9 @@ def positions(path: Path) -> np.ndarray:
 
 
 def theirs(case: Case, setup: Setup) -> Trajectory | str:
-    """Run a peer in a process of its own; why it failed if it did."""
-    path = FOLDER / f"{case.peer}.npz"
-    words = ["--frames", setup.frames, "--play", case.peer, setup.reference, path, case.substeps, case.iterations]
+    """Run Newton in a process of its own; why it failed if it did."""
+    path = FOLDER / "newton.npz"
+    words = ["--frames", setup.frames, "--play", setup.reference, path, case.substeps, case.iterations]
     ended = lab.python([Path(__file__), *words], path.with_suffix(".log"), timeout=setup.timeout)
     if ended.reason:
         return ended.reason
@@ -269,18 +177,16 @@ def theirs(case: Case, setup: Setup) -> Trajectory | str:
 
 
 def play(args: Namespace) -> None:
-    """Step the lattice of a result by a peer; its seconds, positions, version and note into a file."""
-    name, result, out, substeps, iterations = args.play
-    package, start = PEERS[name]
-    os.chdir(Path(out).parent)  # where MuJoCo leaves its log
-    peer = start(read_beam(Path(result)), FRAME / int(substeps), int(iterations))
+    """Step the lattice of a result by Newton; its seconds, positions and version into a file."""
+    result, out, substeps, iterations = args.play
+    peer = Newton(read_beam(Path(result)), FRAME / int(substeps), int(iterations))
     positions, seconds = [peer.positions()], []
     for _ in range(args.frames):
         begin = perf_counter()
         peer.advance(int(substeps))
         seconds.append(perf_counter() - begin)
         positions.append(peer.positions())
-    np.savez(out, position=positions, seconds=seconds, version=version(package))
+    np.savez(out, position=positions, seconds=seconds, version=version("newton"))
 
 
 def rows(cases: list[Case], setup: Setup) -> lab.Rows:
@@ -310,15 +216,15 @@ def main() -> None:
     options.add_argument("--frames", type=int, default=30, metavar="N")
     options.add_argument("--only", default="", metavar="WORD", help="cases whose program or method has this word")
     options.add_argument("--timeout", type=float, default=600, metavar="S", help="of each program [s]")
-    options.add_argument("--play", nargs=5, help=SUPPRESS)  # what theirs() starts
+    options.add_argument("--play", nargs=4, help=SUPPRESS)  # what theirs() starts
     args = options.parse_args()
     if args.play:
         play(args)
         return
     use_one_core()
     cases = [case for case in CASES if args.only.lower() in f"{case.program} {case.method}".lower()]
-    with lab.page(args):
-        lab.table(rows(cases, set_up(args.cells, args.frames, args.timeout)))
+    lab.heading()
+    lab.table(rows(cases, set_up(args.cells, args.frames, args.timeout)))
 
 
 if __name__ == "__main__":

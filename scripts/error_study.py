@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Holds the error that steps say they have against their true one, on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--set KEY=VALUE ...] [--json OUT] [-o PAGE]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--set KEY=VALUE ...] [--json OUT]
 
 Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
 or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
@@ -205,8 +205,8 @@ def main() -> int:
         print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)
     names = sorted({row["preset"] for row in rows})
     of_presets = [row_of(name, [row for row in rows if row["preset"] == name]) for name in names]
-    with lab.page(args):
-        lab.table([*of_presets, row_of("all", rows)])
+    lab.heading()
+    lab.table([*of_presets, row_of("all", rows)])
     return int(any(map(bad, rows)))
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The measures of a tree of msmpetsc: rooms, functions, names, density of lines, findings.
 
-    scripts/house.py [FOLDER] [--quick] [-o PAGE]
+    scripts/house.py [FOLDER] [--quick]
 
 FOLDER is a clone, this one if none is given. --quick leaves out mypy, whose rules are this clone's. A walk counts the
 functions, and the modules that they stand in, which take a value of such a type: a Scene, or the request as Namespace
@@ -170,8 +170,7 @@ def main() -> None:
     options.add_argument("--quick", action="store_true", help="read files only")
     args = options.parse_args()
     found = measures(args.folder.resolve(), args.quick)
-    with lab.page(args):
-        lab.table({"measure": name, "now": value} for name, value in found.items())
+    lab.table({"measure": name, "now": value} for name, value in found.items())
 
 
 if __name__ == "__main__":

@@ -1,18 +1,16 @@
-"""What the studies of this folder share: runs of scenes in processes of their own, repeats, and tables in Markdown."""
+"""What the studies of this folder share: runs of scenes in processes of their own, repeats, tables in Markdown."""
 
 import datetime
-import io
 import json
 import shlex
 import sys
-from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import median
-from typing import Any, TextIO, TypeVar
+from typing import Any, TypeVar
 
 from clone import ROOT
 
@@ -142,10 +140,8 @@ def table(rows: Iterable[Row]) -> None:
 
 
 def parser(documentation: str | None) -> ArgumentParser:
-    """Return a parser that prints a script's documentation for --help, and has -o for a page of its results."""
-    options = ArgumentParser(description=documentation, formatter_class=RawDescriptionHelpFormatter)
-    options.add_argument("-o", "--output", type=Path, metavar="PAGE", help="a Markdown file of what is printed")
-    return options
+    """Return a parser that prints a script's documentation for --help."""
+    return ArgumentParser(description=documentation, formatter_class=RawDescriptionHelpFormatter)
 
 
 def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) -> None:
@@ -155,35 +151,15 @@ def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) 
     args = options.parse_args()
     if unknown := set(args.tables) - set(tables):
         options.error(f"no table {', '.join(sorted(unknown))}: {', '.join(tables)}")
-    with page(args):
-        for name in args.tables or tables:
-            print(f"\n## {name}")
-            table(tables[name]())
+    heading()
+    for name in args.tables or tables:
+        print(f"\n## {name}")
+        table(tables[name]())
 
 
-@contextmanager
-def page(args: Namespace) -> Iterator[None]:
-    """Leave what is printed in the file of -o, too, if there is one, below the command, the day and the machine."""
-    if args.output is None:
-        yield
-        return
-    args.output.parent.mkdir(parents=True, exist_ok=True)
+def heading() -> None:
+    """Print the command of a script, the day and the machine, below which its tables stand."""
     name, *words = sys.argv
-    with open(args.output, "w") as file, redirect_stdout(Both(sys.stdout, file)):
-        file.write(f"# {Path(name).name}\n\n```sh\n{shlex.join([f'scripts/{Path(name).name}', *words])}\n```\n\n")
-        host = machine()
-        file.write(f"{datetime.date.today()}, msmpetsc {__version__}, {host['cpu']}, {host['cores']} cores.\n")
-        yield
-
-
-class Both(io.TextIOBase):
-    """A stream that writes into two, each time to the end, so that what was measured outlives a kill."""
-
-    def __init__(self, *streams: TextIO):
-        self.streams = streams
-
-    def write(self, text: str) -> int:
-        for stream in self.streams:
-            stream.write(text)
-            stream.flush()
-        return len(text)
+    print(f"# {Path(name).name}\n\n```sh\n{shlex.join([f'scripts/{Path(name).name}', *words])}\n```\n")
+    host = machine()
+    print(f"{datetime.date.today()}, msmpetsc {__version__}, {host['cpu']}, {host['cores']} cores.", flush=True)

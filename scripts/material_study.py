@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Both laws against elasticity at small strain, Poisson's ratio 1/4.
 
-    scripts/material_study.py [beam wave round turned ball] [-o PAGE]
+    scripts/material_study.py [beam wave round turned ball]
 
 Of boxes that lie along the grid: a clamped beam, a wave. Of bodies that do not, whole boundary cells
 beside those by their fill, and the neo-Hookean solid: clamped bars, round and turned, and the frequency of a ball; of

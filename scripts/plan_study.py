@@ -1,26 +1,20 @@
 #!/usr/bin/env python3
 """Holds what `plan --surface-error` chooses against finer runs. Needs the meshes.
 
-    scripts/plan_study.py [SCENE...] [--errors 0.1 0.03 0.01] [--laws LAW...] [--cells N] [--frames N]
-                          [--limit SECONDS] [-o PAGE]
+    scripts/plan_study.py [SCENE...] [--errors 0.1 0.03 0.01] [--cells N] [--frames N] [--limit S]
 
 The finer run has 32 times the cells of the choice, or 8 times where that takes longer than the limit, and a quarter
 more than the plan's finest trial at least. It takes explicit substeps or a quarter of the step; a static one is static.
-Where no choice meets the error, the best one is held against a finer run. With --laws each scene is planned with each
-of these laws of its material. SCENE is a name of the study or a scene file.
+Where no choice meets the error, the best one is held against a finer run. SCENE is a name of the study or a scene file.
 """
 
 import json
-import tomllib
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
-from shutil import copy
 from typing import NamedTuple
 
 import lab
-
-import tomli_w
 
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
@@ -92,21 +86,6 @@ class Planned(NamedTuple):
             yield round(max(times * self.cells, MORE * finest)), method
 
 
-def scene_file(name: str, law: str | None) -> Path:
-    """Return the file of a scene, of its twin by another law, which is written."""
-    file = Path(name) if name.endswith(".toml") else lab.SCENES / f"{name}.toml"
-    if law is None:
-        return file
-    tables = tomllib.loads(file.read_text())
-    tables["material"]["law"] = law
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    if (mesh := file.parent / tables["mesh"]["source"]).exists():  # a scene may name what lies beside it alone
-        copy(mesh, FOLDER)
-    twin = FOLDER / f"{file.stem}_{law}.toml"
-    twin.write_text(tomli_w.dumps(tables))
-    return twin
-
-
 def planned(file: Path, target: float, frames: int | None, cells: int) -> Planned | str:
     """Return what `msmpetsc plan` chooses; or why there is nothing."""
     words = ["--surface-error", target, *(("--frames", frames) if frames else ()), "--cells", cells, "--json"]
@@ -134,9 +113,9 @@ def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
     return None, why
 
 
-def row(names: dict[str, object], target: float, plan: Planned | str, limit: float) -> lab.Row:
-    """Return the row of a plan; ``names``: its first columns."""
-    found = names | {"asked": f"{100 * target:g}%"}
+def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row:
+    """Return the row of the plan of a scene."""
+    found: dict[str, object] = {"scene": scene, "asked": f"{100 * target:g}%"}
     if isinstance(plan, str):
         return found | {"chosen, cells": plan}
     error, why = true_error(plan, limit)
@@ -160,25 +139,23 @@ def rows(args: Namespace) -> lab.Rows:
         number = next((number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1)
         for scene in args.scenes or STUDIES:
             tried, finest = STUDIES.get(scene, ANOTHER)
-            for law in args.laws:
-                size = args.frames or tried[number], args.cells or finest[number]
-                names = {"scene": scene} | ({"law": law} if law else {})
-                yield row(names, target, planned(scene_file(scene, law), target, *size), args.limit)
+            file = Path(scene) if scene.endswith(".toml") else lab.SCENES / f"{scene}.toml"
+            plan = planned(file, target, args.frames or tried[number], args.cells or finest[number])
+            yield row(scene, target, plan, args.limit)
 
 
 def main() -> None:
     options = lab.parser(__doc__)
     options.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(STUDIES))
     options.add_argument("--errors", nargs="+", type=float, default=ERRORS)
-    options.add_argument("--laws", nargs="+", default=[None], metavar="LAW", help="of the material; the scene's own")
     options.add_argument("--cells", type=int, help="of the finest trial")
     options.add_argument("--frames", type=int, help="the first ones, that are tried")
     options.add_argument("--limit", type=float, default=LIMIT, help="seconds of a finer run")
     args = options.parse_args()
     if unknown := {name for name in args.scenes if name not in STUDIES and not Path(name).is_file()}:
         options.error(f"no such scene: {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}")
-    with lab.page(args):
-        lab.table(rows(args))
+    lab.heading()
+    lab.table(rows(args))
 
 
 if __name__ == "__main__":

@@ -49,11 +49,9 @@ def main(arguments: list[str] | None = None) -> int:
     options.add_argument("--ranks", type=int, default=1, metavar="N", help="MPI ranks of the runs (1)")
     options.add_argument("--update", action="store_true", help="store the numbers found in place of those there")
     args = options.parse_args(arguments)
-    with lab.page(args):
-        print(baseline.HEAD)
-        outcomes = [check(scene, args.ranks, args.update) for scene in args.scenes]
-        for line in (line for wrong in outcomes for line in wrong or ()):
-            print(line)
+    print(baseline.HEAD)
+    outcomes = [check(scene, args.ranks, args.update) for scene in args.scenes]
+    print("".join(f"{line}\n" for wrong in outcomes for line in wrong or ()), end="")
     return int(any(outcomes) or all(outcome is None for outcome in outcomes))
 
 

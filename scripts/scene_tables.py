@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Tables of the shipped scenes. Needs the meshes.
 
-    scripts/scene_tables.py table1|tissue|touching [SCENE...] [--frames N] [--set KEY=VALUE ...] [-o PAGE]
+    scripts/scene_tables.py table1|tissue|touching [SCENE...] [--frames N] [--set KEY=VALUE ...]
 
 table1   : the paper's Table 1 beside ours, the paper's figures in brackets: with its own springs, and as its twin, a
            neo-Hookean solid of the same Young's modulus and Poisson's ratio 1/4. Frames a second are those of the
@@ -166,8 +166,8 @@ def main() -> None:
     options.add_argument("--shorter", type=int, default=1, metavar="N", help="times, the steps")
     args = options.parse_args()
     row, scenes = TABLES[args.table]
-    with lab.page(args):
-        lab.table(row(scene, args) for scene in args.scenes or scenes)
+    lab.heading()
+    lab.table(row(scene, args) for scene in args.scenes or scenes)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from msmpetsc.cli.commands import check as numbers
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study import baseline
 
 STORED = ROOT / "tests" / "regression"
 
@@ -36,7 +35,7 @@ def check(scene: str, ranks: int, update: bool) -> list[str] | None:
         if update:
             numbers.update(path, file, None, ranks)
             return []
-        return [f"{scene}: {line}" for line in numbers.checked(path, baseline.read(file), ranks).wrong]
+        return [f"{scene}: {line}" for line in numbers.checked(path, numbers.read(file), ranks)]
     except InputError as error:
         print(f"{scene:20} FAILED")
         return [str(error)]
@@ -49,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
     options.add_argument("--ranks", type=int, default=1, metavar="N", help="MPI ranks of the runs (1)")
     options.add_argument("--update", action="store_true", help="store the numbers found in place of those there")
     args = options.parse_args(arguments)
-    print(baseline.HEAD)
+    print(numbers.HEAD)
     outcomes = [check(scene, args.ranks, args.update) for scene in args.scenes]
     print("".join(f"{line}\n" for wrong in outcomes for line in wrong or ()), end="")
     return int(any(outcomes) or all(outcome is None for outcome in outcomes))

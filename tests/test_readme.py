@@ -26,7 +26,6 @@ from msmpetsc.geometry.registry import locate
 from msmpetsc.scene.bodies import BodyTable
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.solve.presets import PRESETS
 from msmpetsc.study.study_file import load_study
 
 OUTSIDE = {".venv", "out", "build", ".petsc-cuda", ".pytest_cache", ".hypothesis"}
@@ -193,7 +192,7 @@ def test_the_study_files_are_some(tmp_path: Path):
     path = tmp_path / "study.toml"
     for text in blocks(ROOT / "scenes" / "studies" / "README.md", "toml"):
         path.write_text(text)
-        study = load_study(path, PRESETS)
+        study = load_study(path)
         assert study.sweep or study.map
 
 

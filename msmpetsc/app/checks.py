@@ -9,7 +9,7 @@ from msmpetsc.results.disk import refuse_no_file
 
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
 MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
-SCENE_NAMES, XML_NAMES = (".toml",), (".xml",)
+SCENE_NAMES = (".toml",)
 NO_PART_OF_A_LINE = ("Cc", "Cs", "Zl", "Zp")  # categories: controls, bytes that are no UTF-8, ends of lines
 
 

@@ -152,6 +152,7 @@ COMMANDS = {
                 "--mesh", type=checked_file, metavar="MESH",
                 help="a mesh file in or below the scene's folder, or a model",
             ),
+            argument("--up", choices=("y", "z"), help="the mesh's upward axis; default: z, of glTF y"),
             argument("--from", dest="from_scene", metavar="NAME", help="copy this scene, see --list"),
             switch("--list", "list the scenes that come with msmpetsc"),
             switch("--overwrite", "replace SCENE.toml if it exists"),
@@ -275,7 +276,7 @@ COMMANDS = {
         "store a scene's numbers; say whether they still hold",
         (
             "msmpetsc check my.toml --update --cells 400 --frames 10",
-            "msmpetsc check my.toml other.toml --ranks 2 --junit out/check.xml",
+            "msmpetsc check my.toml other.toml --ranks 2",
         ),
         (
             argument("scenes", type=checked_file, nargs="+", metavar="SCENE", help="scene files (TOML)"),
@@ -285,7 +286,6 @@ COMMANDS = {
             whole("--cells", "N", "of --update: cages.count; the scene's if not given"),
             whole("--frames", "N", "of --update: steps, the scene's at the most (20)"),
             SET,
-            argument("--junit", type=checked_file, metavar="OUT.xml", help="write what was checked as JUnit XML"),
             JSON,
         ),
         description="Run the first steps of scenes, each solved to 1e-9, and hold counts, energies, momentum and "

@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -178,7 +178,6 @@ class StudyPart:
 def run_study(
     path: Path,
     folder: Path,
-    presets: Collection[str] | None,
     *,
     full: bool = False,
     jobs: int | None = None,
@@ -192,8 +191,8 @@ def run_study(
     its own, and only its rows are returned. Raises InputError before anything is run.
     """
     require_extra()
-    study = load_study(path, presets)
-    every, wanted = _cases(study, path, full, presets)
+    study = load_study(path)
+    every, wanted = _cases(study, path, full)
     wanted = part.of(wanted) if part else wanted
     own = part.folder(folder) if part else folder
     own.mkdir(parents=True, exist_ok=True)
@@ -212,22 +211,18 @@ def run_study(
     return [results.rows[case] for case in wanted]
 
 
-def list_study(
-    path: Path, folder: Path, presets: Collection[str] | None, full: bool = False
-) -> list[tuple[Case, bool]]:
+def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case, bool]]:
     """Return the cases of a study file, and whether each is done; nothing is run or written."""
     require_extra()
-    every, wanted = _cases(load_study(path, presets), path, full, presets)
+    every, wanted = _cases(load_study(path), path, full)
     rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
     return [(every[case], _is_done(every[case], rows)) for case in wanted]
 
 
-def _cases(
-    study: Study, path: Path, full: bool, presets: Collection[str] | None
-) -> tuple[dict[str, Case], Sequence[str]]:
+def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Sequence[str]]:
     """Return all cases by their id, and the ids of those that are wanted."""
-    every = {case.id: case for case in study_cases(study, path.parent, True, presets)}
-    return every, [case.id for case in study_cases(study, path.parent, full, presets)]
+    every = {case.id: case for case in study_cases(study, path.parent, True)}
+    return every, [case.id for case in study_cases(study, path.parent, full)]
 
 
 def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:

@@ -1,7 +1,7 @@
 """A study file (TOML): which scenes are run, and with what."""
 
 import shlex
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -12,6 +12,7 @@ from msmpetsc.scene.problems import problem_lines, rule
 from msmpetsc.scene.reading import OF_STUDIES, read_toml
 from msmpetsc.scene.values import Count, FileName, IntegratorName, ListOf, Positive, PresetName, Table
 from msmpetsc.solve.petsc.words import unsafe_word
+from msmpetsc.solve.presets import preset_names
 
 Error = Annotated[float, Field(gt=0, lt=1)]
 Override = Annotated[str, Field(min_length=3)]  # of the scene, as of --set: "key.path=value"
@@ -217,15 +218,12 @@ class Study(Table):
         return self
 
 
-def load_study(path: Path, presets: Collection[str] | None = None) -> Study:
-    """Read and check a study file; ``presets`` are the names known, any will do if None.
-
-    Raises InputError naming every problem, one a line.
-    """
+def load_study(path: Path) -> Study:
+    """Read and check a study file. Raises InputError naming every problem, one a line."""
     text, data = read_toml(path, "study")
     if {"mesh", "body"} & data.keys() and OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a scene, no study: msmpetsc run {path}")
     try:
-        return Study.model_validate(data, context={"presets": presets})
+        return Study.model_validate(data, context={"presets": preset_names()})
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error, text, {}))) from None

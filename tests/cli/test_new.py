@@ -16,58 +16,27 @@ from conftest import ROOT
 from one_process import command_error
 
 import msmpetsc
+from msmpetsc.cli.commands.new import measured, unit_of
 from msmpetsc.cli.main import main
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study.new_scene import measured, unit_of
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
     return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
 
 
-def chair(upwards: int, back: int) -> trimesh.Trimesh:
-    """A chair of boxes that stands on y (1) or z (2), its back towards one end (1) or the other (-1)."""
-    boxes = [[[0, 0.4, 0], [0.45, 0.45, 0.45]], [[0, 0.45, 0], [0.45, 0.9, 0.05]]]  # seat and back
-    boxes += [[[x, 0, z], [x + 0.05, 0.4, z + 0.05]] for x in (0, 0.4) for z in (0, 0.4)]
-    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in boxes])
-    turns = [trimesh.transformations.rotation_matrix(np.pi, [0, 1, 0])] * (back < 0)
-    turns += [trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])] * (upwards == 2)
-    for turn in turns:
-        mesh.apply_transform(turn)
-    return mesh
-
-
-def table(upwards: int) -> trimesh.Trimesh:
-    """A table, which lies as well on its top, and on its sides."""
-    boxes = [[[0, 0.7, 0], [1.2, 0.75, 0.8]]]
-    boxes += [[[x, 0, z], [x + 0.06, 0.7, z + 0.06]] for x in (0, 1.14) for z in (0, 0.74)]
-    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in boxes])
-    return mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2 * (upwards == 2), [1, 0, 0]))
-
-
-@pytest.mark.parametrize("axis", [1, 2])
-def test_furniture_stands_on_its_feet(axis: int):
-    for mesh in (chair(axis, 1), chair(axis, -1), table(axis)):
-        assert measured(surface(mesh)).y_up == (axis == 1)
-
-
-@pytest.mark.parametrize("axis", [1, 2])
-def test_new_says_which_axis_it_takes_for_upwards_and_what_changes_that(axis, tmp_path, monkeypatch, caplog):
+@pytest.mark.parametrize(("suffix", "words", "up"), [("stl", [], "z"), ("stl", ["--up", "y"], "y"), ("glb", [], "y")])
+def test_new_takes_z_for_upwards_or_what_is_said(suffix, words, up, tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
-    table(axis).export("table.stl")
+    trimesh.creation.box([0.1, 0.2, 0.1]).export(f"box.{suffix}")
     with caplog.at_level("INFO", logger="msmpetsc"):
-        assert main(["new", "my.toml", "--mesh", "table.stl"]) == 0
-    assert f"{'xyz'[axis]} is taken for upwards" in caplog.text and "mesh.prepare" in caplog.text
+        assert main(["new", "my.toml", "--mesh", f"box.{suffix}", *words]) == 0
+    assert f"{up} is taken for upwards" in caplog.text
     turns = [step for step in load_scene("my.toml").mesh.prepare if "rotate" in step]
-    assert len(turns) == (axis == 1)
+    assert len(turns) == (up == "y")
     assert "upwards" in Path("my.toml").read_text()
-
-
-def test_gltf_has_y_upwards_by_definition_and_a_ball_has_z():
-    ball = surface(trimesh.creation.icosphere(subdivisions=2))
-    assert measured(ball, ".glb").y_up and not measured(ball, ".ply").y_up
 
 
 @pytest.mark.parametrize(("side", "unit"), [(0.3, 1.0), (15.0, 1.0), (150.0, 1e-3), (1e-5, None), (1e6, None)])

@@ -59,7 +59,7 @@ def study_file(folder: Path, text: str) -> Path:
 
 def carry_out(folder: Path, text: str, **options) -> list[dict]:
     """The rows of a study in this folder."""
-    run_study(study_file(folder, text), folder / "out", None, **options)
+    run_study(study_file(folder, text), folder / "out", **options)
     return records(read_table(folder / "out"))
 
 

@@ -19,13 +19,11 @@ from conftest import ROOT
 from one_process import input_error
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
-from msmpetsc.cli.commands import new
-from msmpetsc.cli.commands.check import Checked, write_junit
+from msmpetsc.cli.commands import check, new
 from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export
 from msmpetsc.results.reader import Result
 from msmpetsc.results.xdmf import write_xdmf
-from msmpetsc.study import baseline
 from msmpetsc.study.charts.plot import COUNT, Chart, curve_styles, log_axis, save_png
 from msmpetsc.study.report import write_report
 from msmpetsc.study.runner import StudyResults
@@ -87,11 +85,7 @@ def writers(sources: Path) -> dict[str, Writer]:
             lambda path: small_result.write(path.with_suffix(".h5")),
         ),
         "x.toml": Writer("cli/commands/new.py", lambda path: new.write(path, "title = 'a scene'\n")),
-        "x.baseline.json": Writer("study/baseline.py", lambda path: baseline.write(path, NUMBERS)),
-        "junit.xml": Writer(
-            "cli/commands/check.py",
-            lambda path: write_junit(path, [Checked(Path("a.toml"), {"cells": "", "nodes": "off"}, 1.0)]),
-        ),
+        "x.baseline.json": Writer("cli/commands/check.py", lambda path: check.write(path, NUMBERS)),
         "planned.toml": Writer(
             "study/sizing/answer.py",
             lambda path: put_into(path, tables(Candidate("verlet", 0.02))),
@@ -113,7 +107,7 @@ def writers(sources: Path) -> dict[str, Writer]:
     return table | {f"z{end}": Writer("view/page.py", partial(page, ball)) for end in PAGE_NAMES}
 
 
-NUMBERS = baseline.Numbers(run=baseline.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={})
+NUMBERS = check.Numbers(run=check.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={})
 NAMES = [*writers(Path())]
 # what never ends a run, and what needs one to be called: these too write by the one way, and nothing else
 NOT_TRIED = {"app/profile.py", "cli/commands/series.py"}

@@ -57,9 +57,9 @@ def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
     """Three cases in two parts of 1 and 2; one part is run twice, its cases once."""
     text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = [0.3, 0.2, 0.1]'
     path, out = study_file(tmp_path, text), tmp_path / "out"
-    found = {index: run_study(path, out, None, part=StudyPart(index, 2)) for index in (2, 1, 2)}
+    found = {index: run_study(path, out, part=StudyPart(index, 2)) for index in (2, 1, 2)}
     assert [[row["error"] for row in found[index]] for index in (1, 2)] == [[0.3], [0.2, 0.1]]
-    assert not (out / "table.csv").exists() and [done for _, done in list_study(path, out, None)] == [True] * 3
+    assert not (out / "table.csv").exists() and [done for _, done in list_study(path, out)] == [True] * 3
     assert [len(log.read_text().splitlines()) for log in sorted(out.glob("parts/*/calls.txt"))] == [1, 2]
     rows = carry_out(tmp_path, text)
     assert [row["error"] for row in rows] == [0.3, 0.2, 0.1] and calls(tmp_path) == []
@@ -113,7 +113,7 @@ def stands_in(of, result, figures):
     at = words.index("-m")
     return [*words[:at], sys.argv[1], *words[at + 2:]]
 runner.command = stands_in
-runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]), None)
+runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]))
 """
 
 

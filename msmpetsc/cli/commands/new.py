@@ -1,22 +1,48 @@
-"""``msmpetsc new``: a first scene for a mesh of one's own, or a copy of one that comes with msmpetsc."""
+"""``msmpetsc new``: a first scene for a mesh of one's own, or a copy of one that comes with msmpetsc.
+
+The mesh is measured; its unit is guessed, its faults and parts counted. The body either falls on
+the ground or, long and lying, is clamped at one end and bends under its weight. Young's modulus follows from the size,
+so that any body deforms visibly; the step from the period of its slowest motion.
+"""
 
 import argparse
 import json
+import math
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+import trimesh
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
+from msmpetsc.build import USUAL
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.geometry.prepare import part_labels
 from msmpetsc.geometry.registry import MODELS, load, locate
-from msmpetsc.geometry.surface import check_encloses, examine
+from msmpetsc.geometry.surface import Surface, SurfaceReport, check_encloses, examine
+from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.results.disk import whole_file, write_whole
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
-from msmpetsc.study.new_scene import draft, measured, upwards
 
 SHIPPED = Path(msmpetsc.__file__).parent / "shipped"  # the scenes that a wheel holds, too; in a clone a link to scenes/
+MILLIMETRE = 1e-3  # [m]
+Y_BY_DEFINITION = (".glb", ".gltf")  # points upwards in such files
+G, DENSITY = 9.81, 1000.0  # [m/s^2], [kg/m^3]
+USUAL_SIZE = 0.3  # [m], where the file's unit cannot be guessed
+SLENDER = 2.5  # times its other sides: so long a body is a beam
+DROP = 0.2  # of the height, that a body falls
+ACROSS, CELLS = 3, (1000, 8000)  # cells across the mean thickness, within these counts
+SINKING = 100  # rho g H in Young's modulus, of a body that falls
+SAG, CLAMPED = 0.15, 0.05  # of a beam's length: what its end sinks by, what is clamped
+PERIODS = 3
+DEBRIS = 0.01  # of the area: all parts but the largest together
+COLUMN = 39  # where comments begin
+TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"  # y upwards becomes z upwards
+GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,20 +61,20 @@ def run(args: argparse.Namespace) -> int:
     if args.from_scene is not None:
         text = f"#:schema {SCHEMA_FILE}\n{shipped_text(args.from_scene)}"
     else:
-        text = drafted(args.mesh, args.scene)
+        up = args.up or ("y" if args.mesh.suffix.lower() in Y_BY_DEFINITION else "z")
+        text = drafted(args.mesh, args.scene, up)
     scene_of(args.scene, text, to_read=False)  # so that nothing is written that run would refuse
     write(args.scene, text)
     print(f"{args.scene}\nto run it: msmpetsc run {args.scene} --picture")
     return 0
 
 
-def drafted(mesh: Path, scene: Path) -> str:
-    """Return the text of a scene for a mesh, a file or a registry name. Raises InputError."""
-    is_named = str(mesh) in MODELS
-    source, suffix = (str(mesh), "") if is_named else (beside(mesh, scene), mesh.suffix)
+def drafted(mesh: Path, scene: Path, up: str) -> str:
+    """Return the text of a scene for a mesh, a file or a registry name, with ``up`` upwards. Raises InputError."""
+    source = str(mesh) if str(mesh) in MODELS else beside(mesh, scene)
     surface = load(source, scene.parent)
     warnings = check_encloses(surface, examine(surface))
-    measures = measured(surface, suffix)
+    measures = measured(surface)
     count, state = len(measures.parts), "closed" if measures.report.closed else "open"
     parts = f"{count} parts, the largest of {measures.parts[0]:.0%} of the area" if count > 1 else "1 part"
     log.info("%s: %d triangles, %s, %s", mesh, measures.triangles, state, parts)
@@ -56,8 +82,8 @@ def drafted(mesh: Path, scene: Path) -> str:
         log.warning("%s: %s", mesh, warning)
     if warnings or count > 1:
         log.info("what the scene does about that stands in its comments")
-    log.info("%s", upwards(measures))
-    return draft(source, scene.stem, measures)
+    log.info("%s is taken for upwards: --up says another axis", up)
+    return draft(source, scene.stem, measures, up)
 
 
 def beside(mesh: Path, scene: Path) -> str:
@@ -94,3 +120,180 @@ def shipped_text(name: str) -> str:
     if name not in titles:
         raise InputError(f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: msmpetsc new --list")
     return (SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
+
+
+# ---- the mesh
+
+
+@dataclass(frozen=True)
+class MeshMeasures:
+    """What a first scene rests on, lengths in the file's unit."""
+
+    sides: np.ndarray  # (3,) of the bounding box
+    triangles: int
+    report: SurfaceReport
+    parts: np.ndarray  # (p,) share of the area that each connected part has, the largest first
+    unit: float | None  # [m]; None where neither metres nor millimetres give a usual body
+
+    @property
+    def thickness(self) -> float:
+        """Mean thickness, twice the volume over the area; in the file's unit."""
+        return 2 * abs(self.report.volume) / self.report.area
+
+
+def measured(surface: Surface) -> MeshMeasures:
+    """Measure a surface as its file has it."""
+    sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
+    areas = np.bincount(part_labels(surface), trimesh.triangles.area(surface.points[surface.triangles]))
+    return MeshMeasures(
+        sides=sides,
+        triangles=len(surface.triangles),
+        report=examine(surface),
+        parts=np.sort(areas / areas.sum())[::-1],
+        unit=unit_of(float(sides.max())),
+    )
+
+
+def unit_of(side: float) -> float | None:
+    """Return the unit [m] in which a body of this longest side has a usual size, metres before millimetres."""
+    return next((unit for unit in (1.0, MILLIMETRE) if USUAL[0] <= side * unit <= USUAL[1]), None)
+
+
+# ---- the scene
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """The body as it will lie, z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
+
+    sides: np.ndarray
+    thickness: float
+    volume: float
+
+    @property
+    def axis(self) -> int | None:
+        """The horizontal axis along which the body is a beam; None for any other."""
+        along = int(np.argmax(self.sides))
+        return along if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max() else None
+
+
+def draft(source: str, title: str, mesh: MeshMeasures, up: str) -> str:
+    """Return the text of a scene for a mesh with the axis ``up`` upwards, ``source`` as the scene will name it."""
+    unit = mesh.unit or USUAL_SIZE / mesh.sides.max()
+    sides = unit * (mesh.sides[[0, 2, 1]] if up == "y" else mesh.sides)
+    body = Dimensions(sides, unit * mesh.thickness, unit**3 * abs(mesh.report.volume))
+    head = [
+        f"#:schema {SCHEMA_FILE}",
+        "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
+        f"title = {json.dumps(title, ensure_ascii=False)}",
+    ]
+    moved = _clamped(body, body.axis) if body.axis is not None else _falling(body)
+    return "\n".join([*head, "", *_mesh(source, mesh, body, up), "", *_cages(body), "", *moved]) + "\n"
+
+
+def _mesh(source: str, mesh: MeshMeasures, body: Dimensions, up: str) -> list[str]:
+    """Return the table of the mesh, and what is wrong with it."""
+    report = mesh.report
+    parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
+    state = "closed" if report.closed else f"open ({report.boundary_edges} boundary edges)"
+    name = json.dumps(source, ensure_ascii=False)
+    lines = ["[mesh]", line(f"source = {name}", f"{mesh.triangles} triangles, {state}, {parts}")]
+    steps = []
+    reasons = []
+    if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
+        steps.append('"largest_part"')
+        reasons.append(f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area")
+    if report.inconsistent_edges or report.volume < 0:
+        steps.append('"orient"')
+        reasons.append("faces are wound inwards, or against each other")
+    if up == "y":
+        steps.append(TURN)
+        reasons.append("y is taken for upwards and turned to z: if z is, take rotate out of prepare")
+    else:
+        reasons.append(f"z is taken for upwards: if y is, put {TURN} into prepare")
+    lines += [f"# {reason}" for reason in reasons]
+    if steps:
+        lines.append(f"prepare = [{', '.join(steps)}]")
+    if not report.closed:
+        lines.append('# open: the winding number decides what is inside; prepare = ["repair"] would close it')
+    if len(mesh.parts) > 1 and '"largest_part"' not in steps:
+        lines.append('# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap')
+    guess = {1.0: "as in the file, taken as metres", None: "unit of the file unknown: what is it?"}
+    lines.append(
+        line(f"size = {plain(body.sides.max(), 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}")
+    )
+    if body.axis is None:
+        drop = plain(DROP * body.sides[2], 2)
+        lines.append(
+            line(f"base = [0, 0, {drop}]", "middle of the bottom at the start [m]: it falls a fifth of its height")
+        )
+    return lines
+
+
+def _cages(body: Dimensions) -> list[str]:
+    aim = body.volume * (ACROSS / body.thickness) ** 3
+    count = int(float(plain(min(max(aim, CELLS[0]), CELLS[1]), 1)))
+    across = body.thickness * (count / body.volume) ** (1 / 3)
+    return ["[cages]", line(f"count = {count}", f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}")]
+
+
+def _falling(body: Dimensions) -> list[str]:
+    """Return the tables of a body that falls on the ground."""
+    height = float(body.sides[2])
+    young = SINKING * DENSITY * G * height
+    period = 4 * height / math.sqrt(young / DENSITY)  # of waves along the height
+    fall = math.sqrt(2 * DROP * height / G)
+    ground = [
+        "[[obstacle]]",
+        line('shape = "plane"', "the ground: the body is no beam that lies, so it falls rather than hangs"),
+        line("point = [0, 0, 0]", "[m]"),
+        line("normal = [0, 0, 1]", "towards the free side"),
+        line('response = "penalty"', 'or "reflect", with a restitution'),
+        line("friction = 0.5", "Coulomb's coefficient"),
+    ]
+    material = _material(young, f"its own weight presses it together by about {100 / SINKING:g}%")
+    return [*material, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
+
+
+def _clamped(body: Dimensions, axis: int) -> list[str]:
+    """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
+    length, thick = float(body.sides[axis]), float(body.sides[2])
+    young = 1.5 * DENSITY * G * length**3 / (thick**2 * SAG)  # q l^4 / 8 E I = SAG l under its weight
+    period = bending_period(length, thick, young, DENSITY)
+    along = np.eye(3, dtype=int)[axis]
+    point = ", ".join(f"{CLAMPED * each:g}" for each in along)
+    normal = ", ".join(str(-each) for each in along)
+    region = f"half_space = {{ point = [{point}], normal = [{normal}] }}, relative = true"
+    pin = [line("[[pin]]", "the body is long and lies: one end does not move"), f"region = {{ {region} }}"]
+    material = _material(young, f"its end would sink by about {100 * SAG:g}% of its length")
+    return [*material, "", *_time(PERIODS * period, period), "", *GRAVITY, "", *pin]
+
+
+def _material(young: float, effect: str) -> list[str]:
+    return [
+        "[material]",
+        line(f"young_modulus = {plain(young, 1)}", f"[Pa]; {effect}"),
+        line(f"density = {plain(DENSITY, 4)}", "[kg/m^3], as water"),
+        line('law = "neo-hookean"', 'a solid; "linear" has the paper\'s springs'),
+        line("poisson_ratio = 0.25", "[-]; tissue has 0.45, rubber 0.49"),
+    ]
+
+
+def _time(duration: float, period: float) -> list[str]:
+    """Return the table of time for a motion whose slowest part has this period [s]."""
+    step = float(plain(period / STEPS_A_PERIOD, 1))
+    return [
+        "[time]",
+        line(f"step = {step:g}", f"[s]; the slowest motion takes about {period:.2g} s"),
+        line(f"duration = {step * math.ceil(duration / step):.6g}", "[s]"),
+    ]
+
+
+def line(setting: str, comment: str) -> str:
+    """Return a line of TOML with a comment, which begins in its column where there is room."""
+    return f"{setting:{COLUMN - 1}} # {comment}"
+
+
+def plain(value: float, digits: int) -> str:
+    """Return a number of so many digits as a person writes it in TOML: 0.12, 3e5."""
+    return f"{value:.{digits}g}".replace("e+0", "e")

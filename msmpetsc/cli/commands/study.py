@@ -14,21 +14,17 @@ from msmpetsc.study.table import as_table, failed, mapped, swept
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; return the exit status."""
     part = part_of(args.part)
-    from msmpetsc.solve.presets import preset_names
-
     folder = args.output or Path("out") / args.study.stem
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
-        listed = list_study(args.study, folder, preset_names(), args.full)
+        listed = list_study(args.study, folder, args.full)
         for number, (case, done) in enumerate(listed, 1):  # the I of --part I/N, where N is the number of cases
             state = "done" if done else "open"
             print(f"{number:4} {state}  {case.scene}: {case.label}  {shown_command(case)}")
         print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
         return 0
-    rows = run_study(
-        args.study, folder, preset_names(), full=args.full, jobs=args.jobs, restart=args.restart, part=part
-    )
+    rows = run_study(args.study, folder, full=args.full, jobs=args.jobs, restart=args.restart, part=part)
     log_failures(rows)
     if part:
         print(part.folder(folder) / "table.csv")  # the study that joins the parts writes the report

@@ -1,7 +1,7 @@
 """The trials that size a scene: coarse lattices tell the error of the step, three lattices that of the cells."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +11,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.scene.values import IntegratorName
+from msmpetsc.solve.presets import preset_names
 from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
@@ -50,19 +51,12 @@ class Asked(NamedTuple):
 class Sizer:
     """Makes the trials of one scene for one surface error; ``report`` gets each, and notes."""
 
-    def __init__(
-        self,
-        scene: Path,
-        bench: Bench,
-        asked: Asked,
-        presets: Collection[str],
-        report: Callable[[SizeTrial | str], None],
-    ):
+    def __init__(self, scene: Path, bench: Bench, asked: Asked, report: Callable[[SizeTrial | str], None]):
         self.scene = scene
         self.bench = bench
         self.target = asked.target
         self.ranks = asked.ranks
-        self.as_given = load_scene(scene, (), presets)
+        self.as_given = load_scene(scene, (), preset_names())
         count = asked.cells or self.as_given.cages.count
         if count is None:
             raise InputError(f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has")

@@ -15,7 +15,6 @@ Of different lattices of one mesh their surfaces are, point by point: both carry
 that nothing is projected or interpolated. A point counts by the area around it, a third of its triangles'.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -239,14 +238,12 @@ def common_times(a: Floats, b: Floats) -> Indices:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is far apart, and is reported as that
-def compare_surfaces(run: Result, reference: Result, until: float = math.inf) -> Comparison:
+def compare_surfaces(run: Result, reference: Result) -> Comparison:
     """Return how far the surface of a run is from that of a reference run, at the times that both have.
 
     Its fields are the greatest distance of a point, and the root mean square over the area (MEAN).
     Both are relative to the largest displacement of a point in the reference, their scale [m]; if
     that is 0, as none moves, they are in metres.
-
-    until : times after it do not count [s]
 
     Raises InputError where a file has no surface, the meshes differ or no time is common.
     """
@@ -254,7 +251,6 @@ def compare_surfaces(run: Result, reference: Result, until: float = math.inf) ->
     rest, area = reference["surface/points"][:], point_areas(reference)
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
-    pairs = pairs[times[pairs[:, 0]] <= until * (1 + SAME_TIME)]
     if reference.scene.get("time", {}).get("integrator") == "static":
         pairs = pairs[times[pairs[:, 0]] > 0]  # when it is in its rest shape, which is no state of equilibrium
     if not len(pairs):

@@ -1,7 +1,6 @@
 """The figures of a run: a row of the table, its distances, its outcome in a word."""
 
 import json
-import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -222,16 +221,16 @@ def trajectory_error(result: Path, reference: Path) -> float:
     return float(np.sqrt(off / moved))
 
 
-def surface_error(result: Path, reference: Path, until: float = math.inf) -> float:
+def surface_error(result: Path, reference: Path) -> float:
     """Return the distance of a run's surface from that of a reference run, of any lattice of the same mesh [-].
 
         sqrt( mean over times and area of |s - s_ref|^2 ) / greatest |s_ref - s_rest|
 
-    Times after ``until`` [s] do not count. The reference stands for the body itself. Raises InputError if the meshes
-    differ, a surface was not stored, there is no common time, or nothing moves.
+    The reference stands for the body itself. Raises InputError if the meshes differ, a surface was not stored, there is
+    no common time, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
-        _, mean = compare_surfaces(run, true, until).fields
+        _, mean = compare_surfaces(run, true).fields
     if mean.scale == 0:
         raise InputError(f"{reference}: nothing moves in it")
     return float(np.sqrt(np.mean(mean.errors**2)))

@@ -14,9 +14,7 @@ from pandas import DataFrame, option_context
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.cells import growth_charts
-from msmpetsc.study.charts.convergence import convergence_charts, order_charts
-from msmpetsc.study.charts.pareto import pareto_charts, size_charts
+from msmpetsc.study.charts.curves import convergence_charts, growth_charts, pareto_charts, size_charts
 from msmpetsc.study.charts.plot import Chart, curve_styles, save_png, svg_text
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.metrics import counted
@@ -49,7 +47,6 @@ def write_report(folder: Path) -> Path:
         *size_charts(sweeps, styles),
         *pareto_charts(sweeps, styles),
         *growth_charts(sweeps, styles),
-        *order_charts(sweeps, styles, study),
         *convergence_charts(sweeps, styles, read_traces(folder)),
     ]
     for chart in charts:

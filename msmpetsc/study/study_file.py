@@ -182,12 +182,6 @@ class Map(Length):
         return self
 
 
-class Order(Table):
-    """A scene whose sweep over time steps is drawn as the order of the integrators; it needs a reference."""
-
-    scene: Name
-
-
 class Study(Table):
     """A study file."""
 
@@ -199,7 +193,6 @@ class Study(Table):
     sweep: ListOf[Sweep] = ()
     method: ListOf[Method] = ()
     map: ListOf[Map] = ()
-    order: ListOf[Order] = ()
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Study":
@@ -213,7 +206,6 @@ class Study(Table):
         _differ(methods, "methods")
         _differ([map.name for map in self.map], "maps")
         _known((name for sweep in self.sweep for name in sweep.scenes), "scene", scenes)
-        _known((order.scene for order in self.order), "scene", scenes)
         _known((name for map in self.map for name in map.methods), "method", methods)
         return self
 

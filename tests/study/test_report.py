@@ -11,9 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_files import Balance, row_of, spaced, svgs, tooltips, write_rows
 
-from msmpetsc.study.charts.cells import growth_charts
-from msmpetsc.study.charts.convergence import convergence_charts
-from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts, size_charts
+from msmpetsc.study.charts.curves import (
+    STEP,
+    TRAJECTORY,
+    cheapest,
+    convergence_charts,
+    front,
+    front_rows,
+    growth_charts,
+    pareto_charts,
+    size_charts,
+)  # fmt: skip
 from msmpetsc.study.charts.plot import RING, Axes, Chart, curve_styles
 from msmpetsc.study.report import write_report
 from msmpetsc.study.table import read_table, succeeded, typed
@@ -106,14 +114,6 @@ NOISY = [
     repeated("anderson", 0.014, 0.029, 0.037, error=1e-4, true_error=1e-4, trajectory_error=0.05),
     repeated("lbfgs", 0.022, 0.030, 0.031, true_error=1e-4, trajectory_error=0.05),
 ]
-
-
-def test_the_cheapest_of_repeats_has_their_range():
-    rows = succeeded(typed(NOISY))
-    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
-    step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
-    assert "newton, 10 ms [9 ms to 21 ms] a frame" in step[1]
-    assert "newton, 1 s [900 ms to 2.1 s] a simulated second" in trajectory[0] and len(step) == 4
 
 
 def values(panel: Axes, column: str) -> list:

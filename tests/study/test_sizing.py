@@ -142,17 +142,16 @@ class Bodies:
     """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution.
 
     slow        : whether explicit substeps take too long
-    share_until : of a distance, up to a time [s]
     inverted    : cells inside out at the end, by cells
     """
 
     def __init__(
         self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0, most=math.inf,
-        fails=lambda *_: False, slow=lambda substep: False, share_until=lambda time: 1.0, inverted=lambda cells: 0.0,
+        fails=lambda *_: False, slow=lambda substep: False, inverted=lambda cells: 0.0,
     ):  # fmt: skip
         self.explicit, self.impacts, self.cell_error, self.fails = explicit, impacts, cell_error, fails
         self.most = most  # error of cells, out of step
-        self.slow, self.share_until, self.inverted = slow, share_until, inverted
+        self.slow, self.inverted = slow, inverted
         self.errors: dict[Path, float] = {}  # by the result
 
     def result_of(self, case: Case) -> Path:
@@ -185,9 +184,7 @@ class Bodies:
 def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
     (tmp_path / "scene.toml").write_text(SCENE)
     bench, said = Bodies(**bodies), []
-    monkeypatch.setattr(
-        trials, "surface_error", lambda a, b, until: bench.share_until(until) * abs(bench.errors[a] - bench.errors[b])
-    )
+    monkeypatch.setattr(trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b]))
     sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 6400), said.append)
     return sizer.plan(), bench, said
 
@@ -222,7 +219,7 @@ def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell
 def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(tmp_path: Path, monkeypatch, target):
     """What parts two runs is at right angles to the finer one's error, of order 1; added up it was twice as much."""
 
-    def apart(a: Path, b: Path, until: float) -> float:
+    def apart(a: Path, b: Path) -> float:
         return math.sqrt(abs(bench.errors[a] ** 2 - bench.errors[b] ** 2))
 
     (tmp_path / "scene.toml").write_text(SCENE)
@@ -252,7 +249,7 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
     (tmp_path / "scene.toml").write_text(SCENE)
     for target, finest in ((0.1, 1000), (0.01, 64_000)):
         bench = Bodies(cell_error=1.0)
-        monkeypatch.setattr(trials, "surface_error", lambda a, b, until, e=bench.errors: abs(e[a] - e[b]))
+        monkeypatch.setattr(trials, "surface_error", lambda a, b, e=bench.errors: abs(e[a] - e[b]))
         sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), print)
         plan = sizer.plan()
         assert plan.met and max(each.cells for each in sizer.trials) == finest
@@ -314,15 +311,6 @@ def test_a_plan_says_what_bounds_the_error(tmp_path: Path, monkeypatch, bound: s
     assert bound != "the mesh's cells" or plan.choice.cells == 8 * 6400
 
 
-def test_a_plan_says_until_when_the_error_would_be_within_reach(tmp_path: Path, monkeypatch):
-    """The lattices part after 0.06 s: before, a quarter of 1.8e-2 is left. What is within reach has no such line."""
-    parts = {"cell_error": 4.0, "share_until": lambda time: 0.25 if time < 0.065 else 1.0}
-    plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, **parts)
-    (said,) = (bound for bound in plan.bounds if bound.startswith("the motion"))
-    assert "if it ended at 0.06 s" in said and plan.choice.budget.total - 0.75 * plan.choice.budget.cells <= 1e-2
-    assert sized(tmp_path, monkeypatch, 0.1, **parts)[0].bounds == []
-
-
 def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
     """On the finest lattice that was tried: then order 1 is taken. Coarser ones do not matter."""
     plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0)
@@ -354,7 +342,7 @@ def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monk
         Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10), print)
 
 
-def true_error(scene: Path, *, choice: list[str], finer: list[str], until: float = math.inf) -> float:
+def true_error(scene: Path, *, choice: list[str], finer: list[str]) -> float:
     """Return the error of what a plan wrote, against a run of 32 times the cells; each with changes of its own."""
     fine = [f"cages.count={32 * load_scene(scene).cages.count}", *finer]
     results = [scene.with_name("choice.h5"), scene.with_name("finer.h5")]
@@ -362,7 +350,7 @@ def true_error(scene: Path, *, choice: list[str], finer: list[str], until: float
         own = [word for change in ("output.surface=true", *changes) for word in ("--set", change)]
         command = [sys.executable, "-m", "msmpetsc", "run", str(scene), "-o", str(result), *own]
         subprocess.run(command, env=ENVIRONMENT, check=True, timeout=300, capture_output=True)
-    return surface_error(*results, until=until)
+    return surface_error(*results)
 
 
 @pytest.fixture
@@ -379,8 +367,9 @@ def test_the_true_error_of_a_plan_is_what_was_asked_for(soft_beam: Path):
     words = ["--surface-error", "0.1", "--cells", "1000", "--frames", "20", "--write"]
     assert main(["plan", str(soft_beam), *words]) == 0
     every = max(1, round(1 / 60 / load_scene(soft_beam).time.step))
-    fine = ["time={step = 0.016666666666666666, duration = 0.5, integrator = 'verlet'}"]
-    error = true_error(soft_beam, choice=[f"output.every={every}"], finer=fine, until=20 / 60)  # frames that were tried
+    tried = 20 / 60  # [s]
+    fine = [f"time={{step = 0.016666666666666666, duration = {tried}, integrator = 'verlet'}}"]
+    error = true_error(soft_beam, choice=[f"output.every={every}", f"time.duration={tried}"], finer=fine)
     assert 0.6 * 0.1 < error < 1.1 * 0.1
 
 

@@ -23,12 +23,10 @@ from study_files import (
 from msmpetsc.cli.commands.study import log_failures
 from msmpetsc.comm import log
 from msmpetsc.study.cases import shown_command, study_cases
-from msmpetsc.study.charts.convergence import order
 from msmpetsc.study.charts.stability import COLORS, SYMBOLS
 from msmpetsc.study.metrics import MEANING, OUTCOMES, counted, outcome
 from msmpetsc.study.report import write_report
 from msmpetsc.study.study_file import load_study
-from msmpetsc.study.table import typed
 
 METHODS = """
 [[method]]
@@ -81,7 +79,6 @@ def test_named_cases_have_their_own_options_for_what_solves(tmp_path: Path):
         (METHODS + NAMED + '[[map.case]]\nname = "a"\nfile = "x"', ["map.0", "two cases", "'a'"]),
         (METHODS + GRID + 'methods = ["newtom"]\n' + X + Y, ["method", "'newtom'", "'newton'"]),
         (METHODS * 2 + GRID + X + Y, ["method", "two methods", "'newton'"]),
-        (METHODS + GRID + X + Y + '[[order]]\nscene = "b"', ["scene", "'b'"]),
     ],
 )
 def test_a_mistake_in_a_map_is_told(tmp_path: Path, text: str, words: list[str]):
@@ -189,15 +186,3 @@ def test_each_cell_has_its_mark_and_tells_its_numbers(folder: Path):
     marks = re.findall(r"<text[^>]*>([^<]*)</text>", text)
     assert marks.count("D") == 2 and marks.count("4") == 6
     assert "Failed cases" not in text and "12: 8 ok, 2 slow, 2 diverged" in text
-
-
-def timed(step: float, error: float, **given) -> dict:
-    return row_of("m", time_step=step, trajectory_error=error, **given)
-
-
-def test_the_slope_is_that_of_the_short_steps():
-    """The two longest steps are off the line; verlet steps by its substep."""
-    rows = [timed(step, (5 if step > 0.03 else 1) * step) for step in (0.1, 0.05, 0.02, 0.01)]
-    assert order(typed(rows)) == pytest.approx(1) and order(typed(rows[:1])) is None
-    rows = [timed(0.1, s**2, integrator="verlet", substep=s) for s in (1e-3, 5e-4)]
-    assert order(typed(rows)) == pytest.approx(2)

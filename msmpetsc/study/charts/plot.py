@@ -26,14 +26,10 @@ COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
     "#882255", "#999933", "#332288", "#8c6239",
 )  # fmt: skip
-STAR = "M0,-1.2L.28,-.38L1.14,-.37L.45,.15L.7,.97L0,.48L-.7,.97L-.45,.15L-1.14,-.37L-.28,-.38Z"
-HOURGLASS = "M-1,-1H1L-1,1H1Z"
-SHAPES = (
-    "circle", "square", "triangle-up", "diamond", "triangle-down", "cross", "triangle-left", STAR, "triangle-right",
-    HOURGLASS,
-)  # fmt: skip  # ten and eleven: a pair is back after 110
+SHAPES = (  # eight, and eleven colours: a pair is back after 88
+    "circle", "square", "triangle-up", "diamond", "triangle-down", "cross", "triangle-left", "triangle-right",
+)  # fmt: skip
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
-DASH = "M-1.7,-.12H-.2V.12H-1.7ZM.2,-.12H1.7V.12H.2Z"
 WIDTH, HEIGHT = 1080, 280  # [px] of all panels of a chart, and of one
 MARKER = 50  # [px^2]
 LETTER = 8  # [px]: mean width in a legend
@@ -131,10 +127,11 @@ class Axes:
             silent = {"aria": "description" in channels}
             self.layers.append({"data": {"values": values}, "mark": mark | silent, "encoding": axes | channels})
 
-    def line(self, x: Iterable[float], y: Iterable[float], **mark: Any) -> None:
-        """Draw a grey line through points in their order."""
+    def stair(self, x: Iterable[float], y: Iterable[float]) -> None:
+        """Draw a grey stair through points in their order."""
         values = [{"x": a, "y": b, "n": n} for n, (a, b) in enumerate(zip(x, y, strict=True))]
-        self.draw(values, {"type": "line", "color": FAINT, "strokeWidth": 1.6} | mark, order={"field": "n"})
+        mark = {"type": "line", "color": FAINT, "interpolate": "step-after", "strokeWidth": 1.2}
+        self.draw(values, mark, order={"field": "n"})
 
     def whiskers(self, rows: DataFrame, columns: Columns, curve: str = "label") -> None:
         """Draw the spread of the repeats of each row; the second column is its cost."""

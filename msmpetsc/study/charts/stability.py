@@ -55,7 +55,7 @@ def entry(value: str, unit: str) -> str:
     return formatting.seconds(number) if unit == "s" else formatting.prefixed(number, unit)
 
 
-def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
+def scale(rows: DataFrame, column: str, axis: dict[str, Any]) -> Scale:
     """Return the values of the rows on this axis, in the order and the unit of the study file."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
@@ -64,13 +64,13 @@ def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
     return Scale(axis.get("name", column), tuple(values), tuple(texts))
 
 
-def stability_charts(table: DataFrame, study: dict) -> list[Chart]:
+def stability_charts(table: DataFrame, study: dict[str, Any]) -> list[Chart]:
     """Return a chart a map; ``study``: the study file, which names the axes."""
     maps = {entry.get("name"): entry for entry in study.get("map", ())}
     return [stability_chart(name, rows, maps.get(name, {})) for name, rows in mapped(table).items()]
 
 
-def stability_chart(name: str, rows: DataFrame, settings: dict) -> Chart:
+def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Chart:
     """Return the chart of a map; ``settings``: its table in the study file."""
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")

@@ -1,14 +1,12 @@
 """What a plan of a surface error tells: its trials, its answer, and what keeps the error from being smaller."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import tomlkit
 
-from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import read_toml
 from msmpetsc.scene.statics import STATIC
@@ -66,22 +64,6 @@ def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
         helps += ' or material.law = "neo-hookean"'
     found = f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, each lattice in its own way"
     return [f"the motion: {found}; {helps} may help"]
-
-
-def time_bound(model: CostModel, target: float, times: Sequence[float], apart: Callable[[float], float]) -> list[str]:
-    """Return until when an error out of reach would be within it; nothing if it is so at none of the times [s].
-
-    apart : distance of the finest two lattices up to a time; the error of the cells is taken to go with it
-    """
-    best, whole = model.best().budget, apart(math.inf)
-    for time in sorted(times, reverse=True):
-        try:
-            error = best.cells * apart(time) / whole + best.time + best.step
-        except InputError:  # nothing moves so early
-            break
-        if error <= target:
-            return [f"the motion: {error:.1e} would be left if it ended at {time:.3g} s: fewer --frames"]
-    return []
 
 
 # The answer as lines of a scene file

@@ -15,7 +15,7 @@ from msmpetsc.solve.presets import preset_names
 from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, inverted_bound, size_bounds, time_bound
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, inverted_bound, size_bounds
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 
@@ -105,7 +105,7 @@ class Sizer:
             lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
             model = replace(model, law=self._law(lattices))
         plan, model = self._checked(model, lattices)
-        return replace(plan, bounds=[*plan.bounds, *self._bounds(plan, model, lattices)], tried=self.trials)
+        return replace(plan, bounds=[*plan.bounds, *self._bounds(plan, model)], tried=self.trials)
 
     # Time
 
@@ -307,14 +307,12 @@ class Sizer:
 
     # What is said
 
-    def _bounds(self, plan: SizePlan, model: CostModel, lattices: list[SizeTrial]) -> list[str]:
-        """Return what bounds the error, in words; of the lattices that tell the cells' error."""
+    def _bounds(self, plan: SizePlan, model: CostModel) -> list[str]:
+        """Return what bounds the error, in words."""
         inverted = inverted_bound(self.trials, self.as_given.material.law)
         bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted]
         if not plan.met:
-            times = [self.step * frame for frame in range(1, round(self.duration / self.step))]
             bounds += size_bounds(model, self.target, bool(self.bounds))
-            bounds += time_bound(model, self.target, times, lambda until: _apart(lattices[-2], lattices[-1], until))
         return bounds
 
     # Runs
@@ -359,5 +357,5 @@ class Sizer:
         return case.changed(f"output.every={every}")
 
 
-def _apart(run: SizeTrial, reference: SizeTrial, until: float = math.inf) -> float:
-    return surface_error(run.result, reference.result, until)
+def _apart(run: SizeTrial, reference: SizeTrial) -> float:
+    return surface_error(run.result, reference.result)

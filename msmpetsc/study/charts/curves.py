@@ -1,26 +1,29 @@
-"""Speed against accuracy: computing time over the errors of step, trajectory and surface.
+"""Curves of methods: speed against accuracy, surface error over cost, growth with cells, convergence of a step.
 
-The two errors are never mixed. The step error says how far a step is from the exact minimiser of its energy: methods
-can be compared by it where the time step is the same. The trajectory error says how far the run is from the true motion
-of the lattice: explicit and implicit runs of any time step can be compared by it.
+The errors are never mixed. The step error says how far a step is from the exact minimiser of its energy: methods can be
+compared by it where the time step is the same. The trajectory error says how far the run is from the true motion of the
+lattice: explicit and implicit runs of any time step can be compared by it.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from pandas import DataFrame, concat
+from pandas import DataFrame, concat, to_numeric
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import (
+    BYTES,
     COUNT,
     ERROR,
     INK,
     RING,
     SECONDS,
+    SHAPES,
     Chart,
     CurveStyle,
     Styles,
+    axis_from_zero,
     log_axis,
     points,
 )
@@ -36,8 +39,6 @@ CAPTION = (
     "two digits. The step error is that of solving a step; the trajectory error is that of the "
     "whole motion, time step included."
 )
-
-
 STEPPING = ("time_step", "substep")
 TOLD = ("least", "greatest", *STEPPING, "error", "max_iterations", "iterations", "ranks")
 
@@ -95,8 +96,7 @@ def cheapest(rows: DataFrame, measure: ErrorMeasure, level: float) -> Row | None
     """Return the measured row of the least cost with an error of at most this level; None where nothing reaches it."""
     reached = measured(rows, *measure.columns)
     reached = reached[reached[measure.error] <= level]
-    best = reached.assign(**spread(reached, measure.cost)).sort_values(measure.cost, kind="stable").head(1)
-    return next(iter(records(best)), None)
+    return next(iter(records(reached.sort_values(measure.cost, kind="stable"))), None)
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -139,7 +139,7 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     front = front_rows(rows, measure)
     (_, right), (_, top) = x["scale"]["domain"], y["scale"]["domain"]
     errors, costs = list(front[measure.error]), list(front[measure.cost])
-    panel.line([errors[0], *errors, right], [top, *costs, costs[-1]], interpolate="step-after", strokeWidth=1.2)
+    panel.stair([errors[0], *errors, right], [top, *costs, costs[-1]])
     rows = rows.join(spread(rows, measure.cost))
     best = concat([front_rows(group, measure) for group in grouped(rows, "label").values()])
     told = (*measure.columns, *TOLD)
@@ -156,18 +156,10 @@ def cheapest_line(measure: ErrorMeasure, level: float, row: Row | None) -> str:
         return f"{start} nothing measured reaches it."
     unit = measure.y_label.removeprefix("computing time ")
     told = ", ".join(filter(None, (formatting.entry(row, name) for name in (measure.error, "error", *STEPPING))))
-    return f"{start} {row['label']}, {cost_of(row, measure)} {unit} ({told})."
+    return f"{start} {row['label']}, {formatting.seconds(row[measure.cost])} {unit} ({told})."
 
 
-def cost_of(row: Row, measure: ErrorMeasure) -> str:
-    """Return 34 ms, or with the range of the repeats 34 ms [31 ms to 40 ms]."""
-    cost = formatting.seconds(row[measure.cost])
-    if row["least"] is None:
-        return cost
-    return f"{cost} [{formatting.seconds(row['least'])} to {formatting.seconds(row['greatest'])}]"
-
-
-# The error of the surface over what it costs
+# ---- the error of the surface over what it costs
 
 SIZES = "Surface error over cost"
 SIZES_CAPTION = (
@@ -224,3 +216,132 @@ def reached(rows: DataFrame, level: float) -> str:
     logs = np.log(between.to_numpy(float)).T
     cells, seconds = (float(np.exp(np.interp(np.log(level), logs[0], column))) for column in logs[1:])
     return f"{formatting.count(round(cells))} cells ({formatting.seconds(seconds)})"
+
+
+# ---- growth with the number of cells
+
+GROWTH = "Growth with the number of cells"
+GROWTH_CAPTION = (
+    "Frames a second: higher is faster, and a frame is one time step; set-up and factorisation, done once, are not "
+    "counted (the paper's Figure 6). The legend says which true step error each curve reached: only curves of like "
+    "error compare. Per cell, a level curve means a cost in proportion to the cells. Memory is the peak of all ranks, "
+    "the program itself and the surface mesh included. Whiskers reach from the least to the greatest of the repeats."
+)
+VARIED = ("error", "max_iterations", "ranks")  # may differ between curves of one method
+GROWTH_TOLD = ("time_frame", "memory", "iterations", "ksp_its", "true_error", "time_setup", "time_factor", "ranks")
+GROWTH_PANELS = (  # title, column, how its ticks are written, whether it varies with the time
+    ("frames a second", "fps", COUNT, True),
+    ("time a frame and cell", "time_frame_a_cell", SECONDS, True),
+    ("memory a cell", "memory_a_cell", BYTES, False),
+    ("KSP iterations a step", "ksp_its", COUNT, False),
+)
+
+
+def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
+    """Return a chart for each scene and time step where some curve has two cell counts or more."""
+    charts = []
+    for (scene, time_step), rows in grouped(measured(succeeded(table), "cells"), "scene", "time_step").items():
+        rows = with_curves(rows)
+        if rows.groupby("curve")["cells"].nunique().max() > 1:
+            step = f", time step {formatting.seconds(time_step)}" if time_step > 0 else ""
+            charts.append(growth_chart(f"growth_{scene}_{formatting.plain(time_step)}", f"{scene}{step}", rows, styles))
+    return [chart for chart in charts if chart.panels]
+
+
+def with_curves(rows: DataFrame) -> DataFrame:
+    """Return the rows with a column ``curve``: method, what varied in it, and its step error."""
+    varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
+    words = ([row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows))
+    rows = rows.assign(curve=[", ".join(filter(None, text)) for text in words])
+    names = {curve: curve for curve in rows["curve"]}
+    for curve, reached in grouped(measured(rows, "true_error"), "curve").items():
+        ends = dict.fromkeys(map(formatting.error, (reached["true_error"].min(), reached["true_error"].max())))
+        names[curve] += f" (step error {' to '.join(ends)})"
+    return rows.assign(curve=rows["curve"].map(names))
+
+
+def styles_of(curves: DataFrame, styles: Styles) -> Styles:
+    """Return the style of each curve: those of one label share its colour, and have own markers."""
+    found = {}
+    number = curves.groupby("label").cumcount()
+    for curve, label, more in zip(curves["curve"], curves["label"], number, strict=True):
+        shape = SHAPES[(SHAPES.index(styles[label].shape) + more) % len(SHAPES)]
+        found[curve] = CurveStyle(styles[label].color, shape)
+    return found
+
+
+def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
+    """Return the panels that have data."""
+    rows = rows.assign(
+        time_frame_a_cell=rows["time_frame"] / rows["cells"], memory_a_cell=rows["memory"] / rows["cells"]
+    ).sort_values("cells", kind="stable")
+    own = styles_of(rows[["curve", "label"]].drop_duplicates().sort_index(), styles)
+    chart = Chart(name, GROWTH, f"Growth with cells: {title}", GROWTH_CAPTION, own, columns=2)
+    for title, column, words, timed in GROWTH_PANELS:
+        shown = measured(rows, column)
+        if shown.empty:
+            continue
+        x = log_axis("valid cells (k: thousand, M: million)", shown["cells"], COUNT)
+        heights = reach(shown, column).to_numpy().ravel() if timed else shown[column]
+        panel = chart.panel(title, x, log_axis("", heights, words))
+        if timed:
+            panel.whiskers(shown, ("cells", column), "curve")
+        panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TOLD), "curve")
+    return chart
+
+
+# ---- convergence within one step
+
+CONVERGENCE = "Convergence within one step"
+CONVERGENCE_CAPTION = (
+    "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second "
+    "number on. Of several cases of a method the one that went furthest is shown."
+)
+CONVERGENCE_PANELS = (
+    ("iteration", "iteration", "over the iterations", COUNT),
+    ("seconds", "computing time within the step", "over the computing time", SECONDS),
+)
+ITERATE = ("iteration", "seconds", "position_error", "energy_error", "ksp_its")
+
+
+def iterates(trace: dict[str, Any], row: Row) -> DataFrame:
+    """Return the trace of a case as a row an iterate; those without a positive error are out."""
+    length = len(trace.get("position_error") or [])
+    columns = {name: (trace.get(name) or [None] * length)[:length] for name in ITERATE}
+    rows = DataFrame(columns, dtype=object).apply(to_numeric, errors="coerce").astype(float)
+    rows = rows.assign(label=row["label"], command=row["command"])
+    return rows[(rows["position_error"] > 0) & (rows["position_error"] < 1e300)]
+
+
+def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict[str, Any]]) -> list[Chart]:
+    """Return one chart for each scene with traces, which come by case."""
+    charts = []
+    for scene, rows in grouped(table[table["case"].isin(traces.keys())], "scene").items():
+        curves = furthest([iterates(traces[row["case"]], row) for row in records(rows)])
+        frames = {traces[case].get("frame") for case in rows["case"]}
+        step = f", step {frames.pop()}" if len(frames) == 1 else ""
+        if curves:
+            charts.append(
+                convergence_chart(f"convergence_{scene}", f"{CONVERGENCE}: {scene}{step}", concat(curves), styles)
+            )
+    return charts
+
+
+def furthest(curves: list[DataFrame]) -> list[DataFrame]:
+    """Return each method's trace that ends with the least error: looser targets are parts of it."""
+    known = sorted((curve for curve in curves if len(curve)), key=lambda rows: -rows["position_error"].iloc[-1])
+    best = {rows["label"].iloc[0]: rows for rows in known}
+    return [best[label] for label in dict.fromkeys(rows["label"].iloc[0] for rows in curves if len(rows))]
+
+
+def convergence_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
+    """Return two panels with one vertical scale."""
+    chart = Chart(
+        name, CONVERGENCE, title, CONVERGENCE_CAPTION, {label: styles[label] for label in dict.fromkeys(rows["label"])}
+    )
+    y = log_axis("true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|", rows["position_error"], ERROR)
+    for column, axis, title, words in CONVERGENCE_PANELS:
+        shown = rows.dropna(subset=[column])
+        panel = chart.panel(title, axis_from_zero(axis, list(shown[column]), words), y)
+        panel.curves(shown, (column, "position_error"), ITERATE)
+    return chart

@@ -12,6 +12,7 @@ import json
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
+from time import perf_counter
 from typing import NamedTuple
 
 import lab
@@ -91,12 +92,13 @@ def planned(file: Path, target: float, frames: int | None, cells: int) -> Planne
     words = ["--surface-error", target, *(("--frames", frames) if frames else ()), "--cells", cells, "--json"]
     log = FOLDER / f"{file.stem}_{target:g}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
+    begin = perf_counter()
     ended = lab.python(["-m", "msmpetsc", "plan", file, *words], log)
     if ended.status not in (0, NOT_MET):
         return ended.reason
     answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])  # behind what was tried
     choice = answer["choice"]
-    return Planned(file, frames, choice["method"], choice["cells"], answer, ended.seconds)
+    return Planned(file, frames, choice["method"], choice["cells"], answer, perf_counter() - begin)
 
 
 def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:

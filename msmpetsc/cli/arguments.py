@@ -10,7 +10,7 @@ import shlex
 import textwrap
 from argparse import RawDescriptionHelpFormatter
 from itertools import pairwise
-from typing import Any
+from typing import Any, NoReturn
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES
@@ -70,7 +70,7 @@ def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
 class Parser(argparse.ArgumentParser):
     """A parser that prints on rank 0 only, and raises InputError."""
 
-    def error(self, message: str):
+    def error(self, message: str) -> NoReturn:
         raise InputError(re.sub(r"^argument (\S+): (?=must )", r"\1 ", message))
 
     def _print_message(self, message: str, file: Any = None) -> None:  # where argparse prints help and version

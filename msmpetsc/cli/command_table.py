@@ -271,6 +271,7 @@ COMMANDS = {
         ),
         description="Write as CSV, for each frame, energies, momentum, loads, the reaction of each pin and anchor, the "
         "push of each obstacle and of contacts on each body, and where the scene's probes are.",
+        module="export",
     ),
     "check": Command(
         "store a scene's numbers; say whether they still hold",
@@ -312,7 +313,7 @@ COMMANDS = {
     "doctor": Command(
         "say what is installed, and how to get what is not",
         ("msmpetsc doctor",),
-        description="Examine PETSc, MPI, the device, HDF5, the kernels' cache, packages and meshes. "
+        description="Examine PETSc, MPI, the device, HDF5 and the packages of each extra. "
         "Exit status 1: a run lacks something that it needs.",
         on_ranks=True,
     ),

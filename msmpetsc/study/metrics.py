@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError
 from msmpetsc.results.comparison import common_times, compare_surfaces, refuse_different_lattices
 from msmpetsc.results.reader import Result
@@ -43,8 +44,8 @@ SLOW = 30  # iterations a step
 def read_record(path: Path) -> dict[str, Any]:
     """Return what stands in a measure file; nothing where a run was killed before it."""
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError):
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
         return {}
 
 
@@ -78,7 +79,7 @@ def of_frames(result: Path, time_step: float) -> Row:
     return row | shape | _errors(series) | _soundness(series)
 
 
-def _soundness(series: dict[str, np.ndarray]) -> Row:
+def _soundness(series: dict[str, Floats]) -> Row:
     """Return what went wrong, inverted cells in the last frame alone; and the energy left where no load acts."""
     row: Row = {name: float(np.nansum(series[name][1:])) for name in ("substeps", "fallbacks", "energy_gained")}
     if series["inverted"][-1] >= 0:
@@ -92,7 +93,7 @@ def _soundness(series: dict[str, np.ndarray]) -> Row:
     return row
 
 
-def _errors(series: dict[str, np.ndarray]) -> Row:
+def _errors(series: dict[str, Floats]) -> Row:
     """Return root mean squares over the steps whose true error was measured, or over all."""
     estimated, true = series["step_error"][1:], series["true_error"][1:]
     where = np.isfinite(true) if np.isfinite(true).any() else ~np.isnan(estimated)
@@ -103,7 +104,7 @@ def _errors(series: dict[str, np.ndarray]) -> Row:
     }
 
 
-def _rms(values: np.ndarray) -> float | None:
+def _rms(values: Floats) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.sqrt((values**2).mean())) if len(values) else None
 
@@ -177,7 +178,7 @@ def shape_error(run: Result, frame: int) -> float | None:
     return max(distance_of_shapes(position[own], rest[own], mass[own]) for own in of_bodies)
 
 
-def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> float:
+def distance_of_shapes(x: Floats, rest: Floats, mass: Floats) -> float:
     """Return the distance of nodes x (n, 3) from ``rest`` (n, 3) after the best rigid motion, over the longest side.
 
         min over R, c of sqrt( sum_i m_i |x_i - R rest_i - c|^2 / sum_i m_i ) / side    [-]

@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from time import perf_counter
 
 import psutil
 
@@ -35,7 +34,6 @@ class Ended:
 
     status: int | None  # exit status, None where time ran out
     reason: str  # the last line of trouble, "" if status is 0
-    seconds: float  # that it took
 
     @property
     def word(self) -> str:
@@ -49,7 +47,7 @@ class Processes:
     """The processes under way; once ``stopped``, none is started any more."""
 
     def __init__(self) -> None:
-        self._running: set[subprocess.Popen | Forked] = set()
+        self._running: set[subprocess.Popen[bytes] | Forked] = set()
         self.stopped = False
         self._lock = Lock()
 
@@ -58,10 +56,9 @@ class Processes:
 
         warm : spare it the start of the program, if it is one
         """
-        begin = perf_counter()
         process = self._start(command, log, warm and list(command[:3]) == COLD)
         if process is None:
-            return Ended(None, "stopped", 0.0)
+            return Ended(None, "stopped")
         status: int | None = None
         try:
             status = process.wait(timeout)
@@ -72,7 +69,7 @@ class Processes:
             end(process)  # what it may have left running, too
             with self._lock:
                 self._running.discard(process)
-        return Ended(status, reason, perf_counter() - begin)
+        return Ended(status, reason)
 
     def close(self) -> None:
         """End those under way."""
@@ -81,12 +78,12 @@ class Processes:
         for process in running:
             end(process)
 
-    def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen | Forked | None:
+    def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen[bytes] | Forked | None:
         variables = environment(alone=command[0] != "mpiexec")
         with self._lock, open(log, "w") as out:
             if self.stopped:
                 return None
-            process: subprocess.Popen | Forked
+            process: subprocess.Popen[bytes] | Forked
             if warm:
                 process = Forked(command[3:], log, variables)
             else:
@@ -115,7 +112,7 @@ def last_error(log: str) -> str:
     return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
 
 
-def end(process: subprocess.Popen | Forked) -> None:
+def end(process: subprocess.Popen[bytes] | Forked) -> None:
     """End a process and all of its session: mpiexec gives each rank a process group of its own."""
     if process.poll() is None:
         with suppress(ProcessLookupError):

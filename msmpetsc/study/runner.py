@@ -23,10 +23,6 @@ from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
 
 PARTS = "parts"  # folder of the parts' folders
-TOLD = (  # of a case that is done
-    "cells", "time_step", "substep", "error", "max_iterations", "time_frame", "true_error", "trajectory_error",
-    "surface_error",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -34,7 +30,7 @@ class CaseResult:
     """The row of a case, and its trace if one was asked for."""
 
     row: Row
-    trace: dict | None
+    trace: dict[str, Any] | None
 
 
 @dataclass
@@ -145,7 +141,7 @@ class StudyResults:
     folder: Path
     order: Sequence[str]
     rows: dict[str, Row] = field(default_factory=dict)
-    traces: dict[str, dict] = field(default_factory=dict)
+    traces: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def add(self, result: CaseResult) -> None:
         case = result.row["case"]
@@ -248,9 +244,7 @@ def described(row: Row) -> str:
     """Return what a case was, and what became of it."""
     if row.get("map"):
         return f"{row['map']} {row['label']} at {row['x']}, {row['y']}: {row['outcome']}"
-    known = (f"{name} {row[name]:.3g}" for name in TOLD if row.get(name))
-    status = row["reason"] if row["status"] == "ok" else f"{row['status']}: {row['reason']}"
-    return ", ".join(filter(None, [f"{row['scene']} {row['label']}", *known, status]))
+    return f"{row['scene']} {row['label']}: {row['status']} {row['reason']}".rstrip()
 
 
 # What earlier runs left

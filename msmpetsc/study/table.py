@@ -48,8 +48,9 @@ def require_extra() -> None:
 
 
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
-    """Write table.csv, replaced whole."""
-    write_whole(folder / "table.csv", as_table(rows).map(_text).to_csv(index=False, lineterminator="\r\n"))
+    """Write table.csv, replaced whole: a column of counts in whole numbers, what was not measured as nothing."""
+    table = as_table(rows).replace([math.inf, -math.inf], math.nan).convert_dtypes(convert_string=False)
+    write_whole(folder / "table.csv", table.to_csv(index=False, lineterminator="\r\n"))
 
 
 def read_table(folder: Path) -> "DataFrame":
@@ -66,7 +67,7 @@ def read_table(folder: Path) -> "DataFrame":
     return typed(texts.to_dict("records"))  # type: ignore[arg-type]  # columns are called by text
 
 
-def read_traces(folder: Path) -> dict[str, dict]:
+def read_traces(folder: Path) -> dict[str, dict[str, Any]]:
     """Return the traces of traces.json by case; none without the file. Raises InputError."""
     path = folder / "traces.json"
     try:
@@ -102,15 +103,6 @@ def _number(text: str) -> float:
     except ValueError:
         return math.nan
     return value if math.isfinite(value) else math.nan
-
-
-def _text(value: Any) -> str:
-    """Return a value as the table has it: a count as a whole number, a text in one line, NaN as nothing."""
-    if isinstance(value, float):
-        if math.isnan(value):
-            return ""
-        return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(float(value))
-    return " ".join(str(value).split())
 
 
 def succeeded(table: "DataFrame") -> "DataFrame":
@@ -164,7 +156,8 @@ def spread(table: "DataFrame", cost: str) -> "DataFrame":
 
 def reach(table: "DataFrame", cost: str) -> "DataFrame":
     """Return the spread; where it is not known, twice the cost itself."""
-    return spread(table, cost).apply(lambda column: column.fillna(table[cost]))
+    ends: DataFrame = spread(table, cost).apply(lambda column: column.fillna(table[cost]))
+    return ends
 
 
 def is_repeated(table: "DataFrame") -> bool:

@@ -42,25 +42,11 @@ for number in range(cupy.cuda.runtime.getDeviceCount()):
     print(cupy.cuda.runtime.getDeviceProperties(number)["name"].decode())
 """,
     "HDF5": "import h5py; print(h5py.version.hdf5_version)",
-    "kernels": """
-import os, pathlib
-from msmpetsc.backend.kernel import cache_is_empty
-state = "not yet compiled: the first run takes a minute more" if cache_is_empty() else "compiled"
-folder = pathlib.Path(os.environ["NUMBA_CACHE_DIR"])
-if os.access(next(path for path in (folder, *folder.parents) if path.exists()), os.W_OK):
-    print(state)
-""",
-    "meshes": """
-from msmpetsc.geometry.registry import MODELS, find
-print(", ".join(name for name in MODELS if find(name)))
-""",
 }
 NOTHING = {  # what it means if they say nothing
     "PETSc": (BROKEN, "a PETSc of real double numbers is needed (--with-scalar-type=real)"),
     "MPI": (BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI"),
     "GPU": (MISSING, "no CUDA device on this machine"),
-    "kernels": (MISSING, "their cache cannot be written, each run compiles anew: export NUMBA_CACHE_DIR=FOLDER"),
-    "meshes": (MISSING, "no named model, for the shipped scenes only: msmpetsc fetch --list"),
 }
 IMPORTS = """
 import importlib, json

@@ -21,18 +21,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _table() -> list[str]:
     """Return one line a model: name, size [MB] of its file, where that lies, licence."""
-    rows = [("name", "MB", "found", "licence")]
+    lines = [f"{'name':12} {'MB':>6}  {'found':26} licence"]
     for name, model in MODELS.items():
+        size, where = "-", "not here"
         try:
-            file = find(name)
+            if file := find(name):
+                size, where = f"{file.path.stat().st_size / 1e6:.1f}", file.where
         except InputError:
-            file, where = None, "another file of its name"
-        else:
-            where = file.where if file else "not here"
-        size = f"{file.path.stat().st_size / 1e6:.1f}" if file else "-"
-        rows.append((name, size, where, model.licence))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        f"{name:{widths[0]}}  {size:>{widths[1]}}  {where:{widths[2]}}  {licence}"
-        for name, size, where, licence in rows
-    ]
+            where = "another file of its name"
+        lines.append(f"{name:12} {size:>6}  {where:26} {model.licence}")
+    return lines

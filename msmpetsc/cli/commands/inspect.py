@@ -12,6 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.app.profile import peak_memory
+from msmpetsc.backend.arrays import Floats
 from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
@@ -73,7 +74,7 @@ def counts_of(scene: Scene, partition: Partition) -> dict[str, dict[str, float]]
     return counts | {f"positions of {scene.stored} frames, file [byte]": {"all": positions}}
 
 
-def over_ranks(values: np.ndarray) -> dict[str, float]:
+def over_ranks(values: Floats) -> dict[str, float]:
     """Return sum, mean and maximum of what the ranks have."""
     return {"all": float(values.sum()), "mean": float(values.mean()), "most": float(values.max())}
 
@@ -94,7 +95,7 @@ def print_counts(report: dict[str, Any]) -> None:
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
 
 
-def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) -> np.ndarray:
+def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) -> Floats:
     """Return the memory (R,) of each rank [byte].
 
     surfaces : that are stored

@@ -16,6 +16,7 @@ import trimesh
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
+from msmpetsc.backend.arrays import Floats
 from msmpetsc.build import USUAL
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, did_you_mean
@@ -129,10 +130,10 @@ def shipped_text(name: str) -> str:
 class MeshMeasures:
     """What a first scene rests on, lengths in the file's unit."""
 
-    sides: np.ndarray  # (3,) of the bounding box
+    sides: Floats  # (3,) of the bounding box
     triangles: int
     report: SurfaceReport
-    parts: np.ndarray  # (p,) share of the area that each connected part has, the largest first
+    parts: Floats  # (p,) share of the area that each connected part has, the largest first
     unit: float | None  # [m]; None where neither metres nor millimetres give a usual body
 
     @property
@@ -144,7 +145,8 @@ class MeshMeasures:
 def measured(surface: Surface) -> MeshMeasures:
     """Measure a surface as its file has it."""
     sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
-    areas = np.bincount(part_labels(surface), trimesh.triangles.area(surface.points[surface.triangles]))
+    faces = trimesh.Trimesh(surface.points, surface.triangles, process=False)
+    areas = np.bincount(part_labels(surface), faces.area_faces)
     return MeshMeasures(
         sides=sides,
         triangles=len(surface.triangles),
@@ -166,7 +168,7 @@ def unit_of(side: float) -> float | None:
 class Dimensions:
     """The body as it will lie, z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
 
-    sides: np.ndarray
+    sides: Floats
     thickness: float
     volume: float
 

@@ -14,7 +14,7 @@ from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables, lines, overrides, put_into, tables
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables, overrides, put_into, tables
 from msmpetsc.study.sizing.choice import Choice
 from msmpetsc.study.sizing.trials import Asked, Sizer
 
@@ -42,14 +42,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def print_command(args: argparse.Namespace, choice: Choice, target: float) -> str:
-    """Print lines to paste and a command that says the same, which is returned; write them."""
+    """Print the command that runs the choice, which is returned; write the choice into the scene if asked to."""
     errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
     budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
     answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
-    print(f"\n{lines(answer)}\n")
     changes = [word for change in overrides(args.scene, answer) for word in ("--set", change)]
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes])
-    print(command, flush=True)
+    print(f"\n{command}", flush=True)
     if args.write:
         put_into(args.scene, answer)
         print(f"\nwritten into {args.scene}")

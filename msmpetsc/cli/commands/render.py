@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES, RESULT_NAMES, SCENE_NAMES, refuse_other_format
+from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.results.frame_choice import Frames, frames_of
@@ -117,7 +118,7 @@ def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[st
     return subject, (f"{_sides(subject.rest.points)} m", cells)
 
 
-def _sides(points: np.ndarray) -> str:
+def _sides(points: Floats) -> str:
     """Return "0.3 x 0.2325 x 0.2974" of the box around points (v, 3)."""
     return " x ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 from msmpetsc.study.cases import shown_command
-from msmpetsc.study.metrics import counted
 from msmpetsc.study.runner import StudyPart, list_study, run_study
-from msmpetsc.study.table import as_table, failed, mapped, swept
+from msmpetsc.study.table import as_table, failed, swept
 
 
 def run(args: argparse.Namespace) -> int:
@@ -25,7 +24,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
         return 0
     rows = run_study(args.study, folder, full=args.full, jobs=args.jobs, restart=args.restart, part=part)
-    log_failures(rows)
+    if lost := len(failed(swept(as_table(rows)))):  # in maps failing is an answer
+        log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
     if part:
         print(part.folder(folder) / "table.csv")  # the study that joins the parts writes the report
         return 0
@@ -44,13 +44,3 @@ def part_of(text: str | None) -> StudyPart | None:
     if not (numbers and 1 <= int(index) <= int(count)):
         raise InputError(f"--part must read I/N, 1 <= I <= N, not {printable(text, 40)}")
     return StudyPart(int(index), int(count))
-
-
-def log_failures(rows: list[dict]) -> None:
-    """Log what deserves a look: cases that failed; and of each map how it went, for there failing is an answer."""
-    table = as_table(rows)
-    lost = len(failed(swept(table)))
-    if lost:
-        log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
-    for name, group in mapped(table).items():
-        log.info("map %s: %s", name, counted(group["outcome"]))

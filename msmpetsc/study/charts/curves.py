@@ -310,7 +310,8 @@ def iterates(trace: dict[str, Any], row: Row) -> DataFrame:
     columns = {name: (trace.get(name) or [None] * length)[:length] for name in ITERATE}
     rows = DataFrame(columns, dtype=object).apply(to_numeric, errors="coerce").astype(float)
     rows = rows.assign(label=row["label"], command=row["command"])
-    return rows[(rows["position_error"] > 0) & (rows["position_error"] < 1e300)]
+    kept: DataFrame = rows[(rows["position_error"] > 0) & (rows["position_error"] < 1e300)]
+    return kept
 
 
 def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict[str, Any]]) -> list[Chart]:

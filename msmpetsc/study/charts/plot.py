@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +69,8 @@ Columns = tuple[str, str]  # of both axes
 
 def curve_styles(labels: Iterable[str]) -> Styles:
     """Return one style a label, given out in order of first appearance."""
-    labels = list(dict.fromkeys(labels))
-    pairs = islice(zip(cycle(COLORS), cycle(SHAPES), strict=False), len(labels))
-    return {label: CurveStyle(*pair) for label, pair in zip(labels, pairs, strict=True)}
+    numbers = enumerate(dict.fromkeys(labels))
+    return {label: CurveStyle(COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)]) for n, label in numbers}
 
 
 def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:

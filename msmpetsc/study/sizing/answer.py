@@ -29,7 +29,7 @@ class SizeTrial:
     @property
     def edge(self) -> float:
         """Edge of a cell, over that of a body of one cell."""
-        return self.cells ** (-1 / 3)
+        return float(self.cells ** (-1 / 3))
 
 
 @dataclass
@@ -66,7 +66,7 @@ def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
     return [f"the motion: {found}; {helps} may help"]
 
 
-# The answer as lines of a scene file
+# The answer as changes of a scene file
 
 Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
 
@@ -79,13 +79,8 @@ def tables(method: Candidate) -> Tables:
     return scene_tables(values)
 
 
-def lines(tables: Tables) -> str:
-    shown = {name: {key: value for key, value in table.items() if value is not None} for name, table in tables.items()}
-    return tomlkit.dumps(shown).strip()
-
-
 def overrides(scene: Path, tables: Tables) -> list[str]:
-    """Return the same as changes of the scene file, as --set takes them. Raises InputError for a file not TOML."""
+    """Return the changes of the scene file, as --set takes them. Raises InputError for a file not TOML."""
     (_, document), changes = read_toml(scene), []
     for name, table in tables.items():
         given = document.get(name, {})

@@ -34,11 +34,11 @@ class ErrorLaw:
 
     def error(self, size: float) -> float:
         """Return the error of a size [-]."""
-        return self.factor * size**self.order
+        return float(self.factor * size**self.order)
 
     def size(self, error: float) -> float:
         """Return the greatest size of this error."""
-        return (error / self.factor) ** (1 / self.order)
+        return float((error / self.factor) ** (1 / self.order))
 
     def through(self, *known: tuple[float, float]) -> "ErrorLaw":
         """Return the law through (size, error) of a run, with this order, or of two unlike ones, the coarser first."""
@@ -99,7 +99,7 @@ def _order(sizes: Sequence[float], ratio: float, cosine: float, orders: tuple[fl
     def excess(order: float) -> float:  # rises with the order
         middle = (b / c) ** order * _finer_error(1.0, (b / c) ** order, cosine)
         coarse = (a / b) ** order * middle
-        return math.sqrt(coarse**2 - (1 - cosine**2) * middle**2) - cosine * middle - ratio
+        return float(math.sqrt(coarse**2 - (1 - cosine**2) * middle**2) - cosine * middle - ratio)
 
     if excess(low) >= 0:
         return low, excess(low - UNSEEN) < 0

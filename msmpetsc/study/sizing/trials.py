@@ -105,7 +105,7 @@ class Sizer:
             lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
             model = replace(model, law=self._law(lattices))
         plan, model = self._checked(model, lattices)
-        return replace(plan, bounds=[*plan.bounds, *self._bounds(plan, model)], tried=self.trials)
+        return replace(plan, bounds=self._bounds(plan, model), tried=self.trials)
 
     # Time
 
@@ -123,12 +123,8 @@ class Sizer:
             raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
         finest, left = ladder[-1], self._left(ladder, sizes)
         if left > self.target / PART:
-            integrator, responses = finest.method.integrator, {obstacle.response for obstacle in self.as_given.obstacle}
-            contact = "; contact is stiff" if responses else ""
-            if "exchange" in responses:
-                contact = '; a rebound of response = "exchange" depends on the step, that of "penalty" has a limit'
-            apart = f"{_apart(ladder[-2], finest):.1e} apart"
-            self.bounds.append(f"the step: the two shortest of {integrator} are {apart}{contact}")
+            apart = _apart(ladder[-2], finest)
+            self.bounds.append(f"the step: the two shortest of {finest.method.integrator} are {apart:.1e} apart")
         known = [Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]]
         known.append(Stepping(finest.method, left, finest.cost))
         explicit = finest.method.integrator == "verlet"
@@ -232,19 +228,13 @@ class Sizer:
         law = error_law([each.edge for each in runs], apart, orders, None if far else across, cosine)
         law, self.cell_bound = replace(law, seen=law.seen and not inverted), ""
         if not law.seen:
-            why = "their distances do not shrink as they should"
-            if inverted:
-                why = "cells end inside out"
-            elif far:
-                why = f"the coarsest two are {apart[0]:.1e} apart, too far to tell"
-            elif len(runs) < 3:
-                why = "two lattices alone could be run"
-            self.cell_bound = f"the cells: no order was seen ({why}); order {law.order:g} is taken"
+            self.cell_bound = f"the cells: their distances show no order; order {law.order:g} is taken"
         return law
 
     def _coarser(self, power: float) -> int:
         """Return the cells of the lattice coarsened so many times."""
-        return max(1, round(self.cells / COARSER ** (3 * power)))
+        cells: float = self.cells / COARSER ** (3 * power)
+        return max(1, round(cells))
 
     def _checked(self, model: CostModel, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, CostModel]:
         """Choose, run the choice and measure it, until its error is little less than was asked for.
@@ -275,13 +265,7 @@ class Sizer:
                 break
             self.report(f"{choice.cells} cells: {measured.total:.1e}, chosen once more")
             model = replace(model, law=law.through(*coarse, *fine))
-        bounds = []
-        if met is not None and met.budget.total < ENOUGH * self.target and (coarse or model.least > model.most):
-            why = "no lattice of fewer can be run"
-            for edge, error in coarse:
-                why = f"{edge**-3:.0f} cells have {error:.1e}, nothing was found between"
-            bounds = [f"the fewest cells: {met.budget.total:.1e} is less than was asked for; {why}"]
-        return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None, bounds), model
+        return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
 
     def _without(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
         """Return a model without the cells of what fails, where they are fewer than were tried, or its way to step."""

@@ -1,4 +1,4 @@
-"""The command line parsed, by the table of commands.
+"""The parser of the command line, made from the table of commands.
 
 What is imported at the top starts neither MPI nor PETSc, so that ``--help`` answers at once.
 """
@@ -39,7 +39,7 @@ def parsed(words: list[str]) -> argparse.Namespace:
 
 
 def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
-    """Split into ours and PETSc's: those of one dash, each with the value that follows it."""
+    """Split words into ours and PETSc's options, which have one dash and may have a value."""
     ours: list[str] = []
     petsc: list[str] = []
     for before, word in pairwise(["", *words]):
@@ -54,7 +54,7 @@ def _is_petsc_option(word: str) -> bool:
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for options of ours that lack a dash, and for needless ones of PETSc's."""
+    """Raise InputError for our options with one dash, and for PETSc options where none are taken."""
     name = ours[0] if ours else ""
     if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
         return
@@ -90,21 +90,21 @@ def versions_line() -> str:
 
 
 def petsc_version() -> str:
-    """Return "PETSc 3.22.4"."""
+    """Return the version of PETSc: "PETSc 3.22.4"."""
     from petsc4py import PETSc
 
     return f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
 
 
 def mpi_version() -> str:
-    """Return "Open MPI v5.0.7", or as much of what the library says of itself."""
+    """Return the first words of the version string of MPI: "Open MPI v5.0.7"."""
     from mpi4py import MPI
 
     return re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()
 
 
 def command_parser() -> Parser:
-    """Make the parser of the whole program, or of one of its commands."""
+    """Return the parser of all commands."""
     parser = Parser(prog="msmpetsc", description=msmpetsc.__doc__)
     about = "show the versions of msmpetsc, PETSc and MPI"
     parser.add_argument("--version", action=Shown, const=versions_line, help=about)
@@ -125,7 +125,7 @@ def command_parser() -> Parser:
 
 
 def option_names(command: str) -> list[str]:
-    """List the options of a command: "--preset"."""
+    """Return the options of a command, such as "--preset"."""
     known = COMMANDS[command]
     given = (*known.arguments, *known.exclusive, *SAID)
     return ["--help", *(name for names, _ in given for name in names if name.startswith("-"))]

@@ -1,4 +1,4 @@
-"""Every command with its help, arguments and examples: what the parser is made of."""
+"""The table of commands: help, arguments and examples, from which the parser is made."""
 
 import argparse
 import sys
@@ -17,7 +17,6 @@ class Command:
     """A command.
 
     exclusive   : arguments of which only one may be given
-    on_ranks    : whether mpiexec may start it; the others are for one process
     starts_runs : whether it starts runs of its own
     module      : in ``commands``, that carries it out; that of its name if empty
     """
@@ -27,13 +26,12 @@ class Command:
     arguments: tuple[Argument, ...] = ()
     exclusive: tuple[Argument, ...] = ()
     description: str | None = None
-    on_ranks: bool = False
     starts_runs: bool = False
     module: str = ""
 
 
 class Shown(argparse.Action):
-    """Prints what its ``const``, a function, returns, and leaves; libraries are loaded then."""
+    """Prints what its ``const``, a function, returns, and exits."""
 
     def __init__(self, option_strings: list[str], const: Any, help: str, **_: Any):
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, const=const, help=help)
@@ -44,7 +42,7 @@ class Shown(argparse.Action):
 
 
 def listed_presets() -> str:
-    """Return a line a preset: when to use it."""
+    """Return one line for each preset, which says when to use it."""
     from msmpetsc.solve.presets import find_preset, preset_names
 
     names = preset_names()
@@ -63,7 +61,7 @@ def switch(name: str, about: str) -> Argument:
 
 
 def arguments_of_run() -> tuple[Argument, ...]:
-    """Return the fields of a request as arguments, but those that Python alone takes."""
+    """Return the fields of a run request as arguments, without those that only Python takes."""
     taken = []
     for field in fields(RunRequest):
         name, option = field.name, OPTIONS[field.name]
@@ -83,14 +81,14 @@ def arguments_of_run() -> tuple[Argument, ...]:
 
 
 def at_least_1(word: str) -> int:
-    """Return the whole number of a word, 1 or more (a type of arguments)."""
+    """Return a word as an integer of at least 1, as argparse's ``type``."""
     if not word.isdecimal() or int(word) < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, not {word}")
     return int(word)
 
 
 def whole(name: str, value: str, about: str, **keywords: Any) -> Argument:
-    """Return an option whose value is a whole number, 1 or more."""
+    """Return an option whose value is an integer of at least 1."""
     return argument(name, type=at_least_1, metavar=value, help=about, **keywords)
 
 
@@ -105,12 +103,12 @@ SAID = (  # of every command
 
 
 def frames(about: str) -> Argument:
-    """Return ``--frames``, which chooses among those of a result."""
+    """Return ``--frames``, which selects frames of a result."""
     return argument("--frames", metavar="0,10,20", type=frames_in, help=about)
 
 
 def ranks(about: str) -> Argument:
-    """Return ``--ranks``, of what starts runs of its own."""
+    """Return ``--ranks``, of commands that start runs."""
     return whole("--ranks", "R", about, default=1)
 
 
@@ -174,7 +172,6 @@ COMMANDS = {
             argument("--list-presets", action=Shown, const=listed_presets, help="say what each preset is for"),
         ),
         description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options (one dash) may follow.",
-        on_ranks=True,
     ),
     "inspect": Command(
         "say what a scene would need on so many ranks",
@@ -315,7 +312,6 @@ COMMANDS = {
         ("msmpetsc doctor",),
         description="Examine PETSc, MPI, the device, HDF5 and the packages of each extra. "
         "Exit status 1: a run lacks something that it needs.",
-        on_ranks=True,
     ),
     "completion": Command(
         "print the script by which a shell completes commands, options and files",
@@ -324,6 +320,5 @@ COMMANDS = {
             "msmpetsc completion fish > ~/.config/fish/completions/msmpetsc.fish",
         ),
         (argument("shell", choices=SHELLS),),
-        on_ranks=True,
     ),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command line, whose failures are one line and an exit status."""
+"""The entry point of the command line, which reports failures in one line and an exit status."""
 
 import argparse
 import logging
@@ -52,9 +52,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def module_of(name: str, ranks: int) -> ModuleType:
-    """Return the module that carries out a command on so many ranks. Raises InputError where it is for one."""
+    """Return the module of a command. Raises InputError on several ranks for a command of one process."""
     command = COMMANDS[name]
-    if ranks > 1 and not command.on_ranks:
+    if ranks > 1 and name != "run":
         raise InputError(f"{name} is for one process: start it without mpiexec")
     if command.starts_runs:  # SIGTERM ends those, too, as Ctrl-C does
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -62,7 +62,7 @@ def module_of(name: str, ranks: int) -> ModuleType:
 
 
 def entry_point() -> None:
-    """Entry point of the installed ``msmpetsc``; where only results can be read, one line says what a run needs.
+    """Run the installed ``msmpetsc``, and name in one line a package that a command lacks.
 
     It ends quietly, as other programs do, when who reads what it prints goes away: ``msmpetsc doctor | head -1``.
     """

@@ -1,4 +1,4 @@
-"""The ranks that a command runs on; most are for one process, and need MPI only to see that there is but one."""
+"""The communicator of a command, which starts MPI only if a launcher started the process."""
 
 import os
 from typing import TYPE_CHECKING, cast
@@ -13,7 +13,7 @@ LAUNCHED = {  # variables that Open MPI, MPICH, PMIx, Slurm, Flux and the launch
 
 
 class Alone:
-    """The communicator of a process that no launcher started, as far as one rank asks it."""
+    """A stand-in for the communicator of a process that no launcher started."""
 
     rank, size = 0, 1
 

@@ -43,7 +43,7 @@ class MapPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One run, repeated; what is None is for the scene or the program to decide."""
+    """A run and its repeats; the scene or the program decides what is None."""
 
     scene: str
     file: Path
@@ -68,14 +68,14 @@ class Case:
 
     @property
     def id(self) -> str:
-        """Digest of what defines the run, whatever it is called, however long it may take."""
+        """Digest of what defines the run, without its label and its time limit."""
         what = {name: value for name, value in asdict(self).items() if name not in NOT_ITS_IDENTITY}
         what |= {"version": __version__, "reference": self.reference and self.reference.id}
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def stores_surface(self) -> bool:
-        """Whether its surface is compared, not its nodes."""
+        """Whether surfaces are compared with the reference, rather than nodes."""
         return SURFACE in self.set
 
     @property
@@ -92,7 +92,7 @@ class Case:
 
 
 def run_arguments(case: Case) -> list[str]:
-    """Return what follows ``msmpetsc``, outputs aside."""
+    """Return the arguments of ``msmpetsc`` for a case, without its outputs."""
     changes = [word for change in case.set for word in ("--set", change)]
     for argument, step in (("--true-error", case.true_error), ("--trace", case.trace)):
         if step is not None:
@@ -113,7 +113,7 @@ def command(case: Case, result: Path, measure: Path) -> list[str]:
 
 
 def shown_command(case: Case) -> str:
-    """Return the line that repeats the case by hand."""
+    """Return the shell command that repeats the case."""
     return shlex.join([*launcher(case.ranks), "msmpetsc", *run_arguments(case)])
 
 
@@ -125,7 +125,7 @@ def digest(file: Path, scene: Scene) -> str:
 
 
 def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the tables time and solver of a scene with a case's values; None: the key must not stand there.
+    """Return the tables time and solver of a scene with a case's values; a key that is None is absent.
 
     Verlet solves nothing, so it has no solver table; implicit Euler is what a scene means that names no integrator.
     """
@@ -147,7 +147,7 @@ def with_solver(case: Case, scene: Scene) -> Case:
 
 
 def with_time(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
-    """Return a case with the overrides of its time and output tables; ``surface``: it is stored."""
+    """Return a case with the overrides of its time and output tables, which store the surface if asked to."""
     time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
     time |= scene_tables(vars(case))["time"]
     case = case.changed(f"time={inline(time)}", SURFACE if surface else "output.surface=false")
@@ -160,7 +160,7 @@ def inline(table: Mapping[str, Any]) -> str:
 
 
 def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
-    """Return all cases, each once, in the order of the file in this folder. Raises InputError."""
+    """Return the distinct cases of a study in the order of its file. Raises InputError."""
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:
@@ -176,12 +176,12 @@ def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
 
 
 def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
-    """Yield every choice from each list, by the name of the list; the last one changes fastest."""
+    """Yield the Cartesian product of lists as dictionaries by their names; the last list changes fastest."""
     return (dict(zip(lists, values, strict=True)) for values in product(*lists.values()))
 
 
 def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
-    """Yield a scene with each law of a sweep, and the sweep labelled by it; references have the law, too."""
+    """Yield a scene and its reference with each material law of a sweep, and the sweep labelled by the law."""
     if not sweep.laws:
         yield scene, sweep
     for law in sweep.laws:
@@ -195,7 +195,7 @@ def checked_scene(file: Path, changes: Sequence[str]) -> Scene:
 
 
 def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> Iterator[Case]:
-    """Yield the cases of a sweep over a scene: its lists multiplied with each other."""
+    """Yield the cases of a sweep over a scene, the product of its lists."""
     file = folder / scene.file
     changes = (*scene.set, *sweep.set)
     as_given = checked_scene(file, changes)
@@ -233,13 +233,13 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 
 
 def _label(sweep: Sweep, method: str, options: str, ranks: int) -> str:
-    """Return what the curve of a case is called."""
+    """Return the label of the curve of a case."""
     name = sweep.label or f"{method} {options}".strip()
     return name if ranks == 1 or sweep.ranks == (ranks,) else f"{name}, {ranks} ranks"
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
-    """Return a case with its time table, and its output at the moments that are compared.
+    """Return a case with its time table, and output at the times that are compared.
 
     Nothing is measured beyond its end.
     """
@@ -257,7 +257,7 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 
 
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
-    """Return the run with tiny steps that a case is measured against, stored where they are compared.
+    """Return the reference run of a case, with tiny steps and output at the times that are compared.
 
     It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in
     it, but for the law, if it names none.
@@ -287,7 +287,7 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
 
 
 def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
-    """Yield a map's cases: each method at each point of two axes, or with each named case. Raises InputError."""
+    """Yield the cases of a map, each method at each of its points. Raises InputError."""
     for x, y, run in map_points(map):
         file = folder / run.file
         scene = checked_scene(file, run.set)
@@ -311,7 +311,7 @@ def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
 
 
 def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
-    """Yield the places of a map, and what is run there; y may be a case's name, x is then the method's."""
+    """Yield the points x, y of a map and the run of each; of a named case x is None and y the name."""
     for case in map.case:
         length = case if case.steps or case.duration else map
         own = {"set": (*map.set, *case.set), "steps": length.steps, "duration": length.duration}
@@ -323,7 +323,7 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
-    """Yield the changes of an axis; with a time step the duration changes, which may be shorter."""
+    """Yield the overrides of an axis, with the duration where the axis is the time step."""
     yield from axis.changes(value)
     if axis.key == "time.step":
         duration = length.steps * value if length.steps else max(length.duration or value, value)

@@ -1,4 +1,4 @@
-"""Runs of the program that need not start it: a process that has imported it forks a child for each.
+"""Runs of the program without its start: a process that has imported it forks a child for each.
 
 A start takes 2 s of a core, which is most of a small case; a fork 0.4 s. What such a run costs says less of the
 program than a run of its own does, so only cases are run like this of which no time is asked.
@@ -25,10 +25,10 @@ SERVER.set_forkserver_preload(
 
 
 class Forked:
-    """``msmpetsc`` with these arguments, in a session of its own; used as subprocess.Popen is."""
+    """A forked run of ``msmpetsc`` in a session of its own, with the interface of subprocess.Popen."""
 
     def __init__(self, arguments: Sequence[str], log: Path, environment: Mapping[str, str], errors: Path | None = None):
-        """Start the run, here; its output goes to ``log``, its errors to ``errors`` where that is another file.
+        """Start the run in the current folder; its output goes to ``log``, its errors to ``errors`` if given.
 
         environment : all that it has
         """

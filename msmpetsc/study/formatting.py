@@ -1,4 +1,4 @@
-"""Measured numbers as a reader wants them: 34 ms, 1.2e-3, 9,897."""
+"""Formatting of measured numbers: 34 ms, 1.2e-3, 9,897."""
 
 from typing import Any
 
@@ -26,12 +26,12 @@ def error(value: float) -> str:
 
 
 def count(value: float) -> str:
-    """Return a number of things: 9897 -> 9,897; means keep a digit."""
+    """Return a count: 9897 -> 9,897; a mean keeps one digit."""
     return f"{value:,.0f}" if value == int(value) else f"{value:,.1f}"
 
 
 def plain(value: float | str | None) -> str:
-    """Return any entry of the table, numbers to four digits; an empty text for what is missing, None or NaN."""
+    """Return an entry of the table with four digits; an empty text for None and NaN."""
     if isinstance(value, str):
         return value
     if value is None or value != value:
@@ -43,7 +43,7 @@ TIMES = ("least", "greatest", "step", "substep", "seconds", "explicit_limit")  #
 
 
 def worded(column: str, value: Any) -> str:
-    """Return an entry of a column as its name asks for: errors, times, memory, counts, texts."""
+    """Return an entry formatted by the name of its column: an error, a time, memory, a count or a text."""
     if isinstance(value, str) or value is None or value != value:
         return plain(value)
     if column.endswith("error"):

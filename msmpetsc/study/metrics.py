@@ -1,4 +1,4 @@
-"""The figures of a run: a row of the table, its distances, its outcome in a word."""
+"""Metrics of a run: its costs, its errors against a reference, and its outcome."""
 
 import json
 import warnings
@@ -42,7 +42,7 @@ SLOW = 30  # iterations a step
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return what stands in a measure file; nothing where a run was killed before it."""
+    """Return the contents of a measure file, empty if the run was killed before writing it."""
     try:
         return dict(json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
@@ -63,7 +63,7 @@ def costs(record: dict[str, Any]) -> Row:
 
 
 def of_frames(result: Path, time_step: float) -> Row:
-    """Return figures of a result: times and iterations are means a step without the first frame."""
+    """Return metrics of a result; times and iterations are means over steps after the first frame."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
@@ -80,7 +80,7 @@ def of_frames(result: Path, time_step: float) -> Row:
 
 
 def _soundness(series: dict[str, Floats]) -> Row:
-    """Return what went wrong, inverted cells in the last frame alone; and the energy left where no load acts."""
+    """Return counts of failures, inverted cells at the end, and the energy left where no load acts."""
     row: Row = {name: float(np.nansum(series[name][1:])) for name in ("substeps", "fallbacks", "energy_gained")}
     if series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])
@@ -110,7 +110,7 @@ def _rms(values: Floats) -> float | None:
 
 
 def together(runs: Sequence[Row]) -> Row:
-    """Return one row of the repeats' figures: medians of times, and the range of a step's.
+    """Return one row for all repeats: medians of times, and the range of the time of a step.
 
     Memory is that of the leanest: the first run may have measured errors beside its work.
     """
@@ -131,7 +131,7 @@ def together(runs: Sequence[Row]) -> Row:
 
 
 def outcome(status: int | None, kind: str, row: Row, recovers: bool) -> str:
-    """Return the worst that befell a run.
+    """Return the worst outcome of a run.
 
     status   : exit status, None where time ran out
     kind     : of the failure that the run records, "" for none
@@ -157,7 +157,7 @@ def outcome(status: int | None, kind: str, row: Row, recovers: bool) -> str:
 
 
 def counted(outcomes: Iterable[Any]) -> str:
-    """Return how many went how, best first: 20 ok, 3 slow."""
+    """Return the number of each outcome, best first: 20 ok, 3 slow."""
     counts = Counter(outcomes)
     return ", ".join(f"{counts[name]} {name}" for name in reversed(OUTCOMES) if counts[name])
 
@@ -166,7 +166,7 @@ def counted(outcomes: Iterable[Any]) -> str:
 
 
 def shape_error(run: Result, frame: int) -> float | None:
-    """Return ``distance_of_shapes`` for a frame of a result; None where a position is not finite.
+    """Return the distance of a frame from the rest shape; None where a position is not finite.
 
     Of several bodies it is that of the one that is farthest from its shape.
     """
@@ -179,7 +179,7 @@ def shape_error(run: Result, frame: int) -> float | None:
 
 
 def distance_of_shapes(x: Floats, rest: Floats, mass: Floats) -> float:
-    """Return the distance of nodes x (n, 3) from ``rest`` (n, 3) after the best rigid motion, over the longest side.
+    """Return the distance of x (n, 3) from ``rest`` (n, 3) after the best rigid motion, over the longest side.
 
         min over R, c of sqrt( sum_i m_i |x_i - R rest_i - c|^2 / sum_i m_i ) / side    [-]
 

@@ -1,4 +1,4 @@
-"""The first import of the fork server (study.forkserver), by name: MPI is to begin in each run, not in the server."""
+"""The first import of the fork server, which keeps MPI from starting in the server itself."""
 
 import mpi4py
 from numba.core.registry import cpu_target

@@ -1,4 +1,4 @@
-"""A process with all that it starts: waited for, ended when it takes too long, its trouble kept in one line."""
+"""Processes with all their children: run to the end or to a time limit, with the last error of their log."""
 
 import os
 import signal
@@ -44,7 +44,7 @@ class Ended:
 
 
 class Processes:
-    """The processes under way; once ``stopped``, none is started any more."""
+    """The running processes; once ``stopped``, no new one is started."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes] | Forked] = set()
@@ -72,7 +72,7 @@ class Processes:
         return Ended(status, reason)
 
     def close(self) -> None:
-        """End those under way."""
+        """End all running processes."""
         with self._lock:
             self.stopped, running = True, list(self._running)
         for process in running:
@@ -95,7 +95,7 @@ class Processes:
 
 
 def environment(alone: bool = False) -> dict[str, str]:
-    """Return the environment that this process was started with: an MPI begun in it since would confuse a child's."""
+    """Return the environment for a child, without the variables of the MPI of this process."""
     ours = {name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)}
     # one thread a rank, or ranks and threads would fight for the cores
     return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | ours

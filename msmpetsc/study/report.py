@@ -1,4 +1,4 @@
-"""The report of a study, from its table alone: one page with charts, all numbers and the commands that repeat them.
+"""The report of a study: one page with charts, all numbers and the commands that repeat them.
 
 What stands where is in report.html.j2; this file says what it is.
 """
@@ -59,7 +59,7 @@ def write_report(folder: Path) -> Path:
 
 
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
-    """Return the whole page; it needs nothing beside itself."""
+    """Return the whole page, which is self-contained."""
     environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
     environment.filters |= {"svg": lambda chart: Markup(svg_text(chart)), "html": html}
     between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]
@@ -84,6 +84,6 @@ def facts(table: DataFrame) -> dict[str, Any]:
 
 
 def html(table: DataFrame) -> Markup:
-    """Return a table whose headings sort it."""
+    """Return a table as HTML that is sorted by a click on a heading."""
     with option_context("display.max_colwidth", None):
         return Markup(table.map(formatting.plain).to_html(index=False, border=0, classes="sortable"))

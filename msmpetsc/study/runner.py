@@ -1,4 +1,4 @@
-"""A study is carried out: a bench runs each case, and the table is written after each."""
+"""The study runner: runs each case and writes the table after each."""
 
 import json
 import os
@@ -35,7 +35,7 @@ class CaseResult:
 
 @dataclass
 class Bench:
-    """Runs cases in a folder: results come and go in it, references stay."""
+    """Runs cases in a folder, which keeps the results of references only."""
 
     folder: Path
     processes: Processes
@@ -45,11 +45,11 @@ class Bench:
     _lock: Lock = field(default_factory=Lock)
 
     def result_of(self, case: Case) -> Path:
-        """Return where the result of a case lies while it runs, and after it if it is kept."""
+        """Return the path of the result of a case."""
         return self.folder / "runs" / f"{case.id}.h5"
 
     def measure(self, case: Case, keep: bool = False) -> CaseResult:
-        """Run a case as often as it says; its row tells what goes wrong. ``keep``: its result stays."""
+        """Run a case with its repeats; return its row, with the reason if it failed."""
         runs: list[Row] = []
         path, trace = self.result_of(case), None
         known = case.columns | {"study": self.study, "command": shown_command(case)}
@@ -86,7 +86,7 @@ class Bench:
         return self.processes.run(words, path.with_suffix(".log"), case.timeout, warm)
 
     def _reference(self, case: Case) -> tuple[Path | None, str]:
-        """Return the result of the case's reference, made if need be; or why there is none."""
+        """Return the result of the reference of a case, run if need be, or the reason why there is none."""
         if case.reference is None:
             return None, ""
         path = self.folder / "references" / f"{case.reference.id}.h5"
@@ -108,7 +108,7 @@ class Bench:
 
 
 def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
-    """Return the figures of a run, as far as it came; and what is missing, in words."""
+    """Return the metrics of a run, and the reason why some are missing."""
     row = costs(record)
     try:
         row |= of_frames(path, case.time_step)
@@ -120,7 +120,7 @@ def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
 
 
 def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
-    """Return the error of a run's surface, or of its nodes, by its column; or why there is none."""
+    """Return the error of a run against its reference, by its column, or the reason why there is none."""
     name, measure = ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
     try:
         return {f"{name}_error": measure(path, reference)}, ""
@@ -129,14 +129,14 @@ def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
 
 
 def _remove_files(path: Path, log: bool) -> None:
-    """Remove a run's files, large as they are; its log only if ``log``."""
+    """Remove the files of a run, and its log if ``log``."""
     for suffix in (".h5", ".xdmf", ".json", *((".log",) if log else ())):
         path.with_suffix(suffix).unlink(missing_ok=True)
 
 
 @dataclass
 class StudyResults:
-    """Rows and traces of a study so far, by case, in its folder and in the order of ``order``."""
+    """The rows and traces of a study so far, written in the order of its cases."""
 
     folder: Path
     order: Sequence[str]
@@ -159,7 +159,7 @@ class StudyResults:
 
 @dataclass(frozen=True)
 class StudyPart:
-    """The ``index``-th of ``count`` parts of a study, from 1: cases that follow each other."""
+    """A part of a study: consecutive cases, ``index`` of ``count`` from 1."""
 
     index: int
     count: int
@@ -180,7 +180,7 @@ def run_study(
     restart: bool = False,
     part: StudyPart | None = None,
 ) -> list[Row]:
-    """Run what is not done yet of a study file, as many cases at a time as ``jobs`` or else the file says; all rows.
+    """Run the cases of a study file that are not done, ``jobs`` at a time; return all rows.
 
     The folder gets table.csv, traces.json, study.toml, references/. Cases that are done and still in the
     file are kept, those of its parts too; ``restart`` forgets them. With a ``part`` only that is run, in a folder of
@@ -208,7 +208,7 @@ def run_study(
 
 
 def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case, bool]]:
-    """Return the cases of a study file, and whether each is done; nothing is run or written."""
+    """Return the cases of a study file and whether each is done, without running any."""
     require_extra()
     every, wanted = _cases(load_study(path), path, full)
     rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
@@ -216,13 +216,13 @@ def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case,
 
 
 def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Sequence[str]]:
-    """Return all cases by their id, and the ids of those that are wanted."""
+    """Return all cases by their id, and the ids of those to run."""
     every = {case.id: case for case in study_cases(study, path.parent, True)}
     return every, [case.id for case in study_cases(study, path.parent, full)]
 
 
 def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:
-    """Run cases, keep their results and show each; ``done`` were before."""
+    """Run cases and add their results, with a progress bar that begins at ``done``."""
     bar = tqdm(total=done + len(todo), initial=done, unit="case", dynamic_ncols=True, disable=None)
     pool = ThreadPoolExecutor(jobs)
     try:
@@ -241,7 +241,7 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
 
 
 def described(row: Row) -> str:
-    """Return what a case was, and what became of it."""
+    """Return a line with the name of a case and its outcome."""
     if row.get("map"):
         return f"{row['map']} {row['label']} at {row['x']}, {row['y']}: {row['outcome']}"
     return f"{row['scene']} {row['label']}: {row['status']} {row['reason']}".rstrip()
@@ -251,7 +251,7 @@ def described(row: Row) -> str:
 
 
 def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
-    """Return what earlier runs left of these cases, called by their present names, for the first of the folders.
+    """Return the results of these cases in earlier runs, under their present labels, for the first folder.
 
     Of a case in several of them the first row counts that need not be run again.
     """
@@ -275,6 +275,6 @@ def _earlier_rows(folder: Path) -> list[Row]:
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
-    """Return whether a case need not be run: one given up may be worth another try."""
+    """Return whether a case need not be run; one that timed out is run again with a longer limit."""
     row = rows.get(case.id)
     return row is not None and not (row["status"] == "timeout" and row["reason"] != too_long(case.timeout))

@@ -1,4 +1,4 @@
-"""A study file (TOML): which scenes are run, and with what."""
+"""The schema of a study file (TOML): its scenes, sweeps, methods and maps."""
 
 import shlex
 from collections.abc import Iterable
@@ -45,7 +45,7 @@ Options = Annotated[str, AfterValidator(_words)]
 
 
 class ReferenceRun(Table):
-    """The run that a scene's motion is measured against, with steps so short that it stands for the true motion.
+    """The reference run of a scene, with steps so short that it stands for the true motion.
 
     With cells of its own, many more than the cases have, it stands for the body itself, and surfaces are compared.
     """
@@ -81,7 +81,7 @@ class Length(Table):
 
 
 class StudyScene(Length):
-    """A scene of the study, and what of it is run and measured."""
+    """A scene of the study, with its length, reference and measurements."""
 
     name: Name
     file: FileName  # a path from the study file
@@ -94,7 +94,7 @@ class StudyScene(Length):
 
 
 class Sweep(Table):
-    """Cases of every choice from each list, for every scene; of an empty list as the scene has it."""
+    """The product of lists of options, run for every scene; an empty list stands for the scene's own value."""
 
     scenes: ListOf[str] = ()  # names; all if absent
     integrators: ListOf[IntegratorName] = ("implicit-euler",)
@@ -133,7 +133,7 @@ class Method(Table):
 
 
 class Axis(Table):
-    """A side of a map: a key of the scene that changes along it, or several changes that name their {value}."""
+    """An axis of a map: a key of the scene, or a template of overrides that contain {value}."""
 
     one_of: ClassVar[tuple[str, ...]] = ("key", "template")
     name: Name  # for the reader
@@ -149,7 +149,7 @@ class Axis(Table):
 
 
 class MapCase(Length):
-    """A named case: a line of a map whose columns are the methods."""
+    """A named case of a map whose columns are the methods."""
 
     name: Name
     file: FileName  # a path from the study file
@@ -159,7 +159,7 @@ class MapCase(Length):
 
 
 class Map(Length):
-    """A map of what happens to a scene over two axes, a panel a method; or to named cases, a column a method."""
+    """A stability map of a scene over two axes, or of named cases."""
 
     one_of: ClassVar[tuple[str, ...]] = ("file", "case")
     name: Name

@@ -1,4 +1,4 @@
-"""The table of a study: a row a case, written as CSV, read as a pandas DataFrame, and its rows chosen.
+"""The table of a study: one row for each case, written as CSV and read as a pandas DataFrame.
 
 pandas is imported where it is used: the commands that need no table do not wait for it.
 """
@@ -48,13 +48,13 @@ def require_extra() -> None:
 
 
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
-    """Write table.csv, replaced whole: a column of counts in whole numbers, what was not measured as nothing."""
+    """Write table.csv, with columns of counts as integers and empty entries for what was not measured."""
     table = as_table(rows).replace([math.inf, -math.inf], math.nan).convert_dtypes(convert_string=False)
     write_whole(folder / "table.csv", table.to_csv(index=False, lineterminator="\r\n"))
 
 
 def read_table(folder: Path) -> "DataFrame":
-    """Return the rows of table.csv, see ``typed``. Raises InputError without such a table."""
+    """Return the rows of table.csv. Raises InputError without such a table."""
     import pandas
 
     path = folder / "table.csv"
@@ -68,7 +68,7 @@ def read_table(folder: Path) -> "DataFrame":
 
 
 def read_traces(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return the traces of traces.json by case; none without the file. Raises InputError."""
+    """Return the traces of traces.json by case, empty without the file. Raises InputError."""
     path = folder / "traces.json"
     try:
         traces = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
@@ -86,7 +86,7 @@ def as_table(rows: Sequence[Row]) -> "DataFrame":
 
 
 def typed(texts: Iterable[Mapping[str, str]]) -> "DataFrame":
-    """Return rows of text as a table; a number that is missing, infinite or unreadable was not measured: NaN."""
+    """Return rows of text as a table; a number that is missing, infinite or unreadable is NaN."""
     return as_table([{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts])
 
 
@@ -114,7 +114,7 @@ def failed(table: "DataFrame") -> "DataFrame":
 
 
 def swept(table: "DataFrame") -> "DataFrame":
-    """Return the rows of sweeps; those of maps stand apart: a run that fails there is an answer."""
+    """Return the rows of sweeps, without those of maps, where a failed run is an answer."""
     return table[table["map"] == ""]
 
 
@@ -123,7 +123,7 @@ def mapped(table: "DataFrame") -> dict[str, "DataFrame"]:
 
 
 def measured(table: "DataFrame", *columns: str) -> "DataFrame":
-    """Return the rows with a positive number in each of these columns: what a logarithmic axis can show."""
+    """Return the rows with a positive number in each of these columns."""
     return table[(table[list(columns)] > 0).all(axis=1)]
 
 
@@ -132,7 +132,7 @@ def timed(table: "DataFrame") -> "DataFrame":
 
 
 def grouped(table: "DataFrame", *columns: str) -> dict[Any, "DataFrame"]:
-    """Return a table's parts by the values of columns, values and rows in their order."""
+    """Return the rows grouped by the values of columns, in order of first appearance."""
     by: Any = columns[0] if len(columns) == 1 else list(columns)
     return dict(iter(table.groupby(by, sort=False, dropna=False)))
 
@@ -155,7 +155,7 @@ def spread(table: "DataFrame", cost: str) -> "DataFrame":
 
 
 def reach(table: "DataFrame", cost: str) -> "DataFrame":
-    """Return the spread; where it is not known, twice the cost itself."""
+    """Return the spread of the repeats, with the cost itself where it is not known."""
     ends: DataFrame = spread(table, cost).apply(lambda column: column.fillna(table[cost]))
     return ends
 

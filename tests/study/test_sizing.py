@@ -25,7 +25,7 @@ from msmpetsc.study.runner import CaseResult
 from msmpetsc.study.sizing import trials
 from msmpetsc.study.sizing.answer import SizePlan, overrides, put_into, tables
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
-from msmpetsc.study.sizing.orders import CELL_ORDERS, ErrorLaw, cosine_of, error_law
+from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 from msmpetsc.study.sizing.trials import Asked, Sizer
 
 STATIC = 'integrator = "static"'
@@ -36,31 +36,31 @@ STATIC = 'integrator = "static"'
 def test_three_sizes_tell_order_and_error(order: float, sizes: tuple):
     """The error is 0.03 size^order exactly."""
     e = [0.03 * size**order for size in sizes]
-    law = error_law(sizes, [e[0] - e[1], e[1] - e[2]], CELL_ORDERS)
+    law = error_law(sizes, [e[0] - e[1], e[1] - e[2]], ORDERS)
     assert law.seen and law.order == pytest.approx(order) and law.error(0.5) == pytest.approx(0.03 * 0.5**order)
     assert law.size(law.error(0.7)) == pytest.approx(0.7)
 
 
 def test_an_order_that_cannot_be_is_not_believed():
     """Distances that do not shrink have no order: the least is taken, which makes the error the greatest."""
-    stuck = error_law((4, 2, 1), [0.05, 0.05], CELL_ORDERS)
+    stuck = error_law((4, 2, 1), [0.05, 0.05], ORDERS)
     assert not stuck.seen and stuck.order == 1 and stuck.error(1) == pytest.approx(0.05)
-    steep = error_law((4, 2, 1), [0.5, 0.01], CELL_ORDERS)
+    steep = error_law((4, 2, 1), [0.5, 0.01], ORDERS)
     assert steep.order == 2.2 and steep.error(1) == pytest.approx(0.01 / (2**2.2 - 1))
-    two = error_law((2, 1), [0.05], CELL_ORDERS)
+    two = error_law((2, 1), [0.05], ORDERS)
     assert not two.seen and two.error(1) == pytest.approx(0.05)
 
 
 def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
     """Errors go as the size, but for 0.02 of chance, which the last two sizes alone would make much of."""
     sizes, errors = (4, 1.4, 1), (0.4, 0.16, 0.08)
-    near = error_law(sizes, [0.24, 0.08], CELL_ORDERS)
-    wide = error_law(sizes, [0.24, 0.08], CELL_ORDERS, across=errors[0] - errors[2])
+    near = error_law(sizes, [0.24, 0.08], ORDERS)
+    wide = error_law(sizes, [0.24, 0.08], ORDERS, across=errors[0] - errors[2])
     assert not near.seen and near.error(1) == pytest.approx(0.2)
     assert not wide.seen and wide.error(1) == pytest.approx(0.32 / 3)
-    assert error_law((4, 2, 1), [0.05, 0.05], CELL_ORDERS, across=0.1).error(1) == pytest.approx(0.05)
+    assert error_law((4, 2, 1), [0.05, 0.05], ORDERS, across=0.1).error(1) == pytest.approx(0.05)
     seen = [0.03 * (4**1.5 - 1.4**1.5), 0.03 * (1.4**1.5 - 1)]
-    assert error_law(sizes, seen, CELL_ORDERS, across=1.0).error(1) == pytest.approx(0.03)
+    assert error_law(sizes, seen, ORDERS, across=1.0).error(1) == pytest.approx(0.03)
 
 
 @pytest.mark.parametrize(("order", "cosine"), [(1.0, 0.0), (1.5, 0.0), (1.5, 0.5), (2.0, 0.9)])
@@ -70,7 +70,7 @@ def test_lattices_that_err_by_chance(order: float, cosine: float):
     first, second = (math.sqrt(a**2 - (1 - cosine**2) * b**2) - cosine * b for a, b in pairwise(e))
     across = math.sqrt(first**2 + second**2 + 2 * cosine * first * second)
     assert cosine_of(first, second, across) == pytest.approx(cosine, abs=1e-6)
-    law = error_law(sizes, [first, second], CELL_ORDERS, across, cosine)
+    law = error_law(sizes, [first, second], ORDERS, across, cosine)
     assert law.order == pytest.approx(order, abs=1e-6) and law.error(1) == pytest.approx(0.03)
     assert law.measured(second, 1) == pytest.approx(e[1]) and law.measured_finer(second, 1, 2) == pytest.approx(0.03)
     assert error_law(sizes[1:], [second], (order, order)).error(1) > law.error(1)

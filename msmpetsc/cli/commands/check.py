@@ -1,4 +1,4 @@
-"""``msmpetsc check``: are the numbers of a scene still those that were stored; ``--update`` stores them.
+"""``msmpetsc check``: compare the numbers of a scene with those that ``--update`` stored.
 
 Each step is solved to 1e-9, so that neither the number of ranks nor the way in which a step is
 solved shows. Counts must be equal, the numbers of the last frame within the tolerance.
@@ -12,6 +12,7 @@ counted from the start), momentum to that of the whole mass at the largest kinet
 
 import argparse
 import json
+import math
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext, redirect_stdout
@@ -31,10 +32,8 @@ from msmpetsc.study.cases import launcher
 from msmpetsc.study.forkserver import COLD
 from msmpetsc.study.process import Processes
 
-SAME, DIFFERENT = 0, 1
 STEPS = 20  # of a scene's numbers, if nothing else is asked for
 ERROR = 1e-9  # of each step, relative
-LONGEST = 1e6  # [s] of a run
 GROWTH = 10  # of an error, by contact and buckling
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 NODES = 5  # whose places are stored, evenly spread by their numbers
@@ -71,7 +70,7 @@ class Number(_Strict):
 
 
 class Numbers(_Strict):
-    """What is stored of a run; scales: what errors are relative to. A file of them may be damaged, or from anywhere."""
+    """What is stored of a run: how it was made, counts, scales of errors, and numbers of the last frame."""
 
     run: Recipe
     counts: dict[str, Annotated[int, Field(ge=0)]]
@@ -91,12 +90,12 @@ def run(args: argparse.Namespace) -> int:
     if not args.update:
         if asked:
             raise InputError("--cells, --frames and --set are for --update: the numbers stored say how they were made")
-        return DIFFERENT if any(check(files, args.ranks, args.json).values()) else SAME
+        return int(any(check(files, args.ranks, args.json).values()))
     if args.json:
-        raise InputError("--update checks nothing: --json has no place beside it")
+        raise InputError("--update checks nothing: --json is of no use")
     for scene, file in files.items():
         update(scene, file, asked, args.ranks)
-    return SAME
+    return 0
 
 
 def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
@@ -111,14 +110,14 @@ def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
             "--set time={step=..., duration=...} takes steps of one length"
         )
     recipe = recipe.model_copy(update={"steps": min(recipe.steps, time.steps)})
-    numbers = found(scene, recipe, ranks)
+    numbers = numbers_of(scene, recipe, ranks)
     write(file, numbers)
     count = len(numbers.counts) + len(numbers.numbers)
     accuracy = allowed(recipe.steps, "m")
     print(f"{file}: {count} numbers after {recipe.steps} steps, positions to {accuracy:.1g}")
 
 
-def found(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
+def numbers_of(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
     """Run a scene by a recipe; return its numbers. Raises InputError where the run fails."""
     load_scene(scene, recipe.changes, by_user=False)  # they come with the scene, and name what lies beside it
     cells = [] if recipe.cells is None else [f"cages.count={recipe.cells}"]
@@ -127,14 +126,14 @@ def found(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
         path = Path(folder) / "run.h5"
         steps = ["--frames", str(recipe.steps), "--error", str(ERROR)]
         command = [*launcher(ranks), *COLD, "run", str(scene), "-o", str(path), *steps, *words]
-        ended = Processes().run(command, path.with_suffix(".log"), LONGEST)
+        ended = Processes().run(command, path.with_suffix(".log"), math.inf)
         if ended.reason:
             raise InputError(f"{scene}: the run failed: {ended.reason}")
         return summary(path, recipe)
 
 
 def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, list[str]]:
-    """Hold the scenes against the files of their numbers; print and return what is not as stored, by scene."""
+    """Compare scenes with their stored numbers; print and return the differences by scene."""
     for scene, file in files.items():
         if not file.is_file():
             raise InputError(f"nothing is stored of {scene}: msmpetsc check --update {scene} stores {file}")
@@ -149,9 +148,9 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, li
 
 
 def checked(scene: Path, stored: Numbers, ranks: int) -> list[str]:
-    """Run a scene as its stored numbers were made, and print its line; return what is not as stored, a line each."""
+    """Run a scene as its stored numbers were made; print a summary and return the differences, a line each."""
     began = perf_counter()
-    numbers = found(scene, stored.run, ranks)
+    numbers = numbers_of(scene, stored.run, ranks)
     wrong = judged(numbers, stored)
     verdict = "DIFFERS" if wrong else "same"
     _, off, most = max(differences(numbers, stored), key=lambda row: row[1] / row[2] if row[2] else np.inf)
@@ -164,7 +163,7 @@ def checked(scene: Path, stored: Numbers, ranks: int) -> list[str]:
 
 
 def summary(path: Path, recipe: Recipe) -> Numbers:
-    """Return what is stored of a run: its recipe, counts, what errors are relative to, the last frame's numbers."""
+    """Return the numbers of a result that are stored."""
     with msmpetsc.open(path) as result:
         lattice, frames = result.lattice, result.frames
         rest, mass = lattice.nodes[:], lattice.mass[:]
@@ -192,19 +191,19 @@ def summary(path: Path, recipe: Recipe) -> Numbers:
 
 
 def allowed(steps: int, unit: str) -> float:
-    """Return the relative difference that the errors of so many steps may come to."""
+    """Return the allowed relative difference after so many steps."""
     return GROWTH * ERROR * steps * (steps + 1) / 2 * (1 if unit == "m" else 2)
 
 
-def differences(found: Numbers, stored: Numbers) -> Iterator[tuple[str, float, float]]:
-    """Yield of each number its name, how far it is off, relative, and how much is allowed."""
-    for name in found.numbers.keys() | stored.numbers.keys():
-        one, other = found.numbers.get(name), stored.numbers.get(name)
+def differences(now: Numbers, stored: Numbers) -> Iterator[tuple[str, float, float]]:
+    """Yield the name, the relative difference and the allowed one of each number."""
+    for name in now.numbers.keys() | stored.numbers.keys():
+        one, other = now.numbers.get(name), stored.numbers.get(name)
         if one is None or other is None or one.unit != other.unit or np.shape(one.value) != np.shape(other.value):
             yield name, np.inf, 0.0
             continue
         apart = np.abs(np.subtract(one.value, other.value, dtype=float)).max()
-        scale = min(found.scales[one.unit], stored.scales[one.unit])  # of a damaged file any
+        scale = min(now.scales[one.unit], stored.scales[one.unit])  # of a damaged file any
         relative = np.inf
         if apart == 0:
             relative = 0.0
@@ -213,16 +212,16 @@ def differences(found: Numbers, stored: Numbers) -> Iterator[tuple[str, float, f
         yield name, relative, allowed(stored.run.steps, one.unit)
 
 
-def judged(found: Numbers, stored: Numbers) -> list[str]:
-    """Return what is wrong with each count and number that is not as stored."""
+def judged(now: Numbers, stored: Numbers) -> list[str]:
+    """Return a line for each count and number that differs from the stored one."""
     lines = [
-        f"{name}: {found.counts.get(name)}, stored {stored.counts.get(name)}"
-        for name in found.counts.keys() | stored.counts.keys()
-        if found.counts.get(name) != stored.counts.get(name)
+        f"{name}: {now.counts.get(name)}, stored {stored.counts.get(name)}"
+        for name in now.counts.keys() | stored.counts.keys()
+        if now.counts.get(name) != stored.counts.get(name)
     ]
-    for name, off, most in differences(found, stored):
+    for name, off, most in differences(now, stored):
         if off > most:
-            values = f"{found.numbers.get(name, 'not there')}, stored {stored.numbers.get(name, 'not there')}"
+            values = f"{now.numbers.get(name, 'not there')}, stored {stored.numbers.get(name, 'not there')}"
             lines.append(f"{name}: {values}: {off:.2g} off, {most:.2g} allowed")
     return sorted(lines)
 
@@ -233,7 +232,7 @@ def write(path: Path, numbers: Numbers) -> None:
 
 
 def read(path: Path) -> Numbers:
-    """Return stored numbers. Raises InputError for what are none."""
+    """Return stored numbers. Raises InputError for a damaged file."""
     try:
         stored = Numbers.model_validate_json(path.read_text(encoding="utf-8"))
         judged(stored, stored)

@@ -1,4 +1,4 @@
-"""``msmpetsc compare``: do two results agree, and if not, from which frame and node on."""
+"""``msmpetsc compare``: the differences of two results, and the first frame and node that differ."""
 
 import argparse
 import json
@@ -19,7 +19,6 @@ from msmpetsc.results.comparison import (
 )
 from msmpetsc.results.reader import Result, refuse_deadly
 
-SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
 
 
@@ -44,11 +43,11 @@ def run(args: argparse.Namespace) -> int:
             print("\n".join(first_difference(first, comparison, args.rtol)))
             if apart:
                 print("they have not the same times, which counts as different")
-    return SAME if agree else DIFFERENT
+    return int(not agree)
 
 
 def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
-    """Compare two results, of different lattices by their surfaces alone; say so in notes."""
+    """Compare two results, by their surfaces alone if the lattices differ, and return notes on that."""
     try:
         return compare(first, second), []
     except DifferentLattices as error:
@@ -66,7 +65,7 @@ def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
 
 
 def record(field: FieldError, comparison: Comparison, rtol: float) -> dict[str, Any]:
-    """Return what is said of a field: frames are numbered as in the first file."""
+    """Return the differences of a field, with frames numbered as in the first file."""
     greatest = int(np.argmax(field.errors))
     first = field.first_above(rtol)
     return {
@@ -79,14 +78,14 @@ def record(field: FieldError, comparison: Comparison, rtol: float) -> dict[str, 
 
 
 def row(name: str, field: dict[str, Any]) -> str:
-    """Return the line of the table of a field's record."""
+    """Return the line of a field in the table."""
     since = "-" if field["first_above"] is None else field["first_above"]
     scale = f"{field['scale']:.3g} {field['unit']}"
     return f"{name:16} {field['error']:14.3g} {field['frame']:8} {since:>11} {scale:>11}"
 
 
 def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterator[str]:
-    """Yield which frames and fields one run alone has."""
+    """Yield notes on frames and fields that only one run has."""
     counts = [len(result.frames.time) for result in (first, second)]
     shared = len(comparison.pairs)
     if counts != [shared, shared]:
@@ -97,7 +96,7 @@ def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterato
 
 
 def first_difference(result: Result, comparison: Comparison, rtol: float) -> Iterator[str]:
-    """Yield the first frame that differs, and the node that is farthest off there."""
+    """Yield the first frame that differs, and its node of the largest difference."""
     firsts = {field.name: first for field in comparison.fields if (first := field.first_above(rtol)) is not None}
     if not firsts:
         yield f"they agree to {rtol:g} at these {len(comparison.pairs)} frames"
@@ -112,7 +111,7 @@ def first_difference(result: Result, comparison: Comparison, rtol: float) -> Ite
 
 
 def farthest(result: Result, comparison: Comparison, field: FieldError, first: int) -> str:
-    """Return which node or surface point is farthest off at a frame, and where it is at rest."""
+    """Return which node or surface point differs most at a frame, with its rest position."""
     number, rest_rows = field.worst[first], rest_of(result, field.name)
     rest = f", at rest at {point_text(rest_rows[number])}" if rest_rows is not None else ""
     kind = "node" if field.name == "position" else "surface point"

@@ -4,7 +4,6 @@ import argparse
 
 from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.cli.arguments import command_parser
-from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError
 
 
@@ -19,6 +18,5 @@ def run(args: argparse.Namespace) -> int:
     for argument in (each for command in commands.values() for each in command._actions):
         if argument.type in (checked_path, checked_file):  # completed by files
             argument.complete = shtab.FILE
-    if world().rank == 0:
-        print(shtab.complete(parser, args.shell))
+    print(shtab.complete(parser, args.shell))
     return 0

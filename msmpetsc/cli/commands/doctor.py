@@ -15,7 +15,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import msmpetsc
-from msmpetsc.cli.ranks import world
 from msmpetsc.errors import EXTRAS, extra_of
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
@@ -73,9 +72,7 @@ Finding = tuple[str, str, str]  # what, its state, and in words
 
 
 def run(_: argparse.Namespace) -> int:
-    """Print a line for each thing; return 1 where a run lacks something that it needs."""
-    if world().rank != 0:
-        return 0
+    """Print the findings; return 1 where a run lacks something that it needs."""
     lacking = False
     for what, state, words in findings():
         print(f"{state:8} {what:16} {words}", flush=True)
@@ -84,15 +81,15 @@ def run(_: argparse.Namespace) -> int:
 
 
 def findings() -> Iterator[Finding]:
-    """Yield what each probe finds, then the packages of each extra."""
+    """Yield the findings of all probes, then those of the packages of each extra."""
     for name, code in PROBES.items():
         has_ranks = name == "MPI" and installed("mpi4py")  # or mpiexec would say something else
         state, words = probed(code, *(("mpiexec", "-n", "2") if has_ranks else ()))
         if not words:
             state, words = NOTHING[name]
         yield name, state, words.replace("\n", ", ")
-    place = Path(msmpetsc.__file__).parent
-    yield "msmpetsc", OK, f"{msmpetsc.__version__} in {place}, Python {platform.python_version()}"
+    folder = Path(msmpetsc.__file__).parent
+    yield "msmpetsc", OK, f"{msmpetsc.__version__} in {folder}, Python {platform.python_version()}"
     yield from packages()
 
 
@@ -105,7 +102,7 @@ def installed(package: str) -> bool:
 
 
 def probed(code: str, *launcher: str) -> tuple[str, str]:
-    """Return how a Python of its own ends: its state, and what it prints, or what brings or ails it."""
+    """Return the state of a probe run in its own Python, with its output or the reason of its failure."""
     command = [*launcher, sys.executable, "-c", code]
     alone = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_COMM", "PMIX_", "PMI_"))}
     alone |= ONE_CORE
@@ -130,7 +127,7 @@ def probed(code: str, *launcher: str) -> tuple[str, str]:
 
 
 def packages() -> Iterator[Finding]:
-    """The packages of each extra: missing, or there but broken, so that they cannot be imported."""
+    """Yield whether the packages of each extra are installed and can be imported."""
     found = sorted({name for names in EXTRAS.values() for name in names if installed(name)})
     state, words = probed(IMPORTS.format(names=found))
     if state != OK:

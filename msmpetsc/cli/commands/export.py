@@ -22,7 +22,7 @@ SERIES = (
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the frames or the series, and print the path; without one print the series; return the exit status."""
+    """Write frames or the series of a result; return the exit status."""
     refuse_deadly(args.result)
     if args.command == "export":
         print(export(args.result, args.output, args.mesh, args.frames))
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
-    """Yield the columns of a result, the time first: name with unit, and a number a frame (T,).
+    """Yield the columns of the series, the time first: a name with unit, and values (T,).
 
     Raises InputError where they are not those of the scene.
     """
@@ -66,7 +66,7 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
 
 
 def series_text(run: Result, scene: SceneFile) -> str:
-    """Return the series as CSV: a line of names and units, then one a frame. Raises InputError."""
+    """Return the series as CSV, with a header and one line for each frame. Raises InputError."""
     columns, text = dict(columns_of(run, scene)), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

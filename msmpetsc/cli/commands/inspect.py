@@ -1,4 +1,4 @@
-"""``msmpetsc inspect``: what a scene would need on so many ranks, without running it there.
+"""``msmpetsc inspect``: counts and memory of a scene on so many ranks, without running it.
 
 memory of a rank  =  PROGRAM + FACTOR (bytes of its arrays while A is assembled), or W is made if that is more
 """
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def counts_of(scene: Scene, partition: Partition) -> dict[str, dict[str, float]]:
-    """Return how many there are of each thing in all, and of a rank in the mean and at the most."""
+    """Return the counts of cells, nodes, springs and messages: total, mean and maximum of a rank."""
     rows = {
         "cells": partition.cells,
         "nodes": partition.nodes,
@@ -75,12 +75,12 @@ def counts_of(scene: Scene, partition: Partition) -> dict[str, dict[str, float]]
 
 
 def over_ranks(values: Floats) -> dict[str, float]:
-    """Return sum, mean and maximum of what the ranks have."""
+    """Return the sum, the mean and the maximum over ranks."""
     return {"all": float(values.sum()), "mean": float(values.mean()), "most": float(values.max())}
 
 
 def print_counts(report: dict[str, Any]) -> None:
-    """Print a table of what there is, and what a rank has of it."""
+    """Print the counts as a table."""
     counts = report["counts"]
     how = "counted"
     if report["counted"] != counts["cells"]["all"]:

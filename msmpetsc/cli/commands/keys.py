@@ -10,7 +10,7 @@ HEAD = ("key", "unit", "default", "range", "meaning")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a line a key, or the schema; return the exit status."""
+    """Print one line for each key, or the schema; return the exit status."""
     if args.command == "schema":
         print(json.dumps(json_schema(), indent=1))
         return 0

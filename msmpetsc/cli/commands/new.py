@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 def drafted(mesh: Path, scene: Path, up: str) -> str:
     """Return the text of a scene for a mesh, a file or a registry name, with ``up`` upwards. Raises InputError."""
-    source = str(mesh) if str(mesh) in MODELS else beside(mesh, scene)
+    source = str(mesh) if str(mesh) in MODELS else path_from(scene, mesh)
     surface = load(source, scene.parent)
     warnings = check_encloses(surface, examine(surface))
     measures = measured(surface)
@@ -87,7 +87,7 @@ def drafted(mesh: Path, scene: Path, up: str) -> str:
     return draft(source, scene.stem, measures, up)
 
 
-def beside(mesh: Path, scene: Path) -> str:
+def path_from(scene: Path, mesh: Path) -> str:
     """Return the path of a mesh from its scene's folder. Raises InputError for one elsewhere."""
     folder = scene.parent
     if not mesh.exists():
@@ -108,7 +108,7 @@ def write(path: Path, text: str) -> None:
 
 
 def shipped_titles() -> dict[str, str]:
-    """Return the title of each scene that comes with the package. Raises InputError for none."""
+    """Return the titles of the scenes that come with the package. Raises InputError if there are none."""
     files = sorted(SHIPPED.glob("*.toml"))
     if not files:
         raise InputError(f"{SHIPPED} has no scenes: this msmpetsc was installed without them")
@@ -116,7 +116,7 @@ def shipped_titles() -> dict[str, str]:
 
 
 def shipped_text(name: str) -> str:
-    """Return the text of a scene that comes with the package. Raises InputError for a name that is none."""
+    """Return the text of a scene that comes with the package. Raises InputError for an unknown name."""
     titles = shipped_titles()
     if name not in titles:
         raise InputError(f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: msmpetsc new --list")
@@ -128,7 +128,7 @@ def shipped_text(name: str) -> str:
 
 @dataclass(frozen=True)
 class MeshMeasures:
-    """What a first scene rests on, lengths in the file's unit."""
+    """Measures of a mesh for its first scene, with lengths in the unit of the file."""
 
     sides: Floats  # (3,) of the bounding box
     triangles: int
@@ -166,7 +166,7 @@ def unit_of(side: float) -> float | None:
 
 @dataclass(frozen=True)
 class Dimensions:
-    """The body as it will lie, z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
+    """The dimensions of a body with z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
 
     sides: Floats
     thickness: float
@@ -194,27 +194,22 @@ def draft(source: str, title: str, mesh: MeshMeasures, up: str) -> str:
 
 
 def _mesh(source: str, mesh: MeshMeasures, body: Dimensions, up: str) -> list[str]:
-    """Return the table of the mesh, and what is wrong with it."""
+    """Return the table of the mesh, with comments on its defects."""
     report = mesh.report
     parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
     state = "closed" if report.closed else f"open ({report.boundary_edges} boundary edges)"
     name = json.dumps(source, ensure_ascii=False)
     lines = ["[mesh]", line(f"source = {name}", f"{mesh.triangles} triangles, {state}, {parts}")]
-    steps = []
-    reasons = []
+    lines.append(f"# {up} is taken for upwards: msmpetsc new --up says another axis")
+    steps = {}  # with the reason
     if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
-        steps.append('"largest_part"')
-        reasons.append(f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area")
+        steps['"largest_part"'] = f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area"
     if report.inconsistent_edges or report.volume < 0:
-        steps.append('"orient"')
-        reasons.append("faces are wound inwards, or against each other")
+        steps['"orient"'] = "faces are wound inwards, or against each other"
     if up == "y":
-        steps.append(TURN)
-        reasons.append("y is taken for upwards and turned to z: if z is, take rotate out of prepare")
-    else:
-        reasons.append(f"z is taken for upwards: if y is, put {TURN} into prepare")
-    lines += [f"# {reason}" for reason in reasons]
+        steps[TURN] = "scenes have z upwards"
     if steps:
+        lines += [f"# {reason}" for reason in steps.values()]
         lines.append(f"prepare = [{', '.join(steps)}]")
     if not report.closed:
         lines.append('# open: the winding number decides what is inside; prepare = ["repair"] would close it')
@@ -292,10 +287,10 @@ def _time(duration: float, period: float) -> list[str]:
 
 
 def line(setting: str, comment: str) -> str:
-    """Return a line of TOML with a comment, which begins in its column where there is room."""
+    """Return a line of TOML with a comment at a fixed column."""
     return f"{setting:{COLUMN - 1}} # {comment}"
 
 
 def plain(value: float, digits: int) -> str:
-    """Return a number of so many digits as a person writes it in TOML: 0.12, 3e5."""
+    """Return a number with so many digits in short TOML notation: 0.12, 3e5."""
     return f"{value:.{digits}g}".replace("e+0", "e")

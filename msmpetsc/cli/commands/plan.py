@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def print_command(args: argparse.Namespace, choice: Choice, target: float) -> str:
-    """Print the command that runs the choice, which is returned; write the choice into the scene if asked to."""
+    """Print and return the command that runs the choice, and write the choice into the scene if asked to."""
     errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
     budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
     answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
@@ -56,7 +56,7 @@ def print_command(args: argparse.Namespace, choice: Choice, target: float) -> st
 
 
 def size_all(args: argparse.Namespace, target: float) -> SizePlan:
-    """Make the trials, and print each when it is done; afterwards none of their runs is left."""
+    """Run the trials in a temporary folder and print each."""
     asked = Asked(target, args.frames, args.cells, args.ranks)
     with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder, closing(Processes()) as processes:
         runs = Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
@@ -66,7 +66,7 @@ def size_all(args: argparse.Namespace, target: float) -> SizePlan:
 
 
 def print_size_trial(trial: SizeTrial | str) -> None:
-    """Print one line of what was tried, or a note."""
+    """Print one line for a trial, or a note."""
     if isinstance(trial, str):
         print(trial, flush=True)
         return
@@ -78,7 +78,7 @@ def print_size_trial(trial: SizeTrial | str) -> None:
 
 
 def print_size(plan: SizePlan, target: float) -> None:
-    """Print the choice with its error, the parts of that, and what bounds it."""
+    """Print the choice with the parts of its error, and what bounds it."""
     choice = plan.choice
     print("\ncheapest:" if plan.met else f"\nnothing meets {target:g}; the smallest error within reach:")
     cost = f"{choice.cost:.3g} computing seconds a simulated second"

@@ -34,7 +34,7 @@ FASTEST = {"fps": 240, "speed": 1e6}
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw what is asked for and print its path; return the exit status."""
+    """Draw a result, a scene or a mesh and print the path; return the exit status."""
     refuse_other_format("-o", args.output, (*PICTURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES))
     path = args.output or args.subject.with_suffix(".png")
     ending = path.suffix.lower()
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def style_of(args: argparse.Namespace) -> Style:
-    """Return how things are to look. Raises InputError."""
+    """Return the style of a picture. Raises InputError."""
     eye = None if args.eye is None else _direction(args.eye)
     shown = tuple(args.show.split(",")) if args.show else ()
     for name in shown:
@@ -82,7 +82,7 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
 
 
 def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
-    """Draw a scene or a mesh as it lies before anything is run."""
+    """Draw a scene or a mesh at rest."""
     for option in ("frames", "count", "speed", "reference"):
         if getattr(args, option) is not None:
             raise InputError(f"--{option} is for results, and {args.subject} is none")
@@ -99,7 +99,7 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
 
 
 def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
-    """Return what a scene or a mesh shows, with size and cells in words. Raises InputError."""
+    """Return a scene or a mesh to draw, with its size and cells in words. Raises InputError."""
     if path.suffix.lower() not in SCENE_NAMES:
         if changes:
             raise InputError(f"--set changes a scene, and {path} is a mesh")
@@ -119,7 +119,7 @@ def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[st
 
 
 def _sides(points: Floats) -> str:
-    """Return "0.3 x 0.2325 x 0.2974" of the box around points (v, 3)."""
+    """Return the sides of the box around points (v, 3): "0.3 x 0.2325 x 0.2974"."""
     return " x ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
 
 

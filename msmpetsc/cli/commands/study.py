@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def part_of(text: str | None) -> StudyPart | None:
-    """Return "3/16" as the third of 16 parts. Raises InputError."""
+    """Return the part that "3/16" names, the third of 16. Raises InputError."""
     if text is None:
         return None
     index, _, count = text.partition("/")

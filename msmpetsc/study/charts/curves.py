@@ -40,11 +40,11 @@ CAPTION = (
     "whole motion, time step included."
 )
 STEPPING = ("time_step", "substep")
-TOLD = ("least", "greatest", *STEPPING, "error", "max_iterations", "iterations", "ranks")
+TIP = ("least", "greatest", *STEPPING, "error", "max_iterations", "iterations", "ranks")
 
 
 class ErrorMeasure(NamedTuple):
-    """A panel: the columns of an error and of what it costs, and their words."""
+    """A panel of cost over error: the columns of both, and their labels."""
 
     error: str
     cost: str
@@ -74,11 +74,9 @@ TRAJECTORY = ErrorMeasure(
 
 
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
-    """Return the points that no other beats: none is at most as great in both and smaller in one.
-
-    They come by rising x.
-    """
-    across, down = np.subtract.outer(x, x), np.subtract.outer(y, y)  # of a row's point from a column's
+    """Return the indices of the Pareto-optimal points, by rising x."""
+    across = np.subtract.outer(x, x)  # of a row's point from a column's
+    down = np.subtract.outer(y, y)
     beaten = ((across >= 0) & (down >= 0) & ((across > 0) | (down > 0))).any(axis=1)
     return [int(index) for index in np.lexsort((y, x)) if not beaten[index]]
 
@@ -93,14 +91,14 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
 
 
 def cheapest(rows: DataFrame, measure: ErrorMeasure, level: float) -> Row | None:
-    """Return the measured row of the least cost with an error of at most this level; None where nothing reaches it."""
+    """Return the row of the least cost whose error is at most ``level``, or None."""
     reached = measured(rows, *measure.columns)
     reached = reached[reached[measure.error] <= level]
     return next(iter(records(reached.sort_values(measure.cost, kind="stable"))), None)
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return one chart for each scene, and for each of its cell counts where a method was swept."""
+    """Return one chart for each scene and each cell count at which a method was swept."""
     charts = []
     for scene, rows in grouped(table, "scene").items():
         sizes = grouped(succeeded(rows), "cells")
@@ -130,7 +128,7 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
 
 
 def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
-    """Draw the front, over it a line through each method's best points, the others hollow."""
+    """Draw the Pareto front, a line through the best points of each method, and the other points hollow."""
     step = formatting.worded("time_step", rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
     x = log_axis(measure.x_label, rows[measure.error], ERROR)
@@ -142,21 +140,22 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel.stair([errors[0], *errors, right], [top, *costs, costs[-1]])
     rows = rows.join(spread(rows, measure.cost))
     best = concat([front_rows(group, measure) for group in grouped(rows, "label").values()])
-    told = (*measure.columns, *TOLD)
+    columns = (*measure.columns, *TIP)
     panel.whiskers(rows, measure.columns)
-    panel.mark(points(rows.drop(best.index), measure.columns, told), hollow=True)
-    panel.curves(best, measure.columns, told)
+    panel.mark(points(rows.drop(best.index), measure.columns, columns), hollow=True)
+    panel.curves(best, measure.columns, columns)
     panel.rings(front, measure.columns)
 
 
 def cheapest_line(measure: ErrorMeasure, level: float, row: Row | None) -> str:
-    """Say which case is the cheapest that reached this level."""
+    """Return a sentence that names the cheapest case below an error."""
     start = f"{formatting.error(level)} or less:"
     if row is None:
         return f"{start} nothing measured reaches it."
     unit = measure.y_label.removeprefix("computing time ")
-    told = ", ".join(filter(None, (formatting.entry(row, name) for name in (measure.error, "error", *STEPPING))))
-    return f"{start} {row['label']}, {formatting.seconds(row[measure.cost])} {unit} ({told})."
+    names = (measure.error, "error", *STEPPING)
+    numbers = ", ".join(filter(None, (formatting.entry(row, name) for name in names)))
+    return f"{start} {row['label']}, {formatting.seconds(row[measure.cost])} {unit} ({numbers})."
 
 
 # ---- the error of the surface over what it costs
@@ -172,7 +171,7 @@ SIZE = ("time_second", "surface_error")
 
 
 def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return a chart of all scenes with surface errors: a curve a way to step, over cost and over cells."""
+    """Return a chart of surface errors over cost and over cells, with a curve for each way to step."""
     scenes = grouped(measured(succeeded(table), *SIZE), "scene")
     if not scenes:
         return []
@@ -189,7 +188,7 @@ def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 
 
 def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
-    """Draw a scene's two panels."""
+    """Draw the errors of a scene over cost and over cells."""
     y = log_axis("surface error", rows["surface_error"], ERROR)
     over_cost = chart.panel(scene, log_axis(TRAJECTORY.y_label, rows["time_second"], SECONDS), y)
     over_cost.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
@@ -199,13 +198,13 @@ def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
 
 
 def what_takes(rows: DataFrame, level: float) -> str:
-    """Say how many cells and what time each way to step takes for an error."""
+    """Return a sentence with the cells and the time that each way to step takes for an error."""
     curves = ", ".join(f"{label} {reached(of, level)}" for label, of in grouped(rows, "label").items())
     return f"{100 * level:g}%: {curves}."
 
 
 def reached(rows: DataFrame, level: float) -> str:
-    """Return the cells and the cost from which on a curve, by rising cells, is below a level."""
+    """Return the cells and the cost from which on the errors of a curve are below a level."""
     above = np.flatnonzero(rows["surface_error"] > level)
     if len(above) == 0:
         cells, seconds = rows.iloc[0][["cells", "time_second"]]
@@ -228,7 +227,7 @@ GROWTH_CAPTION = (
     "the program itself and the surface mesh included. Whiskers reach from the least to the greatest of the repeats."
 )
 VARIED = ("error", "max_iterations", "ranks")  # may differ between curves of one method
-GROWTH_TOLD = ("time_frame", "memory", "iterations", "ksp_its", "true_error", "time_setup", "time_factor", "ranks")
+GROWTH_TIP = ("time_frame", "memory", "iterations", "ksp_its", "true_error", "time_setup", "time_factor", "ranks")
 GROWTH_PANELS = (  # title, column, how its ticks are written, whether it varies with the time
     ("frames a second", "fps", COUNT, True),
     ("time a frame and cell", "time_frame_a_cell", SECONDS, True),
@@ -249,7 +248,7 @@ def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 
 
 def with_curves(rows: DataFrame) -> DataFrame:
-    """Return the rows with a column ``curve``: method, what varied in it, and its step error."""
+    """Return the rows with a column ``curve``: the method, its varied options, and its step error."""
     varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
     words = ([row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows))
     rows = rows.assign(curve=[", ".join(filter(None, text)) for text in words])
@@ -261,7 +260,7 @@ def with_curves(rows: DataFrame) -> DataFrame:
 
 
 def styles_of(curves: DataFrame, styles: Styles) -> Styles:
-    """Return the style of each curve: those of one label share its colour, and have own markers."""
+    """Return the style of each curve; curves of one label share the colour but not the marker."""
     found = {}
     number = curves.groupby("label").cumcount()
     for curve, label, more in zip(curves["curve"], curves["label"], number, strict=True):
@@ -286,7 +285,7 @@ def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
         panel = chart.panel(title, x, log_axis("", heights, words))
         if timed:
             panel.whiskers(shown, ("cells", column), "curve")
-        panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TOLD), "curve")
+        panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TIP), "curve")
     return chart
 
 
@@ -305,7 +304,7 @@ ITERATE = ("iteration", "seconds", "position_error", "energy_error", "ksp_its")
 
 
 def iterates(trace: dict[str, Any], row: Row) -> DataFrame:
-    """Return the trace of a case as a row an iterate; those without a positive error are out."""
+    """Return the iterates of a case that have a positive error, one row each."""
     length = len(trace.get("position_error") or [])
     columns = {name: (trace.get(name) or [None] * length)[:length] for name in ITERATE}
     rows = DataFrame(columns, dtype=object).apply(to_numeric, errors="coerce").astype(float)
@@ -315,7 +314,7 @@ def iterates(trace: dict[str, Any], row: Row) -> DataFrame:
 
 
 def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict[str, Any]]) -> list[Chart]:
-    """Return one chart for each scene with traces, which come by case."""
+    """Return one chart for each scene that has traces, which are given by case."""
     charts = []
     for scene, rows in grouped(table[table["case"].isin(traces.keys())], "scene").items():
         curves = furthest([iterates(traces[row["case"]], row) for row in records(rows)])
@@ -329,14 +328,14 @@ def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict[
 
 
 def furthest(curves: list[DataFrame]) -> list[DataFrame]:
-    """Return each method's trace that ends with the least error: looser targets are parts of it."""
+    """Return the trace of each method that ends with the least error, of which looser ones are parts."""
     known = sorted((curve for curve in curves if len(curve)), key=lambda rows: -rows["position_error"].iloc[-1])
     best = {rows["label"].iloc[0]: rows for rows in known}
     return [best[label] for label in dict.fromkeys(rows["label"].iloc[0] for rows in curves if len(rows))]
 
 
 def convergence_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
-    """Return two panels with one vertical scale."""
+    """Return a chart of errors over iterations and over computing time, with one vertical scale."""
     chart = Chart(
         name, CONVERGENCE, title, CONVERGENCE_CAPTION, {label: styles[label] for label in dict.fromkeys(rows["label"])}
     )

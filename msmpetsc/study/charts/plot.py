@@ -1,4 +1,4 @@
-"""What all charts share: colours and markers, axes in readable units, points with their numbers.
+"""Elements of charts: colours and markers, axes in readable units, points with tooltips.
 
 A chart is a Vega-Lite specification; vl-convert draws it, without a browser, as SVG for the page and as PNG.
 """
@@ -68,26 +68,26 @@ Columns = tuple[str, str]  # of both axes
 
 
 def curve_styles(labels: Iterable[str]) -> Styles:
-    """Return one style a label, given out in order of first appearance."""
+    """Return a style for each label, assigned in order of first appearance."""
     numbers = enumerate(dict.fromkeys(labels))
     return {label: CurveStyle(COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)]) for n, label in numbers}
 
 
-def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:
-    """Return what the point of each row tells: curve, numbers, the command that repeats it."""
-    told = list(dict.fromkeys(told))
-    lines = ([row[curve], *(formatting.entry(row, name) for name in told), row["command"]] for row in records(rows))
+def tips(rows: DataFrame, names: Iterable[str], curve: str = "label") -> list[str]:
+    """Return the tooltip of each row: its curve, its numbers and the command that repeats it."""
+    names = list(dict.fromkeys(names))
+    lines = ([row[curve], *(formatting.entry(row, name) for name in names), row["command"]] for row in records(rows))
     return ["\n".join(filter(None, tip)) for tip in lines]
 
 
 def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dict[str, Any]:
-    """Return an axis; words: how its ticks are written, an expression of Vega's."""
+    """Return an axis whose tick labels are written by ``words``, an expression of Vega."""
     axis = {"values": list(ticks), "labelExpr": words}
     return {"type": "quantitative", "title": title, "scale": {"nice": False, "zero": False} | scale, "axis": axis}
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
-    """Return a logarithmic axis around positive values, with margins, of a decade at least."""
+    """Return a logarithmic axis around positive values, with margins, at least a decade long."""
     low, high = math.log10(np.min(values)), math.log10(np.max(values))
     middle, half = (low + high) / 2, max(high - low, 0.85) * 0.58
     low, high = middle - half, middle + half
@@ -110,7 +110,7 @@ def axis_from_zero(title: str, values: Iterable[float], words: str) -> dict[str,
 
 @dataclass
 class Axes:
-    """A panel: two axes and what is drawn in them; styles: of all curves of the legend."""
+    """A panel: two axes, the layers drawn in it, and the styles of all curves of the chart."""
 
     title: str
     x: dict[str, Any]
@@ -139,22 +139,22 @@ class Axes:
         bar = {"type": "errorbar", "ticks": part | {"size": 7}, "rule": part}
         self.draw(values, bar, y2={"field": "high"}, color=nominal(self.styles, "color"))
 
-    def curves(self, rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> None:
+    def curves(self, rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label") -> None:
         """Draw the rows of each curve, in their order, as a line with a marker at each point."""
-        values = points(rows, columns, told, curve)
+        values = points(rows, columns, names, curve)
         color = {"color": nominal(self.styles, "color")}
         self.draw(values, {"type": "line", "strokeWidth": 1.6}, order={"field": "n"}, **color)
         self.mark(values)
 
     def mark(self, values: list[dict[str, Any]], hollow: bool = False) -> None:
-        """Draw a marker at each of ``points``, which tells its numbers."""
+        """Draw a marker with a tooltip at each of ``points``."""
         color = nominal(self.styles, "color")
         own = {"fill": color}
-        look: dict[str, Any] = {"type": "point", "size": MARKER, "stroke": "white", "strokeWidth": 0.6}
+        mark: dict[str, Any] = {"type": "point", "size": MARKER, "stroke": "white", "strokeWidth": 0.6}
         if hollow:
             own = {"stroke": color}
-            look = {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
-        self.draw(values, look, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own)
+            mark = {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
+        self.draw(values, mark, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own)
 
     def rings(self, rows: DataFrame, columns: Columns) -> None:
         """Draw a ring around each row."""
@@ -162,15 +162,15 @@ class Axes:
         self.draw(values, {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0})
 
 
-def points(rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> list[dict[str, Any]]:
-    """Return each row as a point with its place, its curve and what it tells."""
-    of_rows = zip(*(rows[name] for name in (*columns, curve)), tips(rows, told, curve), strict=True)
+def points(rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label") -> list[dict[str, Any]]:
+    """Return each row as a point with coordinates, curve and tooltip."""
+    of_rows = zip(*(rows[name] for name in (*columns, curve)), tips(rows, names, curve), strict=True)
     return [{"x": x, "y": y, "curve": name, "tip": tip, "n": n} for n, (x, y, name, tip) in enumerate(of_rows)]
 
 
 @dataclass
 class Chart:
-    """Panels, and what they say in plain words."""
+    """Panels with one legend, and sentences that sum them up."""
 
     name: str  # of its file
     kind: str  # the heading it stands under
@@ -189,12 +189,12 @@ class Chart:
         return "chart-" + re.sub(r"\W|_", "-", self.name)
 
     def panel(self, title: str, x: dict[str, Any], y: dict[str, Any]) -> Axes:
-        """Return a new panel behind the others."""
+        """Append a panel and return it."""
         self.panels.append(Axes(title, x, y, self.styles))
         return self.panels[-1]
 
     def spec(self) -> dict[str, Any]:
-        """Return the panels line by line in Vega-Lite, with one legend of all curves below."""
+        """Return the Vega-Lite specification: rows of panels above one legend."""
         columns = min(len(self.panels), self.columns)
         width = (WIDTH - self.gap * (columns - 1)) / columns
         panels = [
@@ -207,7 +207,7 @@ class Chart:
 
 
 def legend(styles: Styles) -> dict[str, Any]:
-    """Return a chart of nothing but a legend."""
+    """Return an empty chart with the legend."""
     longest = max(map(len, styles), default=1)
     fit = max(1, min(6, len(styles), int(WIDTH / (LETTER * longest + 40))))
     lines = -(-len(styles) // fit)
@@ -225,13 +225,13 @@ def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> 
 
 
 def save_png(chart: Chart, folder: Path) -> None:
-    """Write the chart with its title, in a file of its name."""
+    """Write the chart with its title as a PNG file of its name."""
     title = {"text": chart.title, "fontWeight": "bold", "fontSize": 15, "offset": 12}
     image = vl_convert.vegalite_to_png({"config": CONFIG, "title": title} | chart.spec(), scale=1.5)
     write_whole(folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', chart.name)}.png", image)
 
 
 def svg_text(chart: Chart) -> str:
-    """Return the chart as an <svg> element, whose points have a <title>: browsers show it."""
+    """Return the chart as an <svg> element whose points have a <title>, which browsers show as a tooltip."""
     text = vl_convert.vegalite_to_svg({"config": CONFIG} | chart.spec())
     return re.sub(r'<path aria-label="([^"]*)"([^>]*)/>', r'<path class="point"\2><title>\1</title></path>', text)

@@ -1,4 +1,4 @@
-"""Stability: what becomes of each method over two axes, or with named cases."""
+"""Stability maps: the outcomes of each method over two axes, or of named cases."""
 
 import json
 import math
@@ -28,14 +28,14 @@ SYMBOLS = {
 DARK = {"crashed", "timeout", "not finite", "energy", "diverged"}  # their symbols are white
 COLUMNS = 6  # panels side by side
 CELL = 24  # [px]: height
-TOLD = (
+TIP = (
     "outcome", "steps", "iterations", "most_iterations", "inverted", "shape_error", "energy_gained", "substeps",
     "fallbacks", "explicit_limit", "reason",
 )  # fmt: skip
 
 
 class Scale(NamedTuple):
-    """One side of a map: its values in their order, and how a reader wants them."""
+    """One axis of a map: its values in order, and their labels."""
 
     name: str
     values: tuple[str, ...]
@@ -43,7 +43,7 @@ class Scale(NamedTuple):
 
 
 def entry(value: str, unit: str) -> str:
-    """Return an entry of an axis as a reader wants it: 10 ms, 20%, 100 kPa, or a case's name."""
+    """Return the label of a value of an axis: 10 ms, 20%, 100 kPa, or the name of a case."""
     try:
         number = float(value)
     except ValueError:
@@ -56,7 +56,7 @@ def entry(value: str, unit: str) -> str:
 
 
 def scale(rows: DataFrame, column: str, axis: dict[str, Any]) -> Scale:
-    """Return the values of the rows on this axis, in the order and the unit of the study file."""
+    """Return the values of rows on an axis, in the order and the unit of the study file."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]
@@ -65,13 +65,13 @@ def scale(rows: DataFrame, column: str, axis: dict[str, Any]) -> Scale:
 
 
 def stability_charts(table: DataFrame, study: dict[str, Any]) -> list[Chart]:
-    """Return a chart a map; ``study``: the study file, which names the axes."""
+    """Return one chart for each map, with the axes that the study file names."""
     maps = {entry.get("name"): entry for entry in study.get("map", ())}
     return [stability_chart(name, rows, maps.get(name, {})) for name, rows in mapped(table).items()]
 
 
 def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Chart:
-    """Return the chart of a map; ``settings``: its table in the study file."""
+    """Return the chart of a map, ``settings`` being its table in the study file."""
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")
     legend = {
@@ -79,8 +79,8 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
         for outcome in reversed(OUTCOMES)
         if outcome in set(rows["outcome"])
     }
-    look: dict[str, Any] = {"columns": COLUMNS, "gap": 35, "height": CELL * len(y.values)}
-    chart = Chart(f"stability_{name}", KIND, settings.get("title") or name, CAPTION, legend, **look)
+    chart = Chart(f"stability_{name}", KIND, settings.get("title") or name, CAPTION, legend, COLUMNS, gap=35)
+    chart.height = CELL * len(y.values)
     by_label = grouped(rows, "label")
     if set(x.values) == set(by_label):
         draw_cells(chart.panel("", *axes_of_cases(x, y)), rows, x._replace(name="method"), y._replace(name="case"))
@@ -92,17 +92,17 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
     return chart
 
 
-def axis(scale: Scale, shown: bool = True, **look: Any) -> dict[str, Any]:
-    """Return an axis whose cells are 1 wide, around 0, 1, 2; its values are written if shown."""
+def axis(scale: Scale, shown: bool = True, **more: Any) -> dict[str, Any]:
+    """Return an axis with cells of width 1 around 0, 1, 2 and so on, labelled if ``shown``."""
     count = len(scale.values)
     words = f"{json.dumps(scale.texts)}[datum.value]"
     made = channel(scale.name if shown else "", words, range(count), domain=[-0.5, count - 0.5])
-    made["axis"] |= {"grid": False, "domain": False, "ticks": False, "labels": shown} | look
+    made["axis"] |= {"grid": False, "domain": False, "ticks": False, "labels": shown} | more
     return made
 
 
 def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the axes of named cases, the first at the top, with the methods above them."""
+    """Return the axes of a map of named cases: cases from top to bottom, methods above."""
     broken = [text.replace("-", "-\n").split("\n") if len(text) > 12 else [text] for text in x.texts]
     room = 4 + 14 * (max(map(len, broken)) - 1)
     across, down = axis(x, orient="top", labelOverlap=False, labelPadding=room), axis(y)
@@ -112,7 +112,7 @@ def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
-    """Draw cells that tell their numbers, and their symbols."""
+    """Draw cells with symbols and tooltips."""
     words = {
         of.name: rows[column].map(dict(zip(of.values, of.texts, strict=True))) for column, of in (("x", x), ("y", y))
     }
@@ -123,7 +123,7 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
             "i": row["i"], "j": row["j"], "text": symbol(row), "color": COLORS[row["outcome"]],
             "ink": "white" if row["outcome"] in DARK else INK,
         }
-        for row, tip in zip(records(placed), tips(placed, (*words, *TOLD)), strict=True)
+        for row, tip in zip(records(placed), tips(placed, (*words, *TIP)), strict=True)
     ]  # fmt: skip
     own = {"type": "nominal", "scale": None}  # colours that stand in a column
     ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
@@ -133,7 +133,7 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
 
 
 def symbol(row: Row) -> str:
-    """Return what stands in a cell: iterations a step where all went well."""
+    """Return the text of a cell: the symbol of its outcome, or iterations a step."""
     count = row["iterations"]
     if row["outcome"] in SYMBOLS or count is None:
         return SYMBOLS.get(row["outcome"], "")

@@ -1,4 +1,4 @@
-"""What a plan of a surface error tells: its trials, its answer, and what keeps the error from being smaller."""
+"""The answer of a plan: its trials, its choice, what bounds the error, and the changes of the scene."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from msmpetsc.study.sizing.choice import Candidate, Choice, CostModel
 
 @dataclass(frozen=True)
 class SizeTrial:
-    """A run that was made."""
+    """A run with its cost and its result."""
 
     method: Candidate
     asked: int  # valid cells
@@ -28,13 +28,13 @@ class SizeTrial:
 
     @property
     def edge(self) -> float:
-        """Edge of a cell, over that of a body of one cell."""
+        """Edge of a cell, relative to that of a body of one cell."""
         return float(self.cells ** (-1 / 3))
 
 
 @dataclass
 class SizePlan:
-    """The answer."""
+    """The choice of a plan, and what bounds its error."""
 
     choice: Choice  # the cheapest that meets the error, or of the smallest error there is
     met: bool  # whether it is expected to meet the error
@@ -43,7 +43,7 @@ class SizePlan:
 
 
 def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
-    """Return what makes over half of an error out of reach: the step, unless that is said already, or the cells."""
+    """Return which of step and cells leaves over half of the target at its finest."""
     bounds = []
     best = model.best().budget
     if best.time > target / 2 and not step_known:
@@ -55,15 +55,15 @@ def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
 
 
 def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
-    """Return that cells of the finest lattice tried end inside out, if any do: such a motion need not converge."""
+    """Return a note if cells of the finest lattice end inverted: such a motion need not converge."""
     finest = max(trials, key=lambda each: each.cells)
     if not finest.inverted:
         return []
     helps = "fewer --frames"
     if law == "linear":
         helps += ' or material.law = "neo-hookean"'
-    found = f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, each lattice in its own way"
-    return [f"the motion: {found}; {helps} may help"]
+    inverted = f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, each lattice in its own way"
+    return [f"the motion: {inverted}; {helps} may help"]
 
 
 # The answer as changes of a scene file
@@ -72,7 +72,7 @@ Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
 
 
 def tables(method: Candidate) -> Tables:
-    """Return what the method says of a scene; None: the key must not stand there."""
+    """Return the tables of a scene that a method sets; a key that is None is absent."""
     values = vars(method) | {"substep": None, "error": method.step_error, "max_iterations": None}
     if method.integrator == STATIC:
         del values["time_step"]  # which spaces states, and need not stand there
@@ -80,7 +80,7 @@ def tables(method: Candidate) -> Tables:
 
 
 def overrides(scene: Path, tables: Tables) -> list[str]:
-    """Return the changes of the scene file, as --set takes them. Raises InputError for a file not TOML."""
+    """Return the changes of a scene file as overrides of --set. Raises InputError."""
     (_, document), changes = read_toml(scene), []
     for name, table in tables.items():
         given = document.get(name, {})
@@ -92,7 +92,7 @@ def overrides(scene: Path, tables: Tables) -> list[str]:
 
 
 def put_into(scene: Path, tables: Tables) -> None:
-    """Change the scene file; comments, order and all else stay as they are. Raises InputError."""
+    """Change a scene file, keeping its comments and order. Raises InputError."""
     text = scene.read_bytes().decode()
     line_end = "\r\n" if "\r\n" in text else "\n"
     document = tomlkit.parse(text)

@@ -1,4 +1,4 @@
-"""The cheapest way to a surface error: it is split among cells, time step and the solution of the steps."""
+"""The cheapest split of a surface error among cells, time step and the solution of the steps."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class Stepping:
 
 @dataclass(frozen=True)
 class Solving:
-    """A relative error of each step that is asked for."""
+    """A target of the relative error of a step, with what it leaves and costs."""
 
     step_error: float | None
     error: float  # that it leaves in the motion [-]
@@ -55,7 +55,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Choice:
-    """What to run, and what is expected of it."""
+    """A run, with its expected error and cost."""
 
     method: Candidate
     cells: int
@@ -65,7 +65,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class CostModel:
-    """What the trials told: errors of cells, steps and their solution, and what each costs."""
+    """Errors of cells, steps and their solution as the trials showed them, and their costs."""
 
     law: ErrorLaw  # of the error over the edge of a cell, cells^(-1/3)
     steppings: Sequence[Stepping]
@@ -93,7 +93,7 @@ class CostModel:
         return self.choice(stepping, solving, self.most)
 
     def cells_for(self, error: float) -> float:
-        """Return how many cells have this error; infinitely many where nothing is left of it."""
+        """Return the number of cells that has this error; infinity for an error of 0."""
         if error <= 0:
             return math.inf
         return max(self.least, math.ceil(self.law.size(error) ** -3)) if self.law.factor > 0 else self.least
@@ -107,7 +107,7 @@ class CostModel:
         return Choice(method, int(cells), budget, cost)
 
     def growth(self, before: float, after: float) -> float:
-        """Return how many times the cost is of so many cells, read off the lattices tried."""
+        """Return the ratio of the costs of two numbers of cells, interpolated between the lattices tried."""
         cells, costs = np.log(self.costs).T
         if len(cells) < 2:
             return after / before
@@ -119,5 +119,5 @@ class CostModel:
         return math.exp(end - start)
 
     def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
-        """Return how its steps may be solved; explicit ones are not."""
+        """Return the step errors that may be chosen; explicit steps have none."""
         return [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings

@@ -1,4 +1,4 @@
-"""The error of a discretisation from runs of several sizes: Richardson's extrapolation with the order that is seen.
+"""Discretisation error from runs of several sizes, by Richardson extrapolation with the observed order.
 
 A size is the edge of a cell, or the time step. Where the error is e = C size^p, three runs tell p
 and C (Roache 1994, the grid convergence index). Errors are fields: that of a coarse run is its
@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 
 from scipy.optimize import brentq
 
-CELL_ORDERS = (1.0, 2.2)  # what is taken seriously: of a boundary seen by the share of its cells, of linear cells
-STEP_ORDERS = (1.0, 2.2)
+ORDERS = (1.0, 2.2)  # that are believed: of a boundary seen by the share of its cells, of linear cells; of steps
 ALIKE = 1.9  # times: sizes nearer than that differ by chance as much as by their order
 CLOSE = 1.01  # times: what parts sizes nearer than that is chance alone
 UNSEEN = 0.05  # a measured order may lie so far below the range before it counts as not seen
@@ -25,7 +24,7 @@ UNSEEN = 0.05  # a measured order may lie so far below the range before it count
 
 @dataclass(frozen=True)
 class ErrorLaw:
-    """An error that goes as a power of a size: factor size^order."""
+    """A power law of the error, factor size^order."""
 
     factor: float
     order: float
@@ -37,22 +36,22 @@ class ErrorLaw:
         return float(self.factor * size**self.order)
 
     def size(self, error: float) -> float:
-        """Return the greatest size of this error."""
+        """Return the largest size with this error."""
         return float((error / self.factor) ** (1 / self.order))
 
     def through(self, *known: tuple[float, float]) -> "ErrorLaw":
-        """Return the law through (size, error) of a run, with this order, or of two unlike ones, the coarser first."""
+        """Return the law through the (size, error) of one run, with this order, or of two runs, the coarser first."""
         (a, error), (b, less) = known[0], known[-1]
         order = math.log(error / less) / math.log(a / b) if a > CLOSE * b and error > less > 0 else self.order
         return replace(self, factor=error / a**order, order=order)
 
     def measured(self, apart: float, finer: float) -> float:
-        """Return the error of a run so far from a finer run of this size."""
+        """Return the error of a run from its distance to a finer one."""
         error = self.error(finer)
         return math.sqrt(apart**2 + error**2 + 2 * self.cosine * apart * error)
 
     def measured_finer(self, apart: float, size: float, coarser: float) -> float:
-        """Return the error of a run of this size that is so far from a coarser one."""
+        """Return the error of a run from its distance to a coarser one."""
         return _finer_error(apart, (coarser / size) ** self.order, self.cosine)
 
 
@@ -62,7 +61,7 @@ def _finer_error(apart: float, ratio: float, cosine: float) -> float:
 
 
 def cosine_of(first: float, second: float, across: float) -> float:
-    """Return c of three runs from the distances of neighbours and of the ends; at least 0, as of errors by chance."""
+    """Return the cosine c of three runs from the distances of neighbours and of the ends, within 0 and 1."""
     if not first or not second:
         return 1.0
     return min(1.0, max(0.0, (across**2 - first**2 - second**2) / (2 * first * second)))
@@ -75,7 +74,7 @@ def error_law(
     across: float | None = None,
     cosine: float = 1.0,
 ) -> ErrorLaw:
-    """Return the law of the error from runs of descending sizes and the distances of neighbours.
+    """Return the law of the error from the distances between runs of descending sizes.
 
     sizes     : two or three of them
     distances : one fewer; of the last two runs the last
@@ -92,7 +91,7 @@ def error_law(
 
 
 def _order(sizes: Sequence[float], ratio: float, cosine: float, orders: tuple[float, float]) -> tuple[float, bool]:
-    """Return the order at which neighbours' distances have this ratio, within the range, and whether it was seen."""
+    """Return the order at which distances have this ratio, clipped to the range, and whether it was observed."""
     a, b, c = sizes[-3:]
     low, high = orders
 

@@ -1,4 +1,4 @@
-"""The trials that size a scene: coarse lattices tell the error of the step, three lattices that of the cells."""
+"""Trial runs of a plan: coarse lattices show the error of the step, three lattices that of the cells."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,12 +17,11 @@ from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, inverted_bound, size_bounds
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
-from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
+from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
-COARSER = 2  # times: the edge of a cell from one lattice to the next, so an eighth of the cells
+COARSER = 2  # times: the edge of a cell from one lattice to the next; the finest chosen is so much finer than the scene
 COARSEST = (2.0, 5 / 3, 4 / 3)  # times that it is done, the first that can be run
-FINEST = 2  # times finer than the scene's: the finest cells that are chosen
 IMPLICIT: tuple[IntegratorName, ...] = ("bdf2", "implicit-euler")
 HALVINGS = 6  # of the scene's step
 REFINED = 3  # times that explicit substeps are halved, at most
@@ -40,7 +39,7 @@ AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where f
 
 
 class Asked(NamedTuple):
-    """What a plan is asked for."""
+    """The request of a plan."""
 
     target: float  # error of the surface
     frames: int  # first frames of the scene that are tried
@@ -49,7 +48,7 @@ class Asked(NamedTuple):
 
 
 class Sizer:
-    """Makes the trials of one scene for one surface error; ``report`` gets each, and notes."""
+    """Runs the trials of a scene for a surface error, and reports each."""
 
     def __init__(self, scene: Path, bench: Bench, asked: Asked, report: Callable[[SizeTrial | str], None]):
         self.scene = scene
@@ -73,7 +72,7 @@ class Sizer:
         self.trials: list[SizeTrial] = []
 
     def plan(self) -> SizePlan:
-        """Make the trials and choose, on few cells first. Raises InputError where too few runs end well."""
+        """Run the trials, on few cells first, and choose. Raises InputError where too few runs succeed."""
         most, between = self.cells, COARSER**3
         while self.cells >= between * FEWEST:
             self.cells //= between
@@ -85,7 +84,7 @@ class Sizer:
             self.cells = min(most, between * self.cells)
 
     def _sized(self) -> SizePlan:
-        """Return the plan of lattices of ``cells`` and fewer."""
+        """Return the plan by lattices of at most ``cells`` cells."""
         coarse = self._coarser(1)
         steppings = self._steppings(coarse)
         fair = [each for each in steppings if each.error <= self.target / 2]
@@ -95,7 +94,9 @@ class Sizer:
         costs = [(each.cells, each.cost) for each in lattices]
         on = next(each.cells for each in self.trials if each.asked == coarse)
         law = self._law(lattices)
-        model = CostModel(law, steppings, solvings, on, costs, method.integrator == "verlet", 1, FINEST**3 * self.cells)
+        model = CostModel(
+            law, steppings, solvings, on, costs, method.integrator == "verlet", 1, COARSER**3 * self.cells
+        )
         wanted = model.cheapest(AIM * self.target)
         like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
         # such an order makes the error of the finest lattice, which is part of all that are measured
@@ -110,7 +111,7 @@ class Sizer:
     # Time
 
     def _steppings(self, cells: int) -> list[Stepping]:
-        """Return integrators and steps with the error of the step alone; the finest stands for the true motion."""
+        """Return integrators and steps with their time error, the finest run being the true motion."""
         if self.is_static:  # whose states have no such error
             state = self._run(self._method(STATIC, self.step), cells)
             if state is None:
@@ -135,11 +136,12 @@ class Sizer:
         return chosen_from
 
     def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
-        """Return runs of verlet, whose error halved substeps tell, and their substeps; none where it takes too long."""
+        """Return runs of verlet with halved substeps, and the substeps; none where one takes too long."""
         first = self._run(self._method("verlet", self.step), cells)
         if first is None:
             return [], []
-        runs, sizes = [first], [self.step / math.ceil(first.substeps)]  # frames come at the same times
+        runs = [first]
+        sizes = [self.step / math.ceil(first.substeps)]  # frames come at the same times
         for _ in range(REFINED):
             sizes.append(sizes[-1] / 2)
             run = self._run(self._method("verlet", sizes[-1]), cells)
@@ -151,7 +153,7 @@ class Sizer:
         return runs, sizes
 
     def _implicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
-        """Return runs of BDF2 with steps halved until the error left is small, and their steps."""
+        """Return runs of BDF2 with halved steps until the remaining error is small, and the steps."""
         runs: list[SizeTrial] = []
         for step in self.halved:
             run = self._run(self._method("bdf2", step), cells)
@@ -165,12 +167,12 @@ class Sizer:
     def _left(self, runs: list[SizeTrial], sizes: list[float]) -> float:
         """Return the error of the last of runs whose steps, or substeps, have these sizes."""
         apart = [_apart(*pair) for pair in pairwise(runs)]
-        return error_law(sizes, apart, STEP_ORDERS).error(sizes[-1])
+        return error_law(sizes, apart, ORDERS).error(sizes[-1])
 
     def _others(
         self, integrator: IntegratorName, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
     ) -> list[Stepping]:
-        """Return what an integrator does with ever shorter steps, while it may be the cheapest."""
+        """Return runs of an integrator with halved steps, while it may be the cheapest."""
         others: list[Stepping] = []
         enough = min((self._at_scale(each) for each in known if each.error <= self.target / 2), default=math.inf)
         for step in self.halved:
@@ -183,11 +185,11 @@ class Sizer:
         return others
 
     def _at_scale(self, stepping: Stepping) -> float:
-        """Return the cost on the finest lattice over its growth: substeps are shorter there."""
+        """Return the cost on the finest lattice up to a common factor; verlet's substeps shorten with the cells."""
         return stepping.cost * (COARSER if stepping.method.integrator == "verlet" else 1)
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
-        """Return how loosely the steps may be solved, and what that leaves."""
+        """Return the step errors that may be chosen, with the error that each leaves in the motion."""
         if method.step_error is None:
             return [Solving(self.solved, 0.0, 1.0)]
         base = self._run(method, cells)
@@ -203,7 +205,7 @@ class Sizer:
     # Cells
 
     def _lattices(self, method: Candidate) -> list[SizeTrial]:
-        """Return the runs of the three lattices that the error of the cells comes from.
+        """Return the runs of three lattices, from which the error of the cells is extrapolated.
 
         Where the coarsest fails, in which a pin may hold no node, a finer one stands in for it.
         """
@@ -220,7 +222,7 @@ class Sizer:
         What turns inside out is as fine as the cells are, and shrinks no faster, whatever the distances say.
         """
         apart = [_apart(*pair) for pair in pairwise(runs)]
-        least, greatest = CELL_ORDERS
+        least, greatest = ORDERS
         far, inverted = len(runs) > 2 and apart[0] > FAR, runs[-1].inverted > 0
         orders = (least, least) if inverted else (USUAL if far else least, greatest)
         across = _apart(runs[0], runs[-1])
@@ -232,12 +234,12 @@ class Sizer:
         return law
 
     def _coarser(self, power: float) -> int:
-        """Return the cells of the lattice coarsened so many times."""
+        """Return the number of cells of the lattice coarsened ``power`` times."""
         cells: float = self.cells / COARSER ** (3 * power)
         return max(1, round(cells))
 
     def _checked(self, model: CostModel, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, CostModel]:
-        """Choose, run the choice and measure it, until its error is little less than was asked for.
+        """Choose, run and measure, until the error is little less than the target.
 
         Each choice lies between the cells that met the error and those that did not, for errors go
         up and down from lattice to lattice. Returns the model with what was learnt, too.
@@ -268,7 +270,7 @@ class Sizer:
         return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
 
     def _without(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
-        """Return a model without the cells of what fails, where they are fewer than were tried, or its way to step."""
+        """Return a model without a failed choice: without its cells if they are few, or else without its step."""
         if choice.cells < fewest:
             return replace(model, least=fewest)
         method = self._as_tried(choice.method)
@@ -277,7 +279,7 @@ class Sizer:
         return replace(model, steppings=kept or model.steppings)
 
     def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> Budget:
-        """Return the errors of a run of the choice, that of its cells from its distance to the finest lattice.
+        """Return the errors of a choice, that of its cells measured from the finest lattice.
 
         Where it is the finer one and they are alike, that is as expected: what they are apart is chance.
         """
@@ -306,11 +308,12 @@ class Sizer:
         return replace(method, step_error=self.solved if method.step_error else None)
 
     def _method(self, integrator: IntegratorName, step: float) -> Candidate:
-        solves = integrator != "verlet"
-        return Candidate(integrator, step, PRESET if solves else "", self.solved if solves else None)
+        if integrator == "verlet":
+            return Candidate(integrator, step)
+        return Candidate(integrator, step, PRESET, self.solved)
 
     def _run(self, method: Candidate, cells: int) -> SizeTrial | None:
-        """Return a run, made if it was not yet; None if it fails, which is reported."""
+        """Return a trial, run at most once; None if it fails, which is reported."""
         done = next((each for each in self.trials if (each.method, each.asked) == (method, cells)), None)
         if done is not None:
             return done
@@ -328,7 +331,7 @@ class Sizer:
         return trial
 
     def case(self, method: Candidate, cells: int) -> Case:
-        """Return the run of a method on so many cells, its surface at the scene's own frames."""
+        """Return the case of a method and a number of cells, with output at the frames of the scene."""
         cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
         timeout = TIME if cells < self.cells else LONG_TIME
         case = Case(

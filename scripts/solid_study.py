@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """The neo-Hookean solid of the lattice against theory and finite elements. Needs scikit-fem.
 
-    scripts/solid_study.py [cantilever elastica bunny ...]
+    scripts/solid_study.py [cantilever elastica rod ...] [-o PAGE]
 
 All are runs of the product; errors are relative.
 """
 
+import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +25,7 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import msmpetsc
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
@@ -180,6 +182,12 @@ def fit(u: np.ndarray, exact: np.ndarray, area: np.ndarray) -> float:
     return area @ (u * exact).sum(axis=1) / (area @ (exact**2).sum(axis=1))
 
 
+def rod_rows() -> lab.Rows:
+    """Rows of the rod and its finite elements in $MSMPETSC_SOLID."""
+    folder = Path(os.environ.get("MSMPETSC_SOLID", ""))
+    yield from scan_rows(trimesh.load(folder / "rod_cut.ply", process=False), np.load(folder / "rod_fem.npz")["U"])
+
+
 def bunny_rows() -> lab.Rows:
     """Rows of the upper part of the bunny, clamped at the cut."""
     whole = prepare(load("bunny", lab.SCENES), [{"simplify": 4000}])
@@ -295,19 +303,56 @@ def pressed_rows(half: float) -> lab.Rows:
         yield row | {f"{high} cells": percent(force(poisson, half, high) / exact - 1) for high in (4, 8, 16)}
 
 
+# ---- starts from which a body has to come back
+
+
+STARTS: dict[str, Tables] = {
+    "twisted by 720 degrees": {"twist": {"axis": [1, 0, 0], "degrees": 720}},
+    "pressed to 30%": {"scale": [0.3, 1, 1]},
+    "mirrored": {"scale": [-1, 1, 1]},
+    "scattered": {"scatter": 1.0},
+    "collapsed": {"scale": [0.01, 0.01, 0.01]},
+}
+FALL = {"time": {"step": 1 / 20, "duration": 60, "until": "rest"}, "solver": {"error": 1e-3}}
+
+
+def start_rows(tables: Tables) -> lab.Rows:
+    """A clamped bar of 4 x 1 x 1 m without a load: what becomes of it, by Poisson's ratio."""
+    for name, start in STARTS.items():
+        yield {"start": name} | {f"nu {nu}": came_back(nu, tables | {"start": start}) for nu in (0.25, 0.45, 0.49)}
+
+
+def clamped_bar(poisson: float, tables: Tables) -> Run:
+    return run(box(4, 1, 1), poisson, cages={"cell_size": 1 / 2}, pin=[held(0, 0, -1)], **tables)
+
+
+def came_back(poisson: float, tables: Tables) -> str:
+    """Return how far the farthest node is from rest [cells], after how many steps and iterations."""
+    try:
+        of = clamped_bar(poisson, tables)
+    except StepFailed as failure:
+        return f"failed: {failure}"[:120]
+    far = np.linalg.norm(of.frames[-1].position - of.lattice.nodes, axis=1).max() * 2
+    last = of.frames[-1]
+    return f"{far:.0e}; {of.iterations} its in {last.index} steps; {last.inverted} inside out"
+
+
 # ---- the soft beam
+
 
 BEAM = lab.SCENES / "studies" / "beam.obj"
 
 
-def rest_rows() -> lab.Rows:
-    """Yield rows of the beam at rest under its weight and twice that, by cells of a 16th and a 32nd of its depth."""
-    material = {"young_modulus": 5e5}
-    for cells in (16, 32):
+def beam(poisson: float | None, h: float, time: Tables, g: float = G, error: float = 1e-6) -> Run:
+    tables = {"gravity": {"acceleration": [0, 0, -g]}, "pin": [held(0, 0, -1)], "material": {"young_modulus": 5e5}}
+    return run(BEAM, poisson, cages={"cell_size": h}, time=time, solver={"error": error}, **tables)
+
+
+def rest_rows(*sizes: int) -> lab.Rows:
+    """Of so many cells a depth."""
+    for cells in sizes:
         for g, poisson in ((1, 0.25), (2, 0.25), (1, 0.45), (2, 0.45)):
-            weight = {"acceleration": [0, 0, -g * G]}
-            cages = {"cell_size": 0.5 / cells}
-            of = run(BEAM, poisson, cages=cages, gravity=weight, pin=[held(0, 0, -1)], material=material)
+            of = beam(poisson, 0.5 / cells, {"integrator": "static"}, g * G)
             yield {
                 "g": g,
                 "Poisson's ratio": str(poisson),
@@ -321,15 +366,39 @@ def rest_rows() -> lab.Rows:
             }
 
 
+def swing_rows() -> lab.Rows:
+    time = {"step": 1 / 60, "duration": 0.5}  # as in scenes/studies/beam_soft.toml
+    for poisson, sizes in ((SPRINGS, (1 / 32,)), (0.25, (1 / 32, 1.25 / 87)), (0.45, (1 / 32, 1.25 / 87))):
+        for h in sizes:
+            of = beam(poisson, h, time, error=1e-3)
+            its = [frame.iterations for frame in of.frames[1:]]
+            tips = [of._replace(frames=[frame]).moved(1.25)[2] for frame in of.frames]
+            yield {
+                "Poisson's ratio": str(poisson or "springs"),
+                "cells": len(of.lattice.cells),
+                "Newton iterations a frame: mean": float(np.mean(its)),
+                "most": max(its),
+                "most cells inside out": max(frame.inverted for frame in of.frames),
+                "tip at the end [m]": f"{-tips[-1]:.4f}",
+                "lowest [m]": f"{-min(tips):.4f}",
+                "seconds a frame": float(np.mean([frame.wall_time for frame in of.frames[1:]])),
+            }
+
+
 TABLES: dict[str, Callable[[], lab.Rows]] = {
     "cantilever": cantilever_rows,
     "elastica": elastica_rows,
+    "rod": rod_rows,
     "bunny": bunny_rows,
     "box": box_rows,
     "clamp": clamp_rows,
     "pad": lambda: pressed_rows(WIDE / 2),
     "punch": lambda: pressed_rows(WIDE / 4),
-    "rest": rest_rows,
+    "starts": lambda: start_rows(FALL),
+    "statics": lambda: start_rows({}),
+    "rest": lambda: rest_rows(16, 32),
+    "fine": lambda: rest_rows(64),
+    "swing": swing_rows,
 }
 
 

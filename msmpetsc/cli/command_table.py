@@ -150,7 +150,7 @@ COMMANDS = {
                 "--mesh", type=checked_file, metavar="MESH",
                 help="a mesh file in or below the scene's folder, or a model",
             ),
-            argument("--up", choices=("y", "z"), help="the mesh's upward axis; default: z, of glTF y"),
+            argument("--up", choices=("y", "z"), help="the mesh's upward axis; guessed if not given"),
             argument("--from", dest="from_scene", metavar="NAME", help="copy this scene, see --list"),
             switch("--list", "list the scenes that come with msmpetsc"),
             switch("--overwrite", "replace SCENE.toml if it exists"),

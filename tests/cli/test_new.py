@@ -16,7 +16,7 @@ from conftest import ROOT
 from one_process import command_error
 
 import msmpetsc
-from msmpetsc.cli.commands.new import measured, unit_of
+from msmpetsc.cli.commands.new import SURER, measured, unit_of, uprightness
 from msmpetsc.cli.main import main
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
@@ -25,6 +25,32 @@ from msmpetsc.scene.reading import load_scene
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
     return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+
+
+def chair(upwards: int, back: int) -> trimesh.Trimesh:
+    """A chair of boxes that stands on y (1) or z (2), its back towards one end (1) or the other (-1)."""
+    boxes = [[[0, 0.4, 0], [0.45, 0.45, 0.45]], [[0, 0.45, 0], [0.45, 0.9, 0.05]]]  # seat and back
+    boxes += [[[x, 0, z], [x + 0.05, 0.4, z + 0.05]] for x in (0, 0.4) for z in (0, 0.4)]
+    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in boxes])
+    turns = [trimesh.transformations.rotation_matrix(np.pi, [0, 1, 0])] * (back < 0)
+    turns += [trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])] * (upwards == 2)
+    for turn in turns:
+        mesh.apply_transform(turn)
+    return mesh
+
+
+def table(upwards: int) -> trimesh.Trimesh:
+    """A table, which lies as well on its top, and on its sides."""
+    boxes = [[[0, 0.7, 0], [1.2, 0.75, 0.8]]]
+    boxes += [[[x, 0, z], [x + 0.06, 0.7, z + 0.06]] for x in (0, 1.14) for z in (0, 0.74)]
+    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in boxes])
+    return mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2 * (upwards == 2), [1, 0, 0]))
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_furniture_stands_on_its_feet(axis: int):
+    for mesh in (chair(axis, 1), chair(axis, -1), table(axis)):
+        assert (uprightness(surface(mesh), 1) > uprightness(surface(mesh), 2) + SURER) == (axis == 1)
 
 
 @pytest.mark.parametrize(("suffix", "words", "up"), [("stl", [], "z"), ("stl", ["--up", "y"], "y"), ("glb", [], "y")])

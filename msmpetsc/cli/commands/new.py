@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial import ConvexHull, QhullError
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
@@ -32,6 +33,9 @@ from msmpetsc.scene.toml import toml_of
 SHIPPED = Path(msmpetsc.__file__).parent / "shipped"  # the scenes that a wheel holds, too; in a clone a link to scenes/
 MILLIMETRE = 1e-3  # [m]
 Y_BY_DEFINITION = (".glb", ".gltf")  # points upwards in such files
+SOLE = 0.02  # of the height: what lies so near to the lowest point may stand on the ground
+FEET = 0.5  # share of the sole that counts less where it is flat, as a table's top is: feet are likelier below
+SURER = 0.1  # by so much y must stand better than z to be upwards
 G, DENSITY = 9.81, 1000.0  # [m/s^2], [kg/m^3]
 USUAL_SIZE = 0.3  # [m], where the file's unit cannot be guessed
 SLENDER = 2.5  # times its other sides: so long a body is a beam
@@ -62,16 +66,18 @@ def run(args: argparse.Namespace) -> int:
     if args.from_scene is not None:
         text = f"#:schema {SCHEMA_FILE}\n{shipped_text(args.from_scene)}"
     else:
-        up = args.up or ("y" if args.mesh.suffix.lower() in Y_BY_DEFINITION else "z")
-        text = drafted(args.mesh, args.scene, up)
+        text = drafted(args.mesh, args.scene, args.up)
     scene_of(args.scene, text, to_read=False)  # so that nothing is written that run would refuse
     write(args.scene, text)
     print(f"{args.scene}\nto run it: msmpetsc run {args.scene} --picture")
     return 0
 
 
-def drafted(mesh: Path, scene: Path, up: str) -> str:
-    """Return the text of a scene for a mesh, a file or a registry name, with ``up`` upwards. Raises InputError."""
+def drafted(mesh: Path, scene: Path, up: str | None) -> str:
+    """Return the text of a scene for a mesh, a file or a registry name. Raises InputError.
+
+    up : the mesh's upward axis, "y" or "z"; None: y of glTF, and where the body stands better on y than on z
+    """
     source = str(mesh) if str(mesh) in MODELS else path_from(scene, mesh)
     surface = load(source, scene.parent)
     warnings = check_encloses(surface, examine(surface))
@@ -83,6 +89,8 @@ def drafted(mesh: Path, scene: Path, up: str) -> str:
         log.warning("%s: %s", mesh, warning)
     if warnings or count > 1:
         log.info("what the scene does about that stands in its comments")
+    stands_on_y = uprightness(surface, 1) > uprightness(surface, 2) + SURER
+    up = up or ("y" if mesh.suffix.lower() in Y_BY_DEFINITION or stands_on_y else "z")
     log.info("%s is taken for upwards: --up says another axis", up)
     return draft(source, scene.stem, measures, up)
 
@@ -159,6 +167,38 @@ def measured(surface: Surface) -> MeshMeasures:
 def unit_of(side: float) -> float | None:
     """Return the unit [m] in which a body of this longest side has a usual size, metres before millimetres."""
     return next((unit for unit in (1.0, MILLIMETRE) if USUAL[0] <= side * unit <= USUAL[1]), None)
+
+
+def uprightness(surface: Surface, axis: int) -> float:
+    """Return how much likelier a body stands with this axis upwards than downwards, in [-1, 1].
+
+    A chair stands well on its feet and badly on its head; lying on its back it does both, a little.
+    """
+    return stands(surface, axis, 1) - stands(surface, axis, -1)
+
+
+def stands(surface: Surface, axis: int, way: int) -> float:
+    """Return how well a body stands with this axis upwards (way 1) or downwards (-1): the share of
+    its ground plan that it stands on, less where it stands on a face rather than on feet.
+
+    That is the convex hull of its lowest points; nothing where its centre is not above it.
+    """
+    used, plan = np.unique(surface.triangles), np.delete(surface.points, axis, axis=1)
+    height = way * surface.points[:, axis]
+    height -= height[used].min()
+    low = height <= SOLE * height[used].max()
+    try:
+        hull, ground = ConvexHull(plan[used[low[used]]]), ConvexHull(plan[used])
+    except QhullError:  # an edge or a corner
+        return 0.0
+    areas = trimesh.triangles.area(surface.points[surface.triangles])
+    centre = areas @ plan[surface.triangles].mean(axis=1) / areas.sum()
+    if not (hull.equations[:, :2] @ centre + hull.equations[:, 2] <= 0).all():
+        return 0.0
+    lowest = surface.triangles[low[surface.triangles].all(axis=1)]
+    flat = np.insert(plan, 2, 0.0, axis=1)
+    face = trimesh.triangles.area(flat[lowest]).sum() / hull.volume  # in two dimensions the volume is an area
+    return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
 
 
 # ---- the scene

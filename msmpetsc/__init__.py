@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what FROM says, for type checkers
-    from msmpetsc.app.simulation import Simulation as Simulation
-    from msmpetsc.app.simulation import frames as frames
+    from msmpetsc.app.start import Simulation as Simulation
+    from msmpetsc.app.start import frames as frames
     from msmpetsc.app.start import run as run
     from msmpetsc.extensions import register_force as register_force
     from msmpetsc.extensions import register_obstacle as register_obstacle
@@ -21,8 +21,8 @@ FROM = {  # what is imported when it is first used: reading a result needs numpy
     "Frame": "msmpetsc.fields",
     "Result": "msmpetsc.results.reader",
     "Scene": "msmpetsc.scene.reading",
-    "Simulation": "msmpetsc.app.simulation",
-    "frames": "msmpetsc.app.simulation",
+    "Simulation": "msmpetsc.app.start",
+    "frames": "msmpetsc.app.start",
     "register_force": "msmpetsc.extensions",
     "register_obstacle": "msmpetsc.extensions",
     "register_preset": "msmpetsc.extensions",

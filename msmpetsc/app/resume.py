@@ -2,9 +2,9 @@
 
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,6 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.app.checks import RESULT_NAMES, refuse_other_format
-from msmpetsc.app.request import RunRequest
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.geometry.registry import MODELS
@@ -35,38 +34,36 @@ FIXED = ("time.step", "time.integrator", *OUTPUTS)  # a file has one of each
 OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that may differ without a word
 
 
-def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
-    """Return what is to be resumed, None to run from the start (collective). Raises InputError."""
-    if request.resume is None:
+def earlier_run(comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool) -> Earlier | None:
+    """Return the run that wrote the file to be resumed, None to run from the start (collective). Raises InputError.
+
+    may_start : whether there is a scene to start from, where there is no such file yet
+    """
+    if resume is None:
         return None
-    path = Path(request.resume)
-    if request.scene is not None and not comm.bcast(on_root(comm, path.exists)):
+    path = Path(resume)
+    if may_start and not comm.bcast(on_root(comm, path.exists)):
         refuse_other_format("--resume", path, RESULT_NAMES)
         return None  # the first start of a job that may be started again
     on_root(comm, lambda: refuse_deadly(path))
     return comm.bcast(on_root(comm, lambda: Earlier.read(path)))
 
 
-def as_before(request: RunRequest, earlier: Earlier | None) -> RunRequest:
-    """Return the request with what the earlier run was asked for and this one is not.
+def kept_options(earlier: Earlier, given: Sequence[str]) -> list[str]:
+    """Return PETSc's options of the earlier run, as words, that have an effect on results and are not given again.
 
-    Of PETSc's options that are those with an effect on results. Raises InputError for an option
-    that could do more than choose a solver, and is not given again: the file may be from anywhere.
+    Raises InputError for one that could do more than choose a solver: the file may be from anywhere.
     """
-    if earlier is None:
-        return request
-    given = request.petsc_words
     kept: list[str] = []
     for name, value in _stored(earlier).items():
         words = [f"-{name}", *filter(None, [value])]
         if name in options_of(given) or OF_NO_EFFECT.search(name):
             continue
         if unsafe_word(words):
-            told = f"{earlier.path} was run with {' '.join(words)}"
-            raise InputError(f"{told}, which is not taken from a file: give it again")
+            text = f"{earlier.path} was run with {' '.join(words)}"
+            raise InputError(f"{text}, which is not taken from a file: give it again")
         kept += words
-    true_error = request.true_error or earlier.true_error or None
-    return replace(request, petsc_options=shlex.join([*kept, *given]), true_error=true_error)
+    return kept
 
 
 def _stored(earlier: Earlier) -> dict[str, str]:

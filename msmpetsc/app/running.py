@@ -12,12 +12,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc import __version__
-from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
+from msmpetsc.app.checkpointing import Checkpoints, Signals
 from msmpetsc.app.ending import ending_together
-from msmpetsc.app.profile import Cost, refuse_unwritable, versions
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
-from msmpetsc.app.summary import log_end, log_model, tell_stop, warn_of_long_steps
+from msmpetsc.app.summary import Cost, log_end, log_model, refuse_unwritable, tell_stop, versions, warn_of_long_steps
 from msmpetsc.backend.kernel import cache_is_empty
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
@@ -47,7 +46,6 @@ class RunPlan:
     request: RunRequest
     scene: Scene
     probes: Probes
-    interval: Interval
     resumed: Resumed | None
     attributes: dict[str, str | int]
     began: float
@@ -64,6 +62,17 @@ class RunEnd:
     failure: StepFailed | None
 
 
+def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, started: float) -> int:
+    """Run from the start, or go on from an earlier run; return the exit status (collective).
+
+    started : count of perf_counter at the start of the command [s]
+    """
+    plan = prepare(comm, request, earlier)
+    if plan.resumed and plan.resumed.is_done:
+        return tell_done(comm, request, plan.resumed)
+    return finish(comm, plan, take_steps(comm, plan), started)
+
+
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
     """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
     refuse_early(comm)
@@ -72,13 +81,12 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     if request.measure:
         PETSc.Log.begin()
     probes = Probes(request.true_error, request.trace)
-    interval = Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(scene, probes)
     on_root(comm, lambda: refuse_unwritable(request.measured))
     attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
-    return RunPlan(request, scene, probes, interval, resumed, attributes, began)
+    return RunPlan(request, scene, probes, resumed, attributes, began)
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
@@ -97,7 +105,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
                 numbers = count(start_output(comm, plan, file, model, simulation))
-                checkpoints = Checkpoints(file, simulation, plan.interval, signals)
+                checkpoints = Checkpoints(file, simulation, plan.request.checkpoint_every, signals)
                 is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:
@@ -121,8 +129,6 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
 
 def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) -> int:
     """Write what stands beside the result and say how the run ended; return the exit status (collective).
-
-    started : count of perf_counter at the start of the command [s]
 
     Raises the StepFailed that ended the run.
     """

@@ -3,7 +3,6 @@
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
-from html import escape
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
@@ -63,11 +62,6 @@ class Scene(SceneFile):
         return f"Scene({self.title!r}: {cells} of {meshes}, {time.integrator}, {time.steps} steps)"
 
     __str__ = __repr__
-
-    def _repr_html_(self) -> str:
-        """Return the scene as a notebook shows it: its title over its text."""
-        title = f"<b>{escape(self.title)}</b>" if self.title else ""
-        return f"{title}<pre>{escape(self.text)}</pre>"
 
 
 def load_scene(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.profile import peak_memory
+from msmpetsc.backend.machine import peak_memory
 from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError

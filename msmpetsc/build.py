@@ -9,10 +9,9 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.constraints.clamp import clamped
-from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
+from msmpetsc.constraints.coverage import NODES, Regions, regions, taken
+from msmpetsc.constraints.holders import Holders, clamped
 from msmpetsc.constraints.loads import Anchor, Load, OwnForce, RigidMotion, spread_by_mass, total_of
-from msmpetsc.constraints.reactions import Holders
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles
@@ -59,7 +58,8 @@ class Model:
     collision : the surface that meets itself, where it does
     obstacles : in the scene's order
     holders   : pins and anchors, and which nodes each has
-    bodies, reaches : what the first lines of a run say of the surfaces, and of pins, anchors and forces
+    bodies    : surfaces, and what all ranks know of them
+    taken     : what anchors and forces take, in words
     """
 
     surface: Surface | None
@@ -72,7 +72,7 @@ class Model:
     start: InitialState
     collision: CollisionSurface | None = None
     bodies: tuple[BodySurface, ...] = ()
-    reaches: tuple[Reach, ...] = ()
+    taken: tuple[str, ...] = ()
     damping: float = 0.0
     retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
@@ -171,7 +171,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
-    reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
+    words = taken(comm, scene, lattice, anchors, masks)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -188,7 +188,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
         collision=collision_surface(scene.self_contact, scene, bodies, cages, lattice) if scene.self_contact else None,
-        reaches=reaches,
+        taken=words,
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),

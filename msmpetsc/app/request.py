@@ -151,10 +151,8 @@ class RunRequest:
     def overrides(self) -> list[str]:
         """Changes of the scene, as ``--set`` takes them."""
         given = {"solver.preset": self.preset, "solver.error": self.error}
-        method = overrides_of({key: value for key, value in given.items() if value is not None})
-        if isinstance(self.set, Mapping):
-            return [*method, *overrides_of(self.set)]
-        return [*method, *([self.set] if isinstance(self.set, str) else self.set)]
+        method = {key: value for key, value in given.items() if value is not None}
+        return [*overrides_of(method), *overrides_of(self.set)]
 
     @property
     def command(self) -> str:

@@ -74,12 +74,12 @@ def _stored(earlier: Earlier) -> dict[str, str]:
         raise InputError(f"{earlier.path} is damaged: its PETSc options cannot be taken apart") from None
 
 
-def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
+def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
     """Return the scene that the earlier run's file has, with changes. Raises InputError."""
     text, file = (earlier.texts.get(name) for name in ("scene", "scene_file"))
     if not text or not file or not file.isprintable():
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
-    scene = scene_of(Path(file), text, changes, presets)
+    scene = scene_of(Path(file), text, changes)
     # The result may be from anywhere, and so may be what it says of the folder in which its scene lay: each file that
     # it names must lie beside it, or be named by that scene's file or by the user.
     given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]

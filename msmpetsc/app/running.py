@@ -25,12 +25,12 @@ from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import write_xdmf
-from msmpetsc.scene.reading import Scene, load_scene, scene_in
+from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
-from msmpetsc.solve.presets import find_preset, preset_names, shown_options
+from msmpetsc.solve.presets import find_preset, shown_options
 from msmpetsc.solve.refused_options import refuse_early, silence_options_left
 from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 
@@ -176,11 +176,12 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     """Read the scene with what the request changes; --set comes last and wins."""
     changes = request.overrides
     if request.made is not None:
-        scene = scene_in(*request.made, changes)
+        folder, tables = request.made
+        scene = Scene.of(tables, folder, changes)
     elif request.file is not None:
-        scene = load_scene(request.file, changes, preset_names())
+        scene = load_scene(request.file, changes)
     elif earlier is not None:
-        scene = stored_scene(earlier, changes, preset_names())
+        scene = stored_scene(earlier, changes)
     else:
         raise InputError("a SCENE is needed, or --resume OUT.h5")
     return scene.changed({"time.duration": request.frames * scene.time.step} if request.frames else {})

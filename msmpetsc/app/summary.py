@@ -20,7 +20,6 @@ from msmpetsc.backend.arrays import on_host
 from msmpetsc.backend.machine import machine, peak_memory
 from msmpetsc.build import Model
 from msmpetsc.comm import log, on_root
-from msmpetsc.constraints.coverage import Reach
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
@@ -53,8 +52,8 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
         "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
         cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
     )  # fmt: skip
-    if named := taken(model.reaches):
-        log.info("%s", ", ".join(named))
+    if model.taken:
+        log.info("%s", ", ".join(model.taken))
 
 
 def warn_of_long_steps(scene: Scene, model: Model) -> None:
@@ -75,18 +74,6 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
             'shows it, time.integrator = "static" goes to rest at once',
             time.step / period, period, period / STEPS_A_PERIOD,
         )  # fmt: skip
-
-
-def taken(reaches: Iterable[Reach]) -> list[str]:
-    """Name what each anchor and force takes; of a force's nodes some may be held."""
-    named = []
-    for reach in reaches:
-        if reach.kind == "anchor":
-            named.append(f"{reach.key} leads {reach.nodes - reach.held} nodes")
-        elif reach.kind == "force":
-            held = f" ({reach.held} of them held)" if reach.held else ""
-            named.append(f"{reach.key} pulls {reach.nodes} nodes{held}")
-    return named
 
 
 def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:

@@ -39,8 +39,6 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "rule": "{words}, got {got}",
     "one_of": "must give exactly one of {names}; has {given}",
 }
-POISSON = 'poisson_ratio, with material.law = "neo-hookean"; that of springs is 1/4'
-NO_KEYS = {name: POISSON for name in ("poissons_ratio", "poisson", "nu")}
 EXAMPLES = {"gravity": "acceleration = [0, 0, -9.81]"}  # of tables that are taken for numbers
 
 
@@ -130,8 +128,6 @@ def _got(value: Any) -> str:
 
 def _words(e: ErrorDetails) -> str:
     kind, context = e["type"], e.get("ctx", {})
-    if kind == "extra_forbidden" and e["loc"][-1] in NO_KEYS:
-        return f"unknown key: {NO_KEYS[e['loc'][-1]]}"
     if kind == "model_type" and e["loc"][-1:] and e["loc"][-1] in EXAMPLES:
         return f"must be a table, {{ {EXAMPLES[e['loc'][-1]]} }}, got {_got(e['input'])}"
     if kind == "extra_forbidden":

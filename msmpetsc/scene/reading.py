@@ -18,6 +18,7 @@ from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 MESHES = (".ply", ".mz3", ".vtu", ".vtk", ".obj", ".stl", ".off", ".glb", ".gltf")  # those of geometry/readers.py
+Changes = Mapping[str, Any] | Iterable[str]  # {"cages.count": 3000}, or words of --set: ["cages.count=3000"]
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
 
 
@@ -34,23 +35,27 @@ class Scene(SceneFile):
     folder: Path = Field(Path(), description="folder of the file")
 
     @classmethod
-    def load(cls, path: str | PathLike[str], changes: Mapping[str, Any] | None = None) -> "Scene":
+    def load(cls, path: str | PathLike[str], changes: Changes = ()) -> "Scene":
         """Read a scene file. Raises InputError naming every problem, one a line."""
-        return load_scene(Path(path), overrides_of(changes or {}))
+        return load_scene(Path(path), changes)
 
     @classmethod
-    def of(
-        cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Mapping[str, Any] | None = None
-    ) -> "Scene":
+    def of(cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Changes = ()) -> "Scene":
         """Make a scene of tables as its file would have them: {"mesh": {"source": "body.obj"}, ...}.
 
         folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
 
         Raises InputError naming every problem, one a line.
         """
-        return scene_in(Path(folder), tables, overrides_of(changes or {}))
+        path, data = Path(folder) / "scene", plain(tables)
+        keys = {_override(data, override): override for override in overrides_of(changes)}
+        checked = _checked(path, data, "", keys)
+        try:
+            return Scene(**_given(checked), text=tomli_w.dumps(data), folder=path.parent)
+        except TypeError as error:
+            raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
-    def changed(self, changes: Mapping[str, Any]) -> "Scene":
+    def changed(self, changes: Changes) -> "Scene":
         """Return this scene with changes, checked as a whole. Raises InputError."""
         return Scene.of(toml_of(self.text), self.folder, changes) if changes else self
 
@@ -64,45 +69,33 @@ class Scene(SceneFile):
     __str__ = __repr__
 
 
-def load_scene(
-    path: str | Path, overrides: Iterable[str] = (), presets: Collection[str] | None = None, by_user: bool = True
-) -> Scene:
+def load_scene(path: str | Path, changes: Changes = (), by_user: bool = True) -> Scene:
     """Read and check a scene file.
 
-    overrides: "key.path=value" each, as of --set: value in TOML (a bare word is a string), list items by
-        number; they replace or insert before anything is checked.
-    presets: the known names of solver presets; any name will do if None. by_user: whether the
-    overrides are a user's own words, which may name files outside the folder; a file's may not.
+    changes : a value in TOML may be a bare word, which is a string; they replace or insert before anything is checked
+    by_user : whether the changes are a user's own words, which may name files outside the folder; a file's may not
 
     Raises InputError naming every problem of the file, one a line.
     """
     path = Path(path)
     if path.name.lower().endswith(MESHES) and path.is_file():
         raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {path.with_suffix('.toml')} --mesh {path}")
-    return scene_of(path, _read(path, "scene"), overrides, presets, by_user)
+    return scene_of(path, _read(path, "scene"), changes, by_user)
 
 
-def scene_of(
-    path: Path,
-    file_text: str,
-    overrides: Iterable[str] = (),
-    presets: Collection[str] | None = None,
-    by_user: bool = True,
-    to_read: bool = True,
-) -> Scene:
+def scene_of(path: Path, text: str, changes: Changes = (), by_user: bool = True, to_read: bool = True) -> Scene:
     """Check the text of a scene file as ``load_scene`` does the file.
 
-    to_read: whether the files that it names are to be read
+    to_read : whether the files that it names are to be read
     """
-    overrides, data = list(overrides), _parse(path, file_text)
+    data = _parse(path, text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a study, no scene: msmpetsc study {path}")
-    keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, presets, file_text, keys)
+    keys = {_override(data, override): override for override in overrides_of(changes)}
+    checked = _checked(path, data, text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else None)
-    text = tomli_w.dumps(data) if overrides else file_text
-    return Scene(**_given(checked), text=text, folder=path.parent)
+    return Scene(**_given(checked), text=tomli_w.dumps(data) if keys else text, folder=path.parent)
 
 
 def _given(scene: SceneFile) -> dict[str, Any]:
@@ -110,28 +103,10 @@ def _given(scene: SceneFile) -> dict[str, Any]:
     return {name: getattr(scene, name) for name in scene.model_fields_set}
 
 
-def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] = ()) -> Scene:
-    """Check a scene that Python has as tables; its files are the user's own words, and may lie anywhere.
-
-    folder : where the paths that it names start
-
-    Raises InputError naming every problem, one a line.
-    """
-    path, data = folder / "scene", plain(tables)
-    keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, None, "", keys)
-    try:
-        return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
-    except TypeError as error:
-        raise InputError(f"{path}: cannot be written as TOML: {error}") from None
-
-
-def _checked(
-    path: Path, data: dict[str, Any], presets: Collection[str] | None, text: str, keys: dict[KeyPath, str]
-) -> SceneFile:
+def _checked(path: Path, data: dict[str, Any], text: str, keys: dict[KeyPath, str]) -> SceneFile:
     """Return the tables checked; of a problem InputError names the line of ``text`` or the override of these keys."""
     try:
-        return SceneFile.model_validate(data, context={"presets": presets})
+        return SceneFile.model_validate(data)
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
 

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -158,7 +158,7 @@ def inline(table: Mapping[str, Any]) -> str:
     return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None) + "}"
 
 
-def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str] | None = None) -> list[Case]:
+def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
     """Return all cases, each once, in the order of the file in this folder. Raises InputError."""
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
@@ -166,10 +166,10 @@ def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str]
             if (sweep.scenes and scene.name not in sweep.scenes) or (not full and (sweep.full or scene.full)):
                 continue
             for own in of_laws(scene, sweep):
-                for case in sweep_cases(study, *own, folder=folder, presets=presets):
+                for case in sweep_cases(study, *own, folder=folder):
                     by_id.setdefault(case.id, case)
     for map in study.map:
-        for case in map_cases(study, map, folder, presets) if full or not map.full else ():
+        for case in map_cases(study, map, folder) if full or not map.full else ():
             by_id.setdefault(case.id, case)
     return list(by_id.values())
 
@@ -188,13 +188,11 @@ def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep
         yield changed, sweep.model_copy(update={"label": ", ".join(filter(None, (sweep.label, law)))})
 
 
-def sweep_cases(
-    study: Study, scene: StudyScene, sweep: Sweep, *, folder: Path, presets: Collection[str] | None
-) -> Iterator[Case]:
+def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, *, folder: Path) -> Iterator[Case]:
     """Yield the cases of a sweep over a scene: its lists multiplied with each other."""
     file = folder / scene.file
     changes = (*scene.set, *sweep.set)
-    as_given = load_scene(file, changes, presets, by_user=False)
+    as_given = load_scene(file, changes, by_user=False)
     for cells, integrator in product(sweep.cells or (None,), sweep.integrators):
         base = Case(
             scene=scene.name, file=file, content=digest(file, as_given), integrator=integrator, cells=cells,
@@ -203,7 +201,7 @@ def sweep_cases(
         )  # fmt: skip
         base = replace(base, reference=_reference(base, scene, as_given))
         for case in _methods(base, scene, sweep, as_given):
-            load_scene(file, case.set, presets, by_user=False)  # what is wrong is said before anything is run
+            load_scene(file, case.set, by_user=False)  # what is wrong is said before anything is run
             yield case
 
 
@@ -282,11 +280,11 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     return with_time(case.changed(f"solver={solver}"), duration, every, as_given, surface)
 
 
-def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | None = None) -> Iterator[Case]:
+def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
     """Yield a map's cases: each method at each point of two axes, or with each named case. Raises InputError."""
     for x, y, run in map_points(map):
         file = folder / run.file
-        scene = load_scene(file, run.set, presets, by_user=False)
+        scene = load_scene(file, run.set, by_user=False)
         step = scene.time.step
         duration = run.steps * step if run.steps else run.duration or scene.time.duration
         for method in study.method:

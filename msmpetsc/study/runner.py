@@ -193,7 +193,7 @@ def run_study(
     """
     require_extra()
     study = load_study(path, presets)
-    every, wanted = _cases(study, path, full, presets)
+    every, wanted = _cases(study, path, full)
     wanted = part.of(wanted) if part else wanted
     own = part.folder(folder) if part else folder
     own.mkdir(parents=True, exist_ok=True)
@@ -217,17 +217,15 @@ def list_study(
 ) -> list[tuple[Case, bool]]:
     """Return the cases of a study file, and whether each is done; nothing is run or written."""
     require_extra()
-    every, wanted = _cases(load_study(path, presets), path, full, presets)
+    every, wanted = _cases(load_study(path, presets), path, full)
     rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
     return [(every[case], _is_done(every[case], rows)) for case in wanted]
 
 
-def _cases(
-    study: Study, path: Path, full: bool, presets: Collection[str] | None
-) -> tuple[dict[str, Case], Sequence[str]]:
+def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Sequence[str]]:
     """Return all cases by their id, and the ids of those that are wanted."""
-    every = {case.id: case for case in study_cases(study, path.parent, True, presets)}
-    return every, [case.id for case in study_cases(study, path.parent, full, presets)]
+    every = {case.id: case for case in study_cases(study, path.parent, True)}
+    return every, [case.id for case in study_cases(study, path.parent, full)]
 
 
 def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:

@@ -188,7 +188,7 @@ def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePla
     monkeypatch.setattr(
         trials, "surface_error", lambda a, b, until: bench.share_until(until) * abs(bench.errors[a] - bench.errors[b])
     )
-    sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 6400), ["newton"], said.append)
+    sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 6400), said.append)
     return sizer.plan(), bench, said
 
 
@@ -229,7 +229,7 @@ def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(t
     bench = Bodies(explicit=False)
     monkeypatch.setattr(Bodies, "error_of", lambda self, case, cells: 1.4 * cells ** (-1 / 3))
     monkeypatch.setattr(trials, "surface_error", apart)
-    plan = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), ["newton"], print).plan()  # fmt: skip
+    plan = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), print).plan()  # fmt: skip
     assert plan.met and 0.6 * target < 1.4 * plan.choice.cells ** (-1 / 3) < 1.1 * target
 
 
@@ -253,7 +253,7 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
     for target, finest in ((0.1, 1000), (0.01, 64_000)):
         bench = Bodies(cell_error=1.0)
         monkeypatch.setattr(trials, "surface_error", lambda a, b, until, e=bench.errors: abs(e[a] - e[b]))
-        sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), ["newton"], print)
+        sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), print)
         plan = sizer.plan()
         assert plan.met and max(each.cells for each in sizer.trials) == finest
         assert bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.7 * target
@@ -345,13 +345,13 @@ def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monk
         bench, "measure", lambda case, keep: CaseResult({"status": "failed", "reason": "planted"}, None)
     )
     (tmp_path / "scene.toml").write_text(SCENE)
-    sizer = Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10, None), ["newton"], said.append)
+    sizer = Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10, None), said.append)
     with pytest.raises(InputError, match="the trials failed"):
         sizer.plan()
     assert all("planted" in text for text in said) and len(said) == 2
     (tmp_path / "scene.toml").write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
     with pytest.raises(InputError, match="--cells N says how many"):
-        Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10), ["newton"], print)
+        Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10), print)
 
 
 def true_error(scene: Path, *, choice: list[str], finer: list[str], until: float = math.inf) -> float:

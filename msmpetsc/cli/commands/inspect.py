@@ -35,9 +35,7 @@ def run(args: argparse.Namespace) -> int:
     if args.ranks > MOST_RANKS:
         raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     initialise(MPI.COMM_WORLD, [])
-    from msmpetsc.solve.presets import preset_names
-
-    scene = load_scene(args.scene, args.set, preset_names())
+    scene = load_scene(args.scene, args.set)
     before = peak_memory()
     bodies = read_bodies(MPI.COMM_WORLD, scene)
     mesh = peak_memory() - before

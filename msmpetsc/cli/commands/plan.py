@@ -58,12 +58,10 @@ def print_command(args: argparse.Namespace, choice: Choice, target: float) -> st
 
 def size_all(args: argparse.Namespace, target: float) -> SizePlan:
     """Make the trials, and print each when it is done; afterwards none of their runs is left."""
-    from msmpetsc.solve.presets import preset_names
-
     asked = Asked(target, args.frames, args.cells, args.ranks)
     with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder, closing(Processes()) as processes:
         runs = Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
-        sizer = Sizer(args.scene, runs, asked, preset_names(), print_size_trial)
+        sizer = Sizer(args.scene, runs, asked, print_size_trial)
         print(HEAD, flush=True)
         return sizer.plan()
 

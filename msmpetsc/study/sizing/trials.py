@@ -1,7 +1,7 @@
 """The trials that size a scene: coarse lattices tell the error of the step, three lattices that of the cells."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -55,14 +55,13 @@ class Sizer:
         scene: Path,
         bench: Bench,
         asked: Asked,
-        presets: Collection[str],
         report: Callable[[SizeTrial | str], None],
     ):
         self.scene = scene
         self.bench = bench
         self.target = asked.target
         self.ranks = asked.ranks
-        self.as_given = load_scene(scene, (), presets)
+        self.as_given = load_scene(scene)
         count = asked.cells or self.as_given.cages.count
         if count is None:
             raise InputError(f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has")

@@ -1,20 +1,25 @@
-"""Springs, and cells of a solid, that the edge of a clamp cuts.
+"""Pins and anchors: the nodes that each holds, what their edges cut, and their forces and torques on the body.
 
-A pin holds nodes, but its region ends between them. Of a spring from a free node to a held one a part theta is free,
-and only that gives: it is 1 / theta as stiff. Where the held node sticks out of the body, as at a clamped face, the
-spring has been made of what is inside, a part sigma of its length (boundary_cells), and is 1 / (sigma theta) as stiff.
-Along a row of cells both are exact, and a clamp askew in the grid is where it should be to second order, as Gibou,
-Fedkiw, Cheng and Kang (2002) have it for the Poisson equation. A cell of a solid takes the mean of
-sigma theta over its pairs of a free and a held corner: along the clamp, where that is too much, nothing strains.
+Springs, and cells of a solid, that the edge of a clamp cuts: a pin holds nodes, but its region ends between them. Of a
+spring from a free node to a held one a part theta is free, and only that gives: it is 1 / theta as stiff. Where the
+held node sticks out of the body, as at a clamped face, the spring has been made of what is inside, a part sigma of its
+length (cell_fractions), and is 1 / (sigma theta) as stiff. Along a row of cells both are exact, and a clamp askew in
+the grid is where it should be to second order, as Gibou, Fedkiw, Cheng and Kang (2002) have it for the Poisson
+equation. A cell of a solid takes the mean of sigma theta over its pairs of a free and a held corner: along the clamp,
+where that is too much, nothing strains.
+
+Reactions: of a node that is held, what moves and pulls it leaves  m a + grad E - f_ext - push,  with which the pin or
+anchor keeps it where it is. So the forces on a body add up: reactions + loads + pushes = sum of m a, as grad E adds up
+to nothing.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
 from msmpetsc.constraints.coverage import Regions
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
@@ -24,6 +29,50 @@ LEAST = 0.1  # free part of a spring: what is stiffer costs iterations, and shor
 HALVINGS = 20  # of the way to the edge
 
 Within = Callable[[Positions], Mask]  # points (n, 3) [m] -> (n,) bool
+
+
+@dataclass(frozen=True)
+class Holders:
+    """The pins of a scene and then its anchors, by their keys, and whose each node is.
+
+    number  : (owned,) of the pin or anchor that has a node, the number of keys where none does
+    centers : (a, 3) of mass of their nodes at rest [m]
+    """
+
+    keys: tuple[str, ...]
+    number: Indices
+    centers: Positions
+
+    @classmethod
+    def of_masks(cls, masks: dict[str, Mask], lattice: Lattice) -> "Holders":
+        """Return those of the nodes (l,) of each table; of two tables on a node the first has it (collective)."""
+        number = np.full(lattice.owned, len(masks))
+        for holder, where in reversed([*enumerate(masks.values())]):
+            number[where[: lattice.owned]] = holder
+        mass = lattice.mass[:, None]
+        sums = sums_by(number, np.hstack([mass * lattice.nodes[: lattice.owned], mass]), len(masks))
+        whole = lattice.table.comm.allreduce(sums)
+        return cls(tuple(masks), number, whole[:, :3] / np.maximum(whole[:, 3:], np.finfo(float).tiny))
+
+    def totals(self, forces: Rows) -> Rows:
+        """Return the sum (a, 3) over the nodes of each of what holds nodes (owned, 3), of this rank's."""
+        return sums_by(self.number, forces, len(self.keys))
+
+    def torques(self, q: Positions, forces: Rows, points: Positions) -> Rows:
+        """Return the sums (a, 3) [N m] of (q - p) x f over the nodes (owned, 3) of each, of this rank's.
+
+        points : p (a, 3) [m] of each
+        """
+        of_node = like(q, np.vstack([points, np.zeros(3)]))[self.number]
+        return self.totals(np.cross(q - of_node, forces))
+
+
+def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
+    """Return the sums (count, k) of vectors (n, k) by their numbers (n,), which are where these are."""
+    sums = np.zeros((count, vectors.shape[1]))
+    for which in range(count):
+        sums[which] = to_host(vectors[number == which].sum(axis=0))
+    return sums
 
 
 def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions) -> Lattice:

@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.constraints.coverage import NODES, Regions, regions, taken
+from msmpetsc.constraints.coverage import Regions, taken
 from msmpetsc.constraints.holders import Holders, clamped
 from msmpetsc.constraints.loads import Anchor, Load, OwnForce, RigidMotion, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
@@ -164,8 +164,9 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
-    points = shape.nearest(lattice) if any(any(scene.tables(kind)) for kind in NODES) else lattice.nodes
-    masks = regions(scene, lattice, finder, points)
+    tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
+    points = shape.nearest(lattice) if tables else lattice.nodes  # of the bodies that nodes are nearest to
+    masks = {table.key: finder.find(table, lattice, points) for table in tables}
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)

@@ -67,19 +67,19 @@ class Checkpoint:
 
     def restore_counts(self, part: Counting) -> None:
         """Give a part its numbers, those that are stored. Raises InputError for what no run can have had."""
-        stored = {name: self._like(name, value, part) for name, value in _numbers(part)}
-        for attribute in part.state:
-            value, begin = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
+        for attribute, bounds in part.state.items():
+            value, name = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
             if is_dataclass(value) and not isinstance(value, type):
-                setattr(part, attribute, replace(value, **{name: stored[f"{begin}.{name}"] for name in vars(value)}))
+                inner = {each: self._like(f"{name}.{each}", number, bounds) for each, number in vars(value).items()}
+                setattr(part, attribute, replace(value, **inner))
             else:
-                setattr(part, attribute, stored[begin])
+                setattr(part, attribute, self._like(name, value, bounds))
 
-    def _like(self, name: str, value: Any, part: Counting) -> Any:
-        """The number of a name, of the kind that ``value`` is."""
+    def _like(self, name: str, value: Any, bounds: Range) -> Any:
+        """Return the number of a name, of the kind that ``value`` is."""
         if isinstance(value, float) and math.isnan(value):  # it may be unknown
             return self.numbers.get(name, value)
-        least, most = part.state[name.split(".")[1]]
+        least, most = bounds
         if isinstance(value, int):
             least, most = max(least, -MOST_COUNT), min(most, MOST_COUNT)
         return type(value)(self.number(name, value, least, most))

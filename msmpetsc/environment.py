@@ -122,7 +122,7 @@ class Environment:
         def at(time: float) -> list[Any]:
             loads = [load.state_at(time) for load in self.pulling]
             anchors = [anchor.holds_at(time) and tuple(anchor.path.value_at(time)) for anchor in self.anchors]
-            obstacles = [o.acts_at(time) and tuple(o.path.displacement_at(time)) for o in self.obstacles]
+            obstacles = [o.acts_at(time) and tuple(o.path.value_at(time)) for o in self.obstacles]
             return [*loads, *anchors, *obstacles]
 
         return at(begin) == at(end)

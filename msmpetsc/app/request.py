@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 from msmpetsc.app.checks import MEASURE_NAMES, RESULT_NAMES, checked_file, checked_path, refuse_other_format
 from msmpetsc.errors import InputError
-from msmpetsc.scene.toml import overrides_of, toml_of
+from msmpetsc.scene.toml import overrides_of
 from msmpetsc.solve.petsc.words import words_of
 
 if TYPE_CHECKING:  # --help, which shows the table, needs neither numpy nor a scene
@@ -117,7 +117,7 @@ class RunRequest:
         other = self.output is not None and self.resume is not None and Path(self.output) != Path(self.resume)
         if self.resume and (self.overwrite or other):
             raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
-        if self.made and not (self.output or self.resume):
+        if self.scene is not None and not (self.file or self.output or self.resume):
             raise InputError("a scene that is no file gives its result no name: say output")
         if self.trace is not None and self.measure is None:
             raise InputError("--trace needs --measure, the file that it is written to")
@@ -126,15 +126,6 @@ class RunRequest:
     def file(self) -> Path | None:
         """Path of the scene, if that is a file."""
         return Path(self.scene) if isinstance(self.scene, str | os.PathLike) else None
-
-    @property
-    def made(self) -> tuple[Path, Mapping[str, Any]] | None:
-        """Folder and tables of the scene, if that is no file."""
-        if self.scene is None or self.file:
-            return None
-        if isinstance(self.scene, Mapping):
-            return Path(), self.scene
-        return cast("Scene", self.scene).folder, toml_of(cast("Scene", self.scene).text)
 
     @property
     def path(self) -> Path:

@@ -29,8 +29,8 @@ if TYPE_CHECKING:  # these import PETSc, which must first be given its options
 OF_NO_EFFECT = re.compile(  # on results
     r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc|^use_gpu_aware_mpi$|^device_"
 )
-OUTPUTS = ("output.every", "output.surface", "output.stress", "output.probe")
-FIXED = ("time.step", "time.integrator", *OUTPUTS)  # a file has one of each
+# a file has one of each
+FIXED = ("time.step", "time.integrator", "output.every", "output.surface", "output.stress", "output.probe")
 OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that may differ without a word
 
 

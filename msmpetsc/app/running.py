@@ -2,6 +2,7 @@
 
 import logging
 import shlex
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import count
@@ -175,9 +176,10 @@ def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier 
 def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     """Read the scene with what the request changes; --set comes last and wins."""
     changes = request.overrides
-    if request.made is not None:
-        folder, tables = request.made
-        scene = Scene.of(tables, folder, changes)
+    if isinstance(request.scene, Scene):
+        scene = request.scene.changed(changes)
+    elif isinstance(request.scene, Mapping):
+        scene = Scene.of(request.scene, changes=changes)
     elif request.file is not None:
         scene = load_scene(request.file, changes)
     elif earlier is not None:
@@ -190,7 +192,7 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
     """Return what the file says of the run that made it, with the user's PETSc options alone."""
     options = PETSc.Options().getAll().items()
-    file = request.made[0] / "scene" if request.made else request.file  # where its paths start
+    file = request.file or scene.folder / "scene"  # where its paths start
     return {
         "msmpetsc_version": __version__,
         "petsc_version": versions()["petsc"],
@@ -198,7 +200,7 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
         "ranks": comm.size,
         "command": request.command,
         "scene": scene.text,
-        "scene_file": str(file.resolve()) if file else "",
+        "scene_file": str(file.resolve()) if request.scene is not None else "",
         "true_error": request.true_error or 0,
     }
 

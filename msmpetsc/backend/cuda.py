@@ -46,13 +46,6 @@ def view(pointer: int, size: int) -> np.ndarray:
     return cupy.ndarray((size,), np.float64, cupy.cuda.MemoryPointer(memory, 0))
 
 
-def wait() -> None:
-    """Wait until the GPU has done all that it was given."""
-    import cupy
-
-    cupy.cuda.Device().synchronize()
-
-
 def name() -> str:
     """Return the name of the GPU in use."""
     import cupy

@@ -6,33 +6,19 @@ What could not have any effect at all is refused; what is overruled in part is w
 import math
 from collections.abc import Mapping
 from functools import reduce
-from itertools import chain
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Mask, Positions
+from msmpetsc.backend.arrays import Mask
 from msmpetsc.comm import log
-from msmpetsc.constraints.loads import SAME, Anchor, within
+from msmpetsc.constraints.loads import Anchor
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.motion import Force
-from msmpetsc.scene.obstacles import ObstacleTable
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.time import Time
 
-NODES = ("pin", "anchor", "force")  # tables whose regions mean nodes
 Regions = Mapping[str, Mask]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
-
-
-def regions(scene: Scene, lattice: Lattice, finder: Finder, points: Positions) -> dict[str, Mask]:
-    """Return the nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes.
-
-    points : (l, 3) of the bodies that nodes are nearest to [m]
-    """
-    tables = chain.from_iterable(scene.tables(kind) for kind in NODES)
-    return {table.key: finder.find(table, lattice, points) for table in tables}
 
 
 def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions) -> tuple[str, ...]:
@@ -63,7 +49,6 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
                 "acts, pins and anchors hold all"
             )
         words.append(f"{table.key} pulls {nodes} nodes" + (f" ({held} of them held)" if held else ""))
-    _note_what_never_acts(scene)
     return tuple(words)
 
 
@@ -91,30 +76,6 @@ def _held_while(force: Force, pinned: Mask, anchors: list[Anchor]) -> Mask:
     until = math.inf if force.stop is None else force.stop
     lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
     return reduce(np.logical_or, lasting, pinned)
-
-
-def _note_what_never_acts(scene: Scene) -> None:
-    """Warn of forces and obstacles that are there at the end of no step."""
-    time = scene.time
-    forces = ((force.key, force.table) for force in scene.tables("force"))
-    obstacles = ((f"obstacle.{number}", obstacle) for number, obstacle in enumerate(scene.obstacle))
-    for key, table in chain(forces, obstacles):
-        if _acts_in_a_step(table, time):
-            continue
-        until = "on" if table.stop is None else f"to {table.stop:g} s"
-        text = f"{key} acts in no step: it is there from {table.start:g} s {until}"
-        if table.start > time.duration:  # as --frames has it, too
-            log.info("%s, and the run ends at %g s", text, time.duration)
-        else:
-            log.warning("%s, between the ends of steps of %g s", text, time.step)
-
-
-def _acts_in_a_step(table: Force | ObstacleTable, time: Time) -> bool:
-    """Return whether a table acts at the end of a step; or, where steps have substeps, at any time of the run."""
-    if time.integrator == "verlet":
-        return table.start < time.duration and (table.stop is None or table.stop > 0)
-    first = max(1, math.ceil(table.start / time.step * (1 - SAME)))
-    return first <= time.steps and within(first * time.step, table.start, table.stop)
 
 
 def _nodes(count: int) -> str:

@@ -50,10 +50,6 @@ class Motion(Lines):
         """Whether the motion leaves where it starts."""
         return len(self.times) > 1
 
-    def displacement_at(self, time: float) -> Floats:
-        """Return the displacement (3,) [m] at a time [s]."""
-        return self.value_at(time)
-
     def displacement_between(self, begin: float, end: float) -> Floats:
         """Return the way (3,) [m] that the motion makes good from one time [s] to another."""
         return self.value_at(end) - self.value_at(begin)

@@ -1,22 +1,19 @@
 """Tables of what moves the body: its start, gravity, pins, anchors, forces."""
 
 from itertools import pairwise
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
-    ConfigDict,
+    Discriminator,
     Field,
-    PlainSerializer,
-    PlainValidator,
-    TypeAdapter,
-    WithJsonSchema,
+    Tag,
     field_validator,
     model_validator,
 )
 
 from msmpetsc.scene.body import Region
-from msmpetsc.scene.problems import rule
+from msmpetsc.scene.problems import TAGS, rule
 from msmpetsc.scene.values import Direction, FunctionName, ListOf, NotNegative, Positive, Table, Vector, after_start
 
 
@@ -113,21 +110,10 @@ class ForceTable(Table):
         return self
 
 
-VECTOR = TypeAdapter(Vector, config=ConfigDict(strict=True, allow_inf_nan=False))
-
-
-def _total(value: Any) -> tuple[float, float, float] | ForceTable:
-    """Return a vector, or a table that has been checked: a plain union would report both for a mistake in one."""
-    if isinstance(value, dict | ForceTable):
-        return ForceTable.model_validate(value)
-    return VECTOR.validate_python(value)
-
-
+# of one kind or the other: a plain union would report both for a mistake in one
 Total = Annotated[
-    Vector | ForceTable,
-    PlainValidator(_total),
-    PlainSerializer(lambda total: total.model_dump() if isinstance(total, ForceTable) else total),
-    WithJsonSchema({"anyOf": [VECTOR.json_schema(), ForceTable.model_json_schema()]}),
+    Annotated[Vector, Tag(TAGS[0])] | Annotated[ForceTable, Tag(TAGS[1])],
+    Discriminator(lambda total: TAGS[isinstance(total, dict | ForceTable)]),
 ]
 
 

@@ -98,11 +98,13 @@ class SceneFile(Table):
     pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
     anchor: ListOf[AnchorTable] = Field((), description="nodes led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
-    solver: Solver = Field(Solver.model_validate({}), description="how a step is solved")
-    safety: Safety = Field(Safety.model_validate({}), description="what is done about a step that fails")
-    output: Output = Field(Output.model_validate({}), description="what is stored")
+    solver: Solver = Field(default_factory=lambda: Solver.model_validate({}), description="how a step is solved")
+    safety: Safety = Field(
+        default_factory=lambda: Safety.model_validate({}), description="what is done about a failed step"
+    )
+    output: Output = Field(default_factory=lambda: Output.model_validate({}), description="what is stored")
     budget: BudgetTable | None = Field(None, description="the surface error that `plan` expects; for the reader")
-    picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
+    picture: Picture = Field(default_factory=lambda: Picture.model_validate({}), description="how the result is drawn")
 
     @model_validator(mode="before")
     @classmethod

@@ -103,25 +103,6 @@ def test_pins_may_overlap(tmp_path, heard):
 
 
 @pytest.mark.parametrize(
-    ("start", "stop", "integrator", "level"),
-    [
-        (0.0, 0.005, "implicit-euler", "WARNING"),  # between the ends of steps
-        (0.012, 0.018, "bdf2", "WARNING"),
-        (0.2, None, "implicit-euler", "INFO"),  # after the end
-        (0.0, 0.005, "verlet", None),
-        (0.1, None, "implicit-euler", None),
-        (0.03, 0.035, "implicit-euler", None),
-    ],
-)
-def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator, level):
-    times = {"start": start} | ({"stop": stop} if stop else {})
-    ground = {"shape": "plane", "point": [0, 0, -1], "normal": [0, 0, 1]}
-    build(tmp_path, force=[force(RIGHT, **times)], obstacle=[ground | times], time=TIME | {"integrator": integrator})
-    wanted = [(level, f"{key} acts in no step") for key in ("force.0", "obstacle.0") if level]
-    assert [(found, line.partition(":")[0]) for found, line in heard()] == wanted
-
-
-@pytest.mark.parametrize(
     ("side", "mesh", "words"),
     [
         (300.0, {}, ["300 m long", "millimetres"]),
@@ -176,7 +157,7 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
     tables = {
         "none is free": {"pin.0.region": LEFT_HALF, "force.0": force(LEFT)},
         "it leads none": {"anchor.0": {"region": LEFT_HALF, "path": UP}, "anchor.1": {"region": LEFT, "path": ASIDE}},
-        "acts in no step": {"force.0": force(RIGHT, stop=0.005)},
+        "which it does not lead": {"anchor.0": {"region": LEFT_HALF, "path": UP}, "pin.0.region": LEFT},
     }
     commands = [
         ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / f"{number}.h5"), "--frames", "1"]

@@ -6,7 +6,7 @@ from dataclasses import astuple
 
 from msmpetsc.scene.key_table import json_schema, keys
 
-HEAD = ("key", "unit", "default", "range", "meaning")
+HEAD = ("key", "default", "range", "meaning [unit]")
 
 
 def run(args: argparse.Namespace) -> int:

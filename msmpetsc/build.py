@@ -81,13 +81,13 @@ class Model:
 
     @property
     def body_of_point(self) -> Indices:
-        """Number (v,) of the body of each surface point, on rank 0."""
+        """Return the number (v,) of the body of each surface point, on rank 0."""
         points = [0 if body.surface is None else len(body.surface.points) for body in self.bodies]
         return np.repeat(np.arange(len(points)), points)
 
     @cached_property
     def solids(self) -> dict[int, Surface]:
-        """Surfaces of obstacles that are meshes or functions, by their numbers, on rank 0 (collective at first)."""
+        """Return the surfaces of obstacles that are meshes or functions, by number, on rank 0 (collective at first)."""
         solids = {number: obstacle.solid for number, obstacle in enumerate(self.obstacles)}
         drawn = {number: solid for number, solid in solids.items() if isinstance(solid, DistanceSolid)}
         if not drawn:
@@ -118,7 +118,7 @@ class Geometry:
 
     @cached_property
     def embedding(self) -> Embedding:
-        """How the surfaces follow the nodes (collective)."""
+        """Return how the surfaces follow the nodes (collective)."""
         points = [np.empty((0, 3)) if body.surface is None else body.surface.points for body in self.bodies]
         _, _, cages = self.source
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
@@ -172,7 +172,6 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
-    words = taken(comm, scene, lattice, anchors, masks)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -189,7 +188,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
         collision=collision_surface(scene.self_contact, scene, bodies, cages, lattice) if scene.self_contact else None,
-        taken=words,
+        taken=taken(comm, scene, lattice, anchors, masks),
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),
@@ -314,8 +313,10 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, a
 def _loads(
     comm: MPI.Comm, gravity: Gravity | None, forces: Iterable[OfBody], lattice: Lattice, masks: Regions
 ) -> tuple[list[Load], tuple[OwnForce, ...]]:
-    """Return the forces, and those that are functions. Raises InputError for a function's name that is neither
-    registered nor installed."""
+    """Return the forces, and those that are functions.
+
+    Raises InputError for a function's name that is neither registered nor installed.
+    """
     loads, own_forces = [], []
     if gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(gravity.acceleration), 0.0, None))

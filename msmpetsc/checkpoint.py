@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 
@@ -27,8 +28,10 @@ LENGTH: Range = (0.0, sys.float_info.max)
 
 
 class Counting(Protocol):
-    """A part of a run that counts: its ``state`` names the attributes, numbers or dataclasses of
-    numbers, that a checkpoint holds, and the range of each."""
+    """A part of a run that counts.
+
+    state : names of its attributes, numbers or dataclasses of numbers, that a checkpoint holds, and the range of each
+    """
 
     @property
     def state(self) -> dict[str, Range]: ...
@@ -45,7 +48,7 @@ def _numbers(part: Counting) -> Iterator[tuple[str, Any]]:
 
 @dataclass
 class Checkpoint:
-    """After ``step`` steps. Empty, it is what a run begins with.
+    """The state of a run after ``step`` steps; empty, it is what a run begins with.
 
     rows    : by name, what there is of each node, this rank's owned ones: (owned, 3) or (owned,); q and q_previous
         [m] among them
@@ -53,10 +56,10 @@ class Checkpoint:
     """
 
     step: int = 0
-    rows: dict[str, np.ndarray] = field(default_factory=dict)
+    rows: dict[str, Array] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
 
-    def keep(self, rows: dict[str, np.ndarray] | None = None, numbers: dict[str, float] | None = None) -> None:
+    def keep(self, rows: dict[str, Array] | None = None, numbers: dict[str, float] | None = None) -> None:
         """Store a part's rows and numbers."""
         self.rows |= rows or {}
         self.numbers |= numbers or {}
@@ -84,14 +87,14 @@ class Checkpoint:
             least, most = max(least, -MOST_COUNT), min(most, MOST_COUNT)
         return type(value)(self.number(name, value, least, most))
 
-    def row(self, name: str) -> np.ndarray:
-        """Raises InputError where there is none."""
+    def row(self, name: str) -> Array:
+        """Return the rows of a name. Raises InputError where there are none."""
         if name not in self.rows:
             raise InputError(f"the checkpoint is damaged: it lacks {name}")
         return self.rows[name]
 
     def number(self, name: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
-        """Raises InputError for one that no run can have had."""
+        """Return the number of a name. Raises InputError for one that no run can have had."""
         value = self.numbers.get(name, default)
         if not least <= value <= most:
             raise InputError(f"the checkpoint is damaged: {name} is {value:g}")

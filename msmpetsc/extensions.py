@@ -44,9 +44,10 @@ class Extensions(Generic[T]):
             near = did_you_mean(name, self.names())
             raise InputError(f"no {self.kind} {name!r} is registered, or installed under {self.group}{near}")
         try:
-            return next(iter(points)).load()
+            value: T = next(iter(points)).load()
         except Exception as error:  # of whatever was installed
             raise InputError(f"the {self.kind} {name!r} that is installed cannot be imported: {error}") from error
+        return value
 
 
 FORCES: Extensions[ForceFunction] = Extensions("force")

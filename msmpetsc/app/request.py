@@ -124,30 +124,30 @@ class RunRequest:
 
     @property
     def file(self) -> Path | None:
-        """Path of the scene, if that is a file."""
+        """Return the path of the scene, if that is a file."""
         return Path(self.scene) if isinstance(self.scene, str | os.PathLike) else None
 
     @property
     def path(self) -> Path:
-        """Path of the result file."""
+        """Return the path of the result file."""
         named = self.resume or self.output
         return Path(named) if named else Path("out") / f"{self.file.stem if self.file else ''}.h5"
 
     @property
     def measured(self) -> Path | None:
-        """Path of the file of what the run cost."""
+        """Return the path of the file of what the run cost."""
         return Path(self.measure) if self.measure else None
 
     @property
     def overrides(self) -> list[str]:
-        """Changes of the scene, as ``--set`` takes them."""
+        """Return the changes of the scene, as ``--set`` takes them."""
         given = {"solver.preset": self.preset, "solver.error": self.error}
         method = {key: value for key, value in given.items() if value is not None}
         return [*overrides_of(method), *overrides_of(self.set)]
 
     @property
     def command(self) -> str:
-        """The command that asks for the same, as the result file and ``--measure`` record it."""
+        """Return the command that asks for the same, as the result file and ``--measure`` record it."""
         words = ["msmpetsc", "run", *([str(self.file)] if self.file else [])]
         for name, option in OPTIONS.items():
             value = getattr(self, name)
@@ -160,7 +160,7 @@ class RunRequest:
 
     @property
     def petsc_words(self) -> list[str]:
-        """PETSc's options as words. Raises InputError for what is no option."""
+        """Return PETSc's options as words. Raises InputError for what is no option."""
         return words_of(self.petsc_options)
 
 

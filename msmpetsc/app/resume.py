@@ -46,7 +46,8 @@ def earlier_run(comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: b
         refuse_other_format("--resume", path, RESULT_NAMES)
         return None  # the first start of a job that may be started again
     on_root(comm, lambda: refuse_deadly(path))
-    return comm.bcast(on_root(comm, lambda: Earlier.read(path)))
+    earlier: Earlier = comm.bcast(on_root(comm, lambda: Earlier.read(path)))
+    return earlier
 
 
 def kept_options(earlier: Earlier, given: Sequence[str]) -> list[str]:
@@ -104,7 +105,7 @@ class Resumed:
     """
 
     def __init__(self, earlier: Earlier, scene: Scene, options: dict[str, str], force: bool):
-        """options: PETSc's, of this run. Raises InputError for what may not differ."""
+        """Compare it with the scene and PETSc's options of this run. Raises InputError for what may not differ."""
         self.earlier = earlier
         self.force = force
         self.stored = scene.stored
@@ -120,7 +121,7 @@ class Resumed:
 
     @property
     def is_done(self) -> bool:
-        """Whether the file has all frames already, or those until rest."""
+        """Return whether the file has all frames already, or those until rest."""
         return self.earlier.finished >= self.stored or (self.earlier.at_rest and not self.differs)
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
@@ -134,7 +135,7 @@ class Resumed:
             if was.get(key) != now.get(key):
                 yield f"{key}: {_shown(was.get(key))} in {earlier.path}, {_shown(now.get(key))} now"
 
-    def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
+    def file(self, comm: MPI.Comm, attributes: dict[str, Any], gathers: bool) -> ResultFile:
         """Open the file that the run writes into (collective)."""
         earlier = self.earlier
         if not (self.differs or self.force) and earlier.planned == self.stored:

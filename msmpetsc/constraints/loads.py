@@ -47,7 +47,7 @@ class Motion(Lines):
 
     @property
     def leads_away(self) -> bool:
-        """Whether the motion leaves where it starts."""
+        """Return whether the motion leaves where it starts."""
         return len(self.times) > 1
 
     def displacement_between(self, begin: float, end: float) -> Floats:
@@ -115,7 +115,7 @@ class Timed:
 
     @property
     def events(self) -> list[float]:
-        """Times [s] at which it begins, ends or turns."""
+        """Return the times [s] at which it begins, ends or turns."""
         return [self.start, *([] if self.stop is None else [self.stop])]
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
@@ -146,7 +146,7 @@ class Load(Timed):
 
     @property
     def events(self) -> list[float]:
-        """Times [s] at which the force begins, ends or turns."""
+        """Return the times [s] at which the force begins, ends or turns."""
         return [*super().events, *([] if self.table is None else self.table.times.tolist())]
 
 
@@ -177,8 +177,8 @@ class OwnForce(Timed):
         try:
             force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
         except ValueError:
-            told = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
-            raise InputError(f"{self.key}.function: {told}") from None
+            words = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
+            raise InputError(f"{self.key}.function: {words}") from None
         if not np.isfinite(force).all():
             raise InputError(f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)")
         return force

@@ -39,7 +39,7 @@ class OfBody(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The path as messages have it, "body.1.pin.0"."""
+        """Return the path as messages have it, "body.1.pin.0"."""
         return ".".join(map(str, self.path))
 
 

@@ -125,12 +125,12 @@ class Material(Table):
 
     @property
     def law_stiffening(self) -> float:
-        """b of the springs' law, 0 for Hooke's."""
+        """Return b of the springs' law, 0 for Hooke's."""
         return self.stiffening or DEFAULT_STIFFENING if self.law == "stiffening" else 0.0
 
     @property
     def poisson(self) -> float | None:
-        """Poisson's ratio of a solid; None of springs."""
+        """Return Poisson's ratio of a solid; None of springs."""
         return self.poisson_ratio if self.law == SOLID else None
 
 
@@ -149,7 +149,7 @@ class HalfSpace(Table):
 
 
 class Region(Table):
-    """A part of space at rest; the body in it is meant: its nodes, or of a part the cells whose middles it holds."""
+    """A part of space at rest, whose nodes are meant, or of a part the cells whose middles lie in it."""
 
     one_of = ("box", "sphere", "half_space", "painted")
     box: Box | None = Field(

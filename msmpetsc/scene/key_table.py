@@ -64,23 +64,23 @@ def keys(prefix: str = "") -> list[SceneKey]:
 
 def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterator[SceneKey]:
     one_of = [name for choice in table.get("oneOf", ()) for name in choice["required"]]
-    for name, found in table["properties"].items():
-        inner = found.get("items", found).get("$ref", "").rpartition("/")[2]
+    for name, field in table["properties"].items():
+        inner = field.get("items", field).get("$ref", "").rpartition("/")[2]
         if inner:
-            yield from _keys(schema, schema["$defs"][inner], f"{prefix}{name}{'.N' * ('items' in found)}.")
+            yield from _keys(schema, schema["$defs"][inner], f"{prefix}{name}{'.N' * ('items' in field)}.")
             continue
         if name in one_of:
             default = f"one of {', '.join(one_of)}"
         elif name in table.get("required", ()):
             default = "required"
         else:
-            default = "none" if found.get("default") in (None, "", []) else toml_value(found["default"])
-        yield SceneKey(prefix + name, default, _bounds(found), found.get("description", ""))
+            default = "none" if field.get("default") in (None, "", []) else toml_value(field["default"])
+        yield SceneKey(prefix + name, default, _bounds(field), field.get("description", ""))
 
 
-def _bounds(found: dict[str, Any]) -> str:
-    if "enum" in found:
-        return " | ".join(map(str, found["enum"]))
-    bounds = [f"{sign} {found[word]:g}" for word, sign in BOUNDS.items() if abs(found.get(word, UNREACHED)) < UNREACHED]
-    kind = {"boolean": "true | false", "integer": "whole", "array": "list", "string": "text"}.get(found.get("type", ""))
+def _bounds(field: dict[str, Any]) -> str:
+    if "enum" in field:
+        return " | ".join(map(str, field["enum"]))
+    bounds = [f"{sign} {field[word]:g}" for word, sign in BOUNDS.items() if abs(field.get(word, UNREACHED)) < UNREACHED]
+    kind = {"boolean": "true | false", "integer": "whole", "array": "list", "string": "text"}.get(field.get("type", ""))
     return " ".join(filter(None, [kind, ", ".join(bounds)]))

@@ -58,14 +58,14 @@ class Gravity(Table):
 
 
 class Keyframe(Table):
-    """A place on a path."""
+    """A displacement at a time of a path."""
 
     time: Positive = Field(description="when it is reached [s]")
     by: Vector = Field(description="displacement from the start [m]")
 
 
 class Pose(Keyframe):
-    """A place on a path on which nodes turn as one rigid body."""
+    """A displacement and a turn at a time of a path."""
 
     by: Vector = Field((0.0, 0.0, 0.0), description="displacement from the start [m]")
     turn: Vector = Field(
@@ -137,7 +137,7 @@ class Force(Table):
 
     @property
     def pulls(self) -> bool:
-        """Whether the force is not zero at some time."""
+        """Return whether the force is not zero at some time."""
         if self.total is None:
             return True  # a function, which may
         values = self.total.values if isinstance(self.total, ForceTable) else (self.total,)
@@ -145,7 +145,7 @@ class Force(Table):
 
 
 class AnchorTable(Table):
-    """Nodes that are led along a path as one rigid body, each keeping its place among them."""
+    """Nodes that are led along a path as one rigid body."""
 
     region: Region = Field(description="the nodes led")
     path: Annotated[ListOf[Pose], AfterValidator(_ascending)] = Field(

@@ -120,24 +120,24 @@ class SceneFile(Table):
 
     @property
     def stored(self) -> int:
-        """Number of frames, frame 0 included."""
+        """Return the number of frames, frame 0 included."""
         return self.stored_until(self.time.steps)
 
     def stored_until(self, step: int) -> int:
-        """Number of frames of the first steps: one for every ``every``-th and for the last."""
+        """Return the number of frames of the first steps: one for every ``every``-th and for the last."""
         every = self.output.every
         return 1 + (-(-step // every) if step == self.time.steps else step // every)
 
     @property
     def meshes(self) -> dict[KeyPath, MeshTable]:
-        """The surface of each body, by the path of its key."""
+        """Return the surface of each body, by the path of its key."""
         if self.mesh is not None:
             return {("mesh",): self.mesh}
         return {("body", number, "mesh"): body.mesh for number, body in enumerate(self.body)}
 
     @property
     def starts(self) -> list[Start | None]:
-        """Starts of all bodies at time 0."""
+        """Return the starts of all bodies at time 0."""
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, kind: str) -> Iterator[OfBody]:
@@ -145,7 +145,7 @@ class SceneFile(Table):
         return tables_of(self, kind)
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:
-        """Key path and name of each file that it names; a mesh's name may be one of the registry's too."""
+        """Yield key path and name of each file that it names; a mesh's name may be one of the registry's too."""
         solids = {("obstacle", number, "mesh"): o.mesh for number, o in enumerate(self.obstacle) if o.mesh is not None}
         for path, mesh in (self.meshes | solids).items():
             yield (*path, "source"), mesh.source

@@ -1,5 +1,7 @@
-"""Rules of a scene that depend on its integrator: in statics, where nothing moves, much has no
-meaning; exchange and a surface that meets itself want implicit steps."""
+"""Rules of a scene that depend on its integrator.
+
+In statics, where nothing moves, much has no meaning; exchange and a surface that meets itself want implicit steps.
+"""
 
 from collections.abc import Iterator
 from typing import Any, Final

@@ -40,7 +40,6 @@ from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 class RunPlan:
     """What a run does, once its request is understood.
 
-    attributes : what the file says of the run that made it
     began      : count of perf_counter when that began [s]
     """
 
@@ -48,7 +47,6 @@ class RunPlan:
     scene: Scene
     probes: Probes
     resumed: Resumed | None
-    attributes: dict[str, str | int]
     began: float
 
 
@@ -85,9 +83,8 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(scene, probes)
     on_root(comm, lambda: refuse_unwritable(request.measured))
-    attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
-    return RunPlan(request, scene, probes, resumed, attributes, began)
+    return RunPlan(request, scene, probes, resumed, began)
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
@@ -149,11 +146,7 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
 def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int:
     """Finish the files of a run that has all its frames; return the exit status (collective)."""
     write_companions(comm, request, whole=True)
-    earlier = resumed.earlier
-    if earlier.finished < resumed.stored:
-        log.info("%s came to rest after step %d: nothing left to do", request.path, earlier.step)
-    else:
-        log.info("%s has all its %d frames: nothing left to do", request.path, resumed.stored)
+    log.info("%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished)
     return 0
 
 
@@ -207,11 +200,11 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
 
 def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
     """Open the file to write into: a new one, or that of the run that goes on (collective)."""
-    request = plan.request
+    request, attributes = plan.request, attributes_of(comm, plan.scene, plan.request)
     if plan.resumed:
-        return plan.resumed.file(comm, plan.attributes, request.gather)
+        return plan.resumed.file(comm, attributes, request.gather)
     begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
-    return ResultFile(request.path, comm, plan.attributes, begin, request.gather)
+    return ResultFile(request.path, comm, attributes, begin, request.gather)
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:

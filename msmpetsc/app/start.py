@@ -142,9 +142,6 @@ class Simulation:
         self._words = words_of(petsc_options)
         self._shape: Geometry | None = None  # that the model was made of
 
-    def __repr__(self) -> str:
-        return f"Simulation({self.scene!r})"
-
     def frames(self, frames: int | None = None, *, set: Mapping[str, Any] | None = None) -> Iterator[Frame]:
         """Yield the frames of a run from the start, frame 0 first (collective).
 

@@ -33,12 +33,9 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
         return int(comm.allreduce(int(where[: lattice.owned].sum())))
 
     words, pinned = [], lattice.pinned
-    for number, (table, anchor) in enumerate(zip(scene.tables("anchor"), anchors, strict=True)):
+    for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
         where = masks[table.key]
-        same = (before.where for before in anchors[:number] if _leads_alike(before, anchor))
-        alike = reduce(np.logical_or, same, np.zeros_like(pinned))
-        prescribed = count(where & ~anchor.where & ~pinned & ~alike)
-        _warn_of_overruled(table.key, count(where), count(where & pinned), prescribed)
+        _warn_of_overruled(table.key, count(where), count(where & pinned), count(where & ~anchor.where & ~pinned))
         words.append(f"{table.key} leads {count(anchor.where)} nodes")
     for table in scene.tables("force"):
         where, force = masks[table.key], table.table
@@ -52,15 +49,8 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
     return tuple(words)
 
 
-def _leads_alike(a: Anchor, b: Anchor) -> bool:
-    """Return whether it does not matter which of two anchors has a node: path, center and stop are the same."""
-    same = np.array_equal(a.path.times, b.path.times) and np.array_equal(a.path.vectors, b.path.vectors)
-    turns = a.path.vectors[:, 3:].any()
-    return same and a.stop == b.stop and not (turns and (a.path.center != b.path.center).any())
-
-
 def _warn_of_overruled(key: str, nodes: int, pinned: int, prescribed: int) -> None:
-    """Warn that some of an anchor's nodes are pinned, or led another way by earlier anchors; raise if all are."""
+    """Warn that some of an anchor's nodes are pinned, or led by earlier anchors; raise if all are."""
     why = [f"{pinned} {'is' if pinned == 1 else 'are'} pinned"] if pinned else []
     why += [f"{prescribed} {'is' if prescribed == 1 else 'are'} led by an anchor before it"] if prescribed else []
     if not why:

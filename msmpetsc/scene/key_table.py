@@ -2,8 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import NullableSchema, WithDefaultSchema
@@ -19,8 +18,7 @@ UNREACHED = 1e18  # a bound beyond it only keeps numbers within a double or a 64
 NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")  # the number of a [[table]]
 
 
-@dataclass(frozen=True)
-class SceneKey:
+class SceneKey(NamedTuple):
     """A key of a scene file, in words.
 
     name : as ``--set`` takes it, N for the number of a [[table]]: "pin.N.region.box"

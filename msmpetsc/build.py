@@ -40,7 +40,7 @@ from msmpetsc.scene.reading import Scene
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
-INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
+INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold only
 USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 
 
@@ -165,7 +165,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
-    points = shape.nearest(lattice) if tables else lattice.nodes  # of the bodies that nodes are nearest to
+    points = shape.nearest(lattice) if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
@@ -222,7 +222,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 
 
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
-    """Return the prepared surfaces on rank 0, and on all ranks what they need to know of them (collective)."""
+    """Return the prepared surfaces, on rank 0, and what all ranks need to know of them (collective)."""
 
     def read() -> tuple[list[Surface], list[tuple[SurfaceReport, Rows]]]:
         surfaces, reports = zip(*_prepared(scene), strict=True)
@@ -236,7 +236,7 @@ def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
 
 
 def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
-    """Yield the surface of each body with its report, checked; bodies of one shape are prepared once."""
+    """Yield each body's surface and report, checked; bodies of one shape are prepared once."""
     shapes: dict[str, Surface] = {}
     for path, mesh in scene.meshes.items():
         whose = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
@@ -252,7 +252,7 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
             raise InputError(f"{whose}{error}") from error
         for warning in warnings:
             log.warning("%s%s: %s", whose, mesh.source, warning)
-        yield compact(surface.points, surface.triangles), report  # a point of no triangle may lie in no cell
+        yield compact(surface.points, surface.triangles), report  # such a point may lie in no cell
 
 
 def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
@@ -292,7 +292,7 @@ def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
 
 
 def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders) -> list[Anchor]:
-    """Return the anchors: a pin is stronger than an anchor, and of two anchors on a node the first."""
+    """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first."""
     anchors = []
     taken = lattice.pinned
     for anchor in tables:

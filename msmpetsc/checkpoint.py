@@ -1,7 +1,7 @@
 """State of a run, which a file holds: positions, velocities, and what the run has counted so far.
 
-What solvers know of the steps before is no part of it. A run forgets that wherever a checkpoint may be
-(solve.simulate), so that the one that goes on and the one that is resumed are the same to the last bit.
+What solvers know of the steps before is no part of it. A run forgets that wherever a checkpoint
+may be (solve.simulate), so that one that goes on and one that is resumed are the same bit by bit.
 """
 
 import math
@@ -19,7 +19,7 @@ from msmpetsc.errors import InputError
 
 MOST = 1e60  # of any number: its fourth power is still finite
 MOST_COUNT = 2**53  # the whole numbers that a double holds
-AT_REST = "Rest.has_come"  # number of a run that ends at rest (time.until): whether it has come there
+AT_REST = "Rest.has_come"  # number of a run that ends at rest (time.until): whether it has
 Range = tuple[float, float]
 COUNT: Range = (0, MOST_COUNT)
 ANY: Range = (-math.inf, math.inf)
@@ -69,7 +69,7 @@ class Checkpoint:
         self.keep(numbers=dict(_numbers(part)))
 
     def restore_counts(self, part: Counting) -> None:
-        """Give a part its numbers, those that are stored. Raises InputError for what no run can have had."""
+        """Give a part its stored numbers. Raises InputError for what no run can have had."""
         for attribute, bounds in part.state.items():
             value, name = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
             if is_dataclass(value) and not isinstance(value, type):

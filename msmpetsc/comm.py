@@ -1,4 +1,4 @@
-"""Ranks together: what rank 0 reads all know, what fails on any fails on all, rows travel to their owners."""
+"""Ranks together: what rank 0 reads all know, what fails on any fails on all, rows go to owners."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @contextmanager
 def together(comm: MPI.Comm) -> Iterator[None]:
-    """Raise on all ranks the first rank's MsmpetscError, if any rank has one or lacks memory (collective).
+    """Raise on all ranks the first rank's MsmpetscError, or lack of memory, if any (collective).
 
     Nothing collective may stand in the block: a rank that fails leaves it early.
     """
@@ -38,7 +38,7 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
-    """Call ``function`` on rank 0 only; its error is everyone's. Returns its value there, None elsewhere."""
+    """Call a function on rank 0 only; its error is everyone's. Returns its value; None elsewhere."""
     value = None
     with together(comm):
         if comm.rank == 0:
@@ -58,7 +58,7 @@ class Stop:
 
 
 class Route:
-    """A way of rows to the ranks named for them (Alltoallv), and of answers back in the rows' own order.
+    """A way of rows to the ranks named for them (Alltoallv), and of answers back in their order.
 
     destination : (n,) rank of each row
     """
@@ -71,7 +71,7 @@ class Route:
         comm.Alltoall(self.sent, self.received)
 
     def send(self, rows: Array) -> Array:
-        """Send rows; return those that all ranks sent to this one, by sending rank and then in its order."""
+        """Send rows; return those that all ranks sent to this one, by rank and then in its order."""
         return self._alltoall(np.asarray(rows)[self.order], self.sent, self.received)
 
     def answer(self, rows: Array) -> Array:

@@ -28,7 +28,7 @@ class Extensions(Generic[T]):
         self._registered: dict[str, T] = {}
 
     def register(self, name: str, value: T) -> None:
-        """Give a value a name that scenes then mean, in place of one that had it before; on all ranks."""
+        """Give a value a name that scenes then mean, in place of the one before; on all ranks."""
         self._registered[name] = value
 
     def names(self) -> list[str]:

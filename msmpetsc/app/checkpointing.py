@@ -100,7 +100,7 @@ class Signals:
         self._stepping = True
 
     def agree(self, due: bool) -> tuple[bool, int]:
-        """Return whether any rank has a checkpoint due, and the signal that any has got, or 0 (collective)."""
+        """Return whether a checkpoint is due, and the greatest signal of any rank, or 0 (collective)."""
         own = 2 * Stop.signal + due
         greatest = self.comm.allreduce(own, MPI.MAX) if self.comm.size > 1 else own
         return bool(greatest), greatest // 2

@@ -147,7 +147,7 @@ class RunRequest:
 
     @property
     def command(self) -> str:
-        """Return the command that asks for the same, as the result file and ``--measure`` record it."""
+        """Return the command that asks for the same, as result files and ``--measure`` have it."""
         words = ["msmpetsc", "run", *([str(self.file)] if self.file else [])]
         for name, option in OPTIONS.items():
             value = getattr(self, name)

@@ -35,7 +35,7 @@ OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that ma
 
 
 def earlier_run(comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool) -> Earlier | None:
-    """Return the run that wrote the file to be resumed, None to run from the start (collective). Raises InputError.
+    """Return the run that is to be resumed, None to run from the start (collective). Raises InputErr
 
     may_start : whether there is a scene to start from, where there is no such file yet
     """
@@ -51,7 +51,7 @@ def earlier_run(comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: b
 
 
 def kept_options(earlier: Earlier, given: Sequence[str]) -> list[str]:
-    """Return PETSc's options of the earlier run, as words, that have an effect on results and are not given again.
+    """Return the earlier run's options of PETSc that affect results and are not given again, as words.
 
     Raises InputError for one that could do more than choose a solver: the file may be from anywhere.
     """
@@ -105,7 +105,7 @@ class Resumed:
     """
 
     def __init__(self, earlier: Earlier, scene: Scene, options: dict[str, str], force: bool):
-        """Compare it with the scene and PETSc's options of this run. Raises InputError for what may not differ."""
+        """Compare scenes and PETSc's options. Raises InputError for what may not differ."""
         self.earlier = earlier
         self.force = force
         self.stored = scene.stored

@@ -73,7 +73,7 @@ def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None,
 
 
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
-    """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
+    """Read the scene. Raises InputError for what can be refused before there is a model (collective)."""
     refuse_early(comm)
     choose(comm, request.device)
     began = perf_counter()
@@ -126,7 +126,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
 
 
 def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) -> int:
-    """Write what stands beside the result and say how the run ended; return the exit status (collective).
+    """Write what stands beside the result, say how it ended, and return the exit status (collective).
 
     Raises the StepFailed that ended the run.
     """
@@ -200,7 +200,8 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
 
 def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
     """Open the file to write into: a new one, or that of the run that goes on (collective)."""
-    request, attributes = plan.request, attributes_of(comm, plan.scene, plan.request)
+    request = plan.request
+    attributes = attributes_of(comm, plan.scene, request)
     if plan.resumed:
         return plan.resumed.file(comm, attributes, request.gather)
     begin = Begin.OVERWRITE if request.overwrite else Begin.NEW

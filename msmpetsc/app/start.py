@@ -1,4 +1,4 @@
-"""What Python and the command line start: PETSc gets its options, and only then what needs it is imported."""
+"""The start of runs: PETSc gets its options, and only then what needs it is imported."""
 
 import inspect
 import logging
@@ -32,7 +32,7 @@ ON_A_GPU = ("-mat_type", "aijcusparse")
 
 
 def asked_by(request: Callable[P, object]) -> Callable[[Callable[..., T]], Callable[P, T]]:
-    """Return a decorator that gives a function the arguments of a request, and its help what is said of each."""
+    """Return a decorator that gives a function the arguments of a request, and their help."""
 
     def decorate(function: Callable[..., T]) -> Callable[P, T]:
         signature = inspect.signature(request).replace(return_annotation=function.__annotations__["return"])
@@ -48,7 +48,7 @@ def asked_by(request: Callable[P, object]) -> Callable[[Callable[..., T]], Calla
 def run(*values: Any, **keywords: Any) -> Path:
     """Run a scene as ``msmpetsc run`` does, and return the path of its result (collective).
 
-        path = msmpetsc.run("scene.toml", "out/scene.h5", frames=10, set={"material.density": 900.0})
+        path = msmpetsc.run("scene.toml", "out/x.h5", frames=10, set={"material.density": 900.0})
 
     Raises InputError and StepFailed on all ranks. Stopped by a signal, the run leaves a file that resume="OUT.h5"
     takes up, and raises what Python raises there: KeyboardInterrupt for SIGINT, SystemExit for SIGTERM.
@@ -101,7 +101,7 @@ def frames(
     device: str | None = None,
     petsc_options: str | Mapping[str, Any] = "",
 ) -> Iterator[Frame]:
-    """Yield the frames of a scene, frame 0 first, and write no file; the arguments are those of ``Simulation``.
+    """Yield the frames of a scene, frame 0 first, and write no file; see ``Simulation``.
 
     for frame in msmpetsc.frames("scene.toml", set={"material.young_modulus": 2e5}):
         print(frame.time, frame.position[:, 2].max())
@@ -110,7 +110,7 @@ def frames(
 
 
 class Simulation:
-    """A scene that is run as often as one likes, on all ranks; its lattice is built anew only when it has to be.
+    """A scene that is run again and again, on all ranks; its lattice is built anew where it must be.
 
     simulation = msmpetsc.Simulation("scene.toml")
     for modulus in (1e5, 2e5, 4e5):
@@ -120,7 +120,7 @@ class Simulation:
     material, loads, starts and times may change from run to run.
 
     scene : as it was given
-    model : of the run begun last: its lattice, embedding, and on rank 0 its surface; None before the first
+    model : of the run begun last: lattice, embedding, on rank 0 the surface; None before the first
     """
 
     def __init__(self, scene: Source, *, device: str | None = None, petsc_options: str | Mapping[str, Any] = ""):
@@ -128,7 +128,7 @@ class Simulation:
 
         scene         : a file's path, tables as in a file, or a Scene
         device        : "cpu" or "cuda"; cuda is -mat_type aijcusparse
-        petsc_options : "-ksp_rtol 1e-3 -ksp_view", or {"ksp_rtol": 1e-3, "ksp_view": None}, for its runs alone
+        petsc_options : for its runs alone: "-ksp_rtol 1e-3", or {"ksp_rtol": 1e-3, "ksp_view": None}
 
         Raises InputError.
         """
@@ -146,10 +146,10 @@ class Simulation:
         """Yield the frames of a run from the start, frame 0 first (collective).
 
         frames : stop after so many steps
-        set    : changes of the scene for this run: {"material.young_modulus": 2e5, "solver.preset": "newton"}
+        set    : changes of the scene for this run: {"time.step": 1e-3, "solver.preset": "newton"}
 
-        Each frame has this rank's rows, which are the caller's own. Leaving the loop early ends the run; all ranks
-        must leave it at the same frame. Raises InputError at once, and while it runs StepFailed, on all ranks.
+        Each frame has this rank's rows, the caller's own. To leave the loop early ends the run; all
+        ranks must do so at the same frame. Raises InputError at once, and StepFailed, on all ranks.
         """
         scene = self.scene.changed(set or {})
         if frames is not None:
@@ -167,7 +167,7 @@ class Simulation:
                     frame = next(steps, None)
                 if frame is None:
                     return
-                yield replace(frame, position=frame.position.copy())  # the next step starts from these numbers
+                yield replace(frame, position=frame.position.copy())  # the next step needs these
 
     def _begin(self, scene: Scene, until_the_end: ExitStack) -> Iterator[Frame]:
         """Build what the run needs, or keep it, and return its steps (collective)."""

@@ -1,4 +1,4 @@
-"""What a run says on stderr, from bodies and counts to the files it leaves; and what it cost, for ``--measure``."""
+"""What a run says on stderr, from bodies and counts to the files it leaves; and what it cost."""
 
 import json
 import platform

@@ -1,4 +1,4 @@
-"""A CUDA GPU: what is missing for one, and arrays in its memory; backend.launcher has threads on it.
+"""A CUDA GPU: what is missing for one, and arrays in its memory.
 
 CuPy and numba's CUDA target are imported by those alone who ask for a GPU: a CPU's run needs neither.
 """

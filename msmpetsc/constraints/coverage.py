@@ -1,4 +1,4 @@
-"""The nodes that pins, anchors and forces of a scene reach, and which of them do nothing or not what they say.
+"""The nodes that anchors and forces take, and which of them do nothing or not what they say.
 
 What could not have any effect at all is refused; what is overruled in part is warned of.
 """
@@ -22,7 +22,7 @@ Regions = Mapping[str, Mask]  # the table's key in the scene, "pin.0" -> its loc
 
 
 def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions) -> tuple[str, ...]:
-    """Return what each anchor and force of a scene takes, in words; warn of what is overruled (collective).
+    """Return what anchors and forces take, in words; warn of what is overruled (collective).
 
     lattice : with its pins
     anchors : each with the nodes that it leads, those of its region aside that a pin or an earlier anchor has
@@ -45,7 +45,7 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
                 f"{table.key} moves nothing: of the {_nodes(nodes)} in its region none is free while it "
                 "acts, pins and anchors hold all"
             )
-        words.append(f"{table.key} pulls {nodes} nodes" + (f" ({held} of them held)" if held else ""))
+        words.append(f"{table.key} pulls {nodes} nodes" + f" ({held} of them held)" * bool(held))
     return tuple(words)
 
 

@@ -1,4 +1,4 @@
-"""Pins and anchors: the nodes that each holds, what their edges cut, and their forces and torques on the body.
+"""Pins and anchors: the nodes that each holds, what their edges cut, and their reactions.
 
 Springs, and cells of a solid, that the edge of a clamp cuts: a pin holds nodes, but its region ends between them. Of a
 spring from a free node to a held one a part theta is free, and only that gives: it is 1 / theta as stiff. Where the
@@ -76,7 +76,7 @@ def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
 
 
 def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions) -> Lattice:
-    """Return the lattice with the springs, or the cells, that pins, and anchors that never let go, cut.
+    """Return the lattice with the springs, or cells, cut by pins and by anchors that never let go.
 
     points : (l, 3) of the bodies that nodes are nearest to [m]
     """
@@ -121,7 +121,7 @@ def _with_cut_cells(lattice: Lattice, held: Mask, stiffer: Callable[[Indices, In
 
 
 def _free_part(within: Within, start: Positions, end: Positions) -> Floats:
-    """Return which part (n,) of the way from ``start`` to ``end`` (n, 3) lies before what is ``within``.
+    """Return which part (n,) of the way from start to end (n, 3) lies before what is ``within``.
 
     It is LEAST at least, and 1 where the way does not lead in from outside.
     """

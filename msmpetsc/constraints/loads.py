@@ -16,7 +16,7 @@ from msmpetsc.scene.values import Vector
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-SAME = 1e-12  # relative: a number of steps may come out a little less than the time it was meant to be
+SAME = 1e-12  # relative: a number of steps may come out a little less than the time meant
 
 
 def within(time: float, start: float, stop: float | None) -> bool:
@@ -57,7 +57,7 @@ class Motion(Lines):
 
 @dataclass(frozen=True)
 class RigidMotion(Lines):
-    """Displacements [m] and turns [rad], rotation vectors, side by side (k, 6); none at time 0, the first.
+    """Displacements [m] and rotation vectors [rad], side by side (k, 6); none at time 0, the first.
 
     center : (3,) about which it turns [m], at rest
     """
@@ -71,7 +71,7 @@ class RigidMotion(Lines):
         return cls(np.array([time for time, _ in stops]), np.array([pose for _, pose in stops]), center)
 
     def moved(self, x: Positions, pose: Floats) -> Positions:
-        """Return where points x (n, 3) [m] are in a pose (6,): c + R (x - c) + by, R of Rodrigues' formula."""
+        """Return where points x (n, 3) [m] are in a pose (6,): c + R (x - c) + by."""
         by, turn = like(x, pose[:3]), pose[3:]
         if not turn.any():
             return x + by

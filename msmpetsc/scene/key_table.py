@@ -1,4 +1,4 @@
-"""The keys of a scene as a table, out of its schema: default, range and meaning of each, with its unit."""
+"""The keys of a scene as a table, out of its schema: default, range, meaning and unit of each."""
 
 import re
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ class SceneKey(NamedTuple):
 
 
 class WithoutNull(GenerateJsonSchema):
-    """A JSON schema without null, which TOML has not: a key that may be absent is of its kind alone."""
+    """A JSON schema without null, which TOML lacks: a key that may be absent is of its kind alone."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
         """Return the schema of the kind alone."""
@@ -48,7 +48,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def keys(prefix: str = "") -> list[SceneKey]:
-    """Return all keys, or those of a table or the one of this name. Raises InputError where there is none."""
+    """Return all keys, or those of a table or of this name. Raises InputError where there is none."""
     schema = json_schema()
     every = list(_keys(schema, schema, ""))
     wanted = NUMBERED.sub("", prefix)

@@ -27,7 +27,7 @@ class Twist(Table):
 
 
 class Start(Table):
-    """How the body is at time 0, if not at rest in its rest shape; scale, twist, scatter in this order.
+    """How the body is at time 0, if not at rest in its rest shape: scaled, twisted, then scattered.
 
     Nodes that are pinned or led stay where they are.
     """

@@ -18,7 +18,7 @@ from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 MESHES = (".ply", ".mz3", ".vtu", ".vtk", ".obj", ".stl", ".off", ".glb", ".gltf")  # those of geometry/readers.py
-Changes = Mapping[str, Any] | Iterable[str]  # {"cages.count": 3000}, or words of --set: ["cages.count=3000"]
+Changes = Mapping[str, Any] | Iterable[str]  # {"cages.count": 3000}, or ["cages.count=3000"]
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
 
 
@@ -28,7 +28,7 @@ class Scene(SceneFile):
         scene = msmpetsc.Scene.load("scenes/bunny_fall.toml", {"cages.count": 3000})
         softer = scene.changed({"material.young_modulus": 2e4})
 
-    Changes are those of ``--set``: any key of a scene, items of lists by their numbers ("pin.0.region").
+    Changes are those of ``--set``: any key of a scene, items of lists by number ("pin.0.region").
     """
 
     text: str = Field("", description="the TOML text, overrides included")
@@ -41,13 +41,14 @@ class Scene(SceneFile):
 
     @classmethod
     def of(cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Changes = ()) -> "Scene":
-        """Make a scene of tables as its file would have them: {"mesh": {"source": "body.obj"}, ...}.
+        """Make a scene of tables as a file would have them: {"mesh": {"source": "body.obj"}, ...}.
 
         folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
 
         Raises InputError naming every problem, one a line.
         """
-        path, data = Path(folder) / "scene", plain(tables)
+        path = Path(folder) / "scene"
+        data = plain(tables)
         keys = {_override(data, override): override for override in overrides_of(changes)}
         checked = _checked(path, data, "", keys)
         try:
@@ -137,7 +138,7 @@ def lies_below(folder: Path, name: str) -> bool:
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # whoever opens it says so
             path.resolve(strict=True)  # from Python 3.13 on a loop of links is an error only so
         return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a name too long
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a long name
         return False
 
 
@@ -149,7 +150,7 @@ def _read(path: Path, kind: str) -> str:
             content = file.read(LONGEST + 1)
         if len(content) > LONGEST:
             raise InputError(f"{path}: is too long for a {kind} file: more than {LONGEST / 2**20:g} MiB")
-        return content.decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
+        return content.decode("utf-8-sig")  # -sig: some editors begin with a byte order mark
     except FileNotFoundError:
         raise InputError(f"{path}: no such {kind} file") from None
     except IsADirectoryError:

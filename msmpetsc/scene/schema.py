@@ -59,7 +59,7 @@ class Output(Table):
 
 
 class BudgetTable(Table):
-    """The surface error that a plan expects: rms over surface and time, of the largest displacement."""
+    """The surface error that a plan expects: rms over surface and time, of the greatest motion."""
 
     target: Positive = Field(description="asked for [-]")
     cells: NotNegative = Field(description="of the cells [-]")
@@ -124,7 +124,7 @@ class SceneFile(Table):
         return self.stored_until(self.time.steps)
 
     def stored_until(self, step: int) -> int:
-        """Return the number of frames of the first steps: one for every ``every``-th and for the last."""
+        """Return the number of frames of the first steps: of every ``every``-th and of the last."""
         every = self.output.every
         return 1 + (-(-step // every) if step == self.time.steps else step // every)
 

@@ -60,7 +60,7 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
 
 
 def _moving(scene: Any) -> Iterator[Broken]:
-    """Yield the rules that a scene of statics breaks by what moves, goes by the state, bounces or rubs."""
+    """Yield the rules that a scene of statics breaks by what moves, depends on motion or rubs."""
     if scene.material.damping:
         words = f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves'
         yield "time", rule(words, "material")

@@ -44,7 +44,7 @@ def toml_value(value: Any) -> str:
 
 
 def overrides_of(changes: Mapping[str, Any] | Iterable[str]) -> list[str]:
-    """Return changes {"cages.count": 3000} as words of ``--set``: "cages.count=3000"; words as they are."""
+    """Return changes {"cages.count": 3000} as words of ``--set``, "cages.count=3000"; or the words."""
     if isinstance(changes, Mapping):
         return [f"{key}={toml_value(value)}" for key, value in changes.items()]
     return [changes] if isinstance(changes, str) else list(changes)

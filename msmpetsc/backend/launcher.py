@@ -19,11 +19,12 @@ from typing import Any
 import cupy
 import numba
 import numpy as np
-from numba import cuda
+from numba import cuda as untyped
 
 from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import MsmpetscError
 
+cuda: Any = untyped
 THREADS = 128  # of a block: registers, not their number, bound the kernels that look at all neighbours of a node
 KEPT = 4096  # descriptions of arrays
 SCALARS = {bool: "?7x", int: "q", float: "d"}  # as the driver takes them (struct): each in eight bytes of its own
@@ -124,16 +125,16 @@ def ptx_of(body: Callable[..., None], kinds: tuple[str, ...], capability: tuple[
     """Return the PTX of a body for arguments of these kinds."""
     arguments = numba.types.Tuple([type_of(kind) for kind in kinds])  # type: ignore[no-untyped-call]
     signature = numba.types.void(numba.types.int64, arguments)
-    ptx, _ = cuda.compile_ptx(kernel_of(body), signature, cc=capability)  # type: ignore[attr-defined,no-untyped-call]
+    ptx, _ = cuda.compile_ptx(kernel_of(body), signature, cc=capability)
     return str(ptx)
 
 
 def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
     """Return the kernel of a body: it takes a count and the tuple of the further arguments."""
-    inlined = cuda.jit(device=True)(body)  # type: ignore[no-untyped-call]
+    inlined = cuda.jit(device=True)(body)
 
     def threads(count: int, arguments: tuple[Any, ...]) -> None:
-        inlined(cuda.grid(1), count, cuda.gridsize(1), *arguments)  # type: ignore[attr-defined,call-arg]  # numba's
+        inlined(cuda.grid(1), count, cuda.gridsize(1), *arguments)
 
     return threads
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what FROM says, for type checkers
-    from msmpetsc.app.simulation import Simulation as Simulation
-    from msmpetsc.app.simulation import frames as frames
+    from msmpetsc.app.start import Simulation as Simulation
+    from msmpetsc.app.start import frames as frames
     from msmpetsc.app.start import run as run
     from msmpetsc.extensions import register_force as register_force
     from msmpetsc.extensions import register_obstacle as register_obstacle
@@ -16,17 +16,20 @@ if TYPE_CHECKING:  # what FROM says, for type checkers
     from msmpetsc.results.reader import Result as Result
     from msmpetsc.scene.reading import Scene as Scene
 
+    open = Result
+
 __version__ = "0.2.0"
 FROM = {  # what is imported when it is first used: reading a result needs numpy and h5py alone
-    "Frame": "msmpetsc.fields",
-    "Result": "msmpetsc.results.reader",
-    "Scene": "msmpetsc.scene.reading",
-    "Simulation": "msmpetsc.app.simulation",
-    "frames": "msmpetsc.app.simulation",
-    "register_force": "msmpetsc.extensions",
-    "register_obstacle": "msmpetsc.extensions",
-    "register_preset": "msmpetsc.extensions",
-    "run": "msmpetsc.app.start",
+    "Frame": "msmpetsc.fields.Frame",
+    "Result": "msmpetsc.results.reader.Result",
+    "Scene": "msmpetsc.scene.reading.Scene",
+    "Simulation": "msmpetsc.app.start.Simulation",
+    "frames": "msmpetsc.app.start.frames",
+    "open": "msmpetsc.results.reader.Result",
+    "register_force": "msmpetsc.extensions.register_force",
+    "register_obstacle": "msmpetsc.extensions.register_obstacle",
+    "register_preset": "msmpetsc.extensions.register_preset",
+    "run": "msmpetsc.app.start.run",
 }
 
 
@@ -38,8 +41,9 @@ def __getattr__(name: str) -> Any:
 
     from msmpetsc.errors import as_expected
 
+    module, _, attribute = FROM[name].rpartition(".")
     try:
-        return getattr(import_module(FROM[name]), name)
+        return getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
         raise as_expected(error) or error from None
 
@@ -50,7 +54,7 @@ def __dir__() -> list[str]:
 
 
 def _kernel_folder() -> Path:
-    """A folder for the compiled kernels of just these sources.
+    """Return a folder for the compiled kernels of just these sources.
 
     numba looks for changes in a kernel's own file alone, not in those of the kernels it calls:
     after an update it would go on with parts of the old version.
@@ -62,16 +66,3 @@ def _kernel_folder() -> Path:
 
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported
-
-
-def open(path: str | Path) -> "Result":
-    """Open a result file to read its frames, lattice, surface, embedding and scene; needs h5py and numpy alone.
-
-        with msmpetsc.open("out/bunny_fall.h5") as run:
-            last = run.frames.position[-1]
-
-    Raises InputError, one line, if the file is no result, or damaged.
-    """
-    from msmpetsc.results.reader import Result  # late: the package itself stays quick to import
-
-    return Result(path)

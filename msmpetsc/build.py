@@ -9,10 +9,9 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.constraints.clamp import clamped
-from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
+from msmpetsc.constraints.coverage import Regions, taken
+from msmpetsc.constraints.holders import Holders, clamped
 from msmpetsc.constraints.loads import Anchor, Load, OwnForce, RigidMotion, spread_by_mass, total_of
-from msmpetsc.constraints.reactions import Holders
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles
@@ -41,7 +40,7 @@ from msmpetsc.scene.reading import Scene
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
-INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
+INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold only
 USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 
 
@@ -59,7 +58,8 @@ class Model:
     collision : the surface that meets itself, where it does
     obstacles : in the scene's order
     holders   : pins and anchors, and which nodes each has
-    bodies, reaches : what the first lines of a run say of the surfaces, and of pins, anchors and forces
+    bodies    : surfaces, and what all ranks know of them
+    taken     : what anchors and forces take, in words
     """
 
     surface: Surface | None
@@ -72,7 +72,7 @@ class Model:
     start: InitialState
     collision: CollisionSurface | None = None
     bodies: tuple[BodySurface, ...] = ()
-    reaches: tuple[Reach, ...] = ()
+    taken: tuple[str, ...] = ()
     damping: float = 0.0
     retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
@@ -81,13 +81,13 @@ class Model:
 
     @property
     def body_of_point(self) -> Indices:
-        """Number (v,) of the body of each surface point, on rank 0."""
+        """Return the number (v,) of the body of each surface point, on rank 0."""
         points = [0 if body.surface is None else len(body.surface.points) for body in self.bodies]
         return np.repeat(np.arange(len(points)), points)
 
     @cached_property
     def solids(self) -> dict[int, Surface]:
-        """Surfaces of obstacles that are meshes or functions, by their numbers, on rank 0 (collective at first)."""
+        """Return the surfaces of obstacles that are meshes or functions, by number, on rank 0 (collective at first)."""
         solids = {number: obstacle.solid for number, obstacle in enumerate(self.obstacles)}
         drawn = {number: solid for number, solid in solids.items() if isinstance(solid, DistanceSolid)}
         if not drawn:
@@ -118,7 +118,7 @@ class Geometry:
 
     @cached_property
     def embedding(self) -> Embedding:
-        """How the surfaces follow the nodes (collective)."""
+        """Return how the surfaces follow the nodes (collective)."""
         points = [np.empty((0, 3)) if body.surface is None else body.surface.points for body in self.bodies]
         _, _, cages = self.source
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
@@ -164,14 +164,14 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
-    points = shape.nearest(lattice) if any(any(scene.tables(kind)) for kind in NODES) else lattice.nodes
-    masks = regions(scene, lattice, finder, points)
+    tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
+    points = shape.nearest(lattice) if tables else lattice.nodes
+    masks = {table.key: finder.find(table, lattice, points) for table in tables}
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
-    reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -188,7 +188,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
         collision=collision_surface(scene.self_contact, scene, bodies, cages, lattice) if scene.self_contact else None,
-        reaches=reaches,
+        taken=taken(comm, scene, lattice, anchors, masks),
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),
@@ -222,7 +222,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 
 
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
-    """Return the prepared surfaces on rank 0, and on all ranks what they need to know of them (collective)."""
+    """Return the prepared surfaces, on rank 0, and what all ranks need to know of them (collective)."""
 
     def read() -> tuple[list[Surface], list[tuple[SurfaceReport, Rows]]]:
         surfaces, reports = zip(*_prepared(scene), strict=True)
@@ -236,7 +236,7 @@ def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
 
 
 def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
-    """Yield the surface of each body with its report, checked; bodies of one shape are prepared once."""
+    """Yield each body's surface and report, checked; bodies of one shape are prepared once."""
     shapes: dict[str, Surface] = {}
     for path, mesh in scene.meshes.items():
         whose = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
@@ -252,7 +252,7 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
             raise InputError(f"{whose}{error}") from error
         for warning in warnings:
             log.warning("%s%s: %s", whose, mesh.source, warning)
-        yield compact(surface.points, surface.triangles), report  # a point of no triangle may lie in no cell
+        yield compact(surface.points, surface.triangles), report  # such a point may lie in no cell
 
 
 def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
@@ -292,7 +292,7 @@ def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
 
 
 def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders) -> list[Anchor]:
-    """Return the anchors: a pin is stronger than an anchor, and of two anchors on a node the first."""
+    """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first."""
     anchors = []
     taken = lattice.pinned
     for anchor in tables:
@@ -313,8 +313,10 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, a
 def _loads(
     comm: MPI.Comm, gravity: Gravity | None, forces: Iterable[OfBody], lattice: Lattice, masks: Regions
 ) -> tuple[list[Load], tuple[OwnForce, ...]]:
-    """Return the forces, and those that are functions. Raises InputError for a function's name that is neither
-    registered nor installed."""
+    """Return the forces, and those that are functions.
+
+    Raises InputError for a function's name that is neither registered nor installed.
+    """
     loads, own_forces = [], []
     if gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(gravity.acceleration), 0.0, None))

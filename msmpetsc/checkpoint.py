@@ -1,7 +1,7 @@
 """State of a run, which a file holds: positions, velocities, and what the run has counted so far.
 
-What solvers know of the steps before is no part of it. A run forgets that wherever a checkpoint may be
-(solve.simulate), so that the one that goes on and the one that is resumed are the same to the last bit.
+What solvers know of the steps before is no part of it. A run forgets that wherever a checkpoint
+may be (solve.simulate), so that one that goes on and one that is resumed are the same bit by bit.
 """
 
 import math
@@ -13,12 +13,13 @@ from typing import Any, Protocol
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 
 MOST = 1e60  # of any number: its fourth power is still finite
 MOST_COUNT = 2**53  # the whole numbers that a double holds
-AT_REST = "Rest.has_come"  # number of a run that ends at rest (time.until): whether it has come there
+AT_REST = "Rest.has_come"  # number of a run that ends at rest (time.until): whether it has
 Range = tuple[float, float]
 COUNT: Range = (0, MOST_COUNT)
 ANY: Range = (-math.inf, math.inf)
@@ -27,8 +28,10 @@ LENGTH: Range = (0.0, sys.float_info.max)
 
 
 class Counting(Protocol):
-    """A part of a run that counts: its ``state`` names the attributes, numbers or dataclasses of
-    numbers, that a checkpoint holds, and the range of each."""
+    """A part of a run that counts.
+
+    state : names of its attributes, numbers or dataclasses of numbers, that a checkpoint holds, and the range of each
+    """
 
     @property
     def state(self) -> dict[str, Range]: ...
@@ -45,7 +48,7 @@ def _numbers(part: Counting) -> Iterator[tuple[str, Any]]:
 
 @dataclass
 class Checkpoint:
-    """After ``step`` steps. Empty, it is what a run begins with.
+    """The state of a run after ``step`` steps; empty, it is what a run begins with.
 
     rows    : by name, what there is of each node, this rank's owned ones: (owned, 3) or (owned,); q and q_previous
         [m] among them
@@ -53,10 +56,10 @@ class Checkpoint:
     """
 
     step: int = 0
-    rows: dict[str, np.ndarray] = field(default_factory=dict)
+    rows: dict[str, Array] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
 
-    def keep(self, rows: dict[str, np.ndarray] | None = None, numbers: dict[str, float] | None = None) -> None:
+    def keep(self, rows: dict[str, Array] | None = None, numbers: dict[str, float] | None = None) -> None:
         """Store a part's rows and numbers."""
         self.rows |= rows or {}
         self.numbers |= numbers or {}
@@ -66,32 +69,32 @@ class Checkpoint:
         self.keep(numbers=dict(_numbers(part)))
 
     def restore_counts(self, part: Counting) -> None:
-        """Give a part its numbers, those that are stored. Raises InputError for what no run can have had."""
-        stored = {name: self._like(name, value, part) for name, value in _numbers(part)}
-        for attribute in part.state:
-            value, begin = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
+        """Give a part its stored numbers. Raises InputError for what no run can have had."""
+        for attribute, bounds in part.state.items():
+            value, name = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
             if is_dataclass(value) and not isinstance(value, type):
-                setattr(part, attribute, replace(value, **{name: stored[f"{begin}.{name}"] for name in vars(value)}))
+                inner = {each: self._like(f"{name}.{each}", number, bounds) for each, number in vars(value).items()}
+                setattr(part, attribute, replace(value, **inner))
             else:
-                setattr(part, attribute, stored[begin])
+                setattr(part, attribute, self._like(name, value, bounds))
 
-    def _like(self, name: str, value: Any, part: Counting) -> Any:
-        """The number of a name, of the kind that ``value`` is."""
+    def _like(self, name: str, value: Any, bounds: Range) -> Any:
+        """Return the number of a name, of the kind that ``value`` is."""
         if isinstance(value, float) and math.isnan(value):  # it may be unknown
             return self.numbers.get(name, value)
-        least, most = part.state[name.split(".")[1]]
+        least, most = bounds
         if isinstance(value, int):
             least, most = max(least, -MOST_COUNT), min(most, MOST_COUNT)
         return type(value)(self.number(name, value, least, most))
 
-    def row(self, name: str) -> np.ndarray:
-        """Raises InputError where there is none."""
+    def row(self, name: str) -> Array:
+        """Return the rows of a name. Raises InputError where there are none."""
         if name not in self.rows:
             raise InputError(f"the checkpoint is damaged: it lacks {name}")
         return self.rows[name]
 
     def number(self, name: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
-        """Raises InputError for one that no run can have had."""
+        """Return the number of a name. Raises InputError for one that no run can have had."""
         value = self.numbers.get(name, default)
         if not least <= value <= most:
             raise InputError(f"the checkpoint is damaged: {name} is {value:g}")

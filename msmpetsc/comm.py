@@ -1,4 +1,4 @@
-"""Ranks together: what rank 0 reads all know, what fails on any fails on all, rows travel to their owners."""
+"""Ranks together: what rank 0 reads all know, what fails on any fails on all, rows go to owners."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.errors import MsmpetscError, as_expected
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ T = TypeVar("T")
 
 @contextmanager
 def together(comm: MPI.Comm) -> Iterator[None]:
-    """Raise on all ranks the first rank's MsmpetscError, if any rank has one or lacks memory (collective).
+    """Raise on all ranks the first rank's MsmpetscError, or lack of memory, if any (collective).
 
     Nothing collective may stand in the block: a rank that fails leaves it early.
     """
@@ -37,7 +38,7 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
-    """Call ``function`` on rank 0 only; its error is everyone's. Returns its value there, None elsewhere."""
+    """Call a function on rank 0 only; its error is everyone's. Returns its value; None elsewhere."""
     value = None
     with together(comm):
         if comm.rank == 0:
@@ -57,30 +58,30 @@ class Stop:
 
 
 class Route:
-    """A way of rows to the ranks named for them (Alltoallv), and of answers back in the rows' own order.
+    """A way of rows to the ranks named for them (Alltoallv), and of answers back in their order.
 
     destination : (n,) rank of each row
     """
 
-    def __init__(self, comm: MPI.Comm, destination: np.ndarray):
+    def __init__(self, comm: MPI.Comm, destination: Indices):
         self.comm = comm
         self.order = np.argsort(destination, kind="stable")
         self.sent = np.bincount(destination, minlength=comm.size).astype(np.int64)
         self.received = np.empty_like(self.sent)
         comm.Alltoall(self.sent, self.received)
 
-    def send(self, rows: np.ndarray) -> np.ndarray:
-        """Send rows; return those that all ranks sent to this one, by sending rank and then in its order."""
+    def send(self, rows: Array) -> Array:
+        """Send rows; return those that all ranks sent to this one, by rank and then in its order."""
         return self._alltoall(np.asarray(rows)[self.order], self.sent, self.received)
 
-    def answer(self, rows: np.ndarray) -> np.ndarray:
+    def answer(self, rows: Array) -> Array:
         """Send answers to the rows that ``send`` returned; return those to this rank's own rows, in their order."""
         back = self._alltoall(np.asarray(rows), self.received, self.sent)
         answers = np.empty_like(back)
         answers[self.order] = back
         return answers
 
-    def _alltoall(self, rows: np.ndarray, out_counts: np.ndarray, in_counts: np.ndarray) -> np.ndarray:
+    def _alltoall(self, rows: Array, out_counts: Indices, in_counts: Indices) -> Array:
         from mpi4py import MPI  # late: what draws results has none
 
         rows = np.ascontiguousarray(rows)
@@ -95,7 +96,7 @@ class Route:
         return result
 
 
-def starts(counts: np.ndarray) -> np.ndarray:
+def starts(counts: Indices) -> Indices:
     """Return where each part begins when parts of these sizes follow each other."""
     return np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int64)
 
@@ -114,7 +115,7 @@ class SortedKeys:
     total : number of keys on all ranks
     """
 
-    def __init__(self, comm: MPI.Comm, keys: np.ndarray):
+    def __init__(self, comm: MPI.Comm, keys: Indices):
         self.comm = comm
         keys = np.unique(np.asarray(keys, np.int64))
         step = max(1, comm.allreduce(len(keys)) // (comm.size * SAMPLES))
@@ -128,28 +129,28 @@ class SortedKeys:
         self.first = int(self.first_of_rank[comm.rank])
         self.total = int(counts.sum())
 
-    def owner(self, keys: np.ndarray) -> np.ndarray:
+    def owner(self, keys: Indices) -> Indices:
         """Return the rank that holds each key, or would hold it."""
         return np.searchsorted(self.splitters, keys, side="right")
 
-    def owner_of_index(self, index: np.ndarray) -> np.ndarray:
+    def owner_of_index(self, index: Indices) -> Indices:
         """Return the rank that holds each global index."""
         last_start = np.append(self.first_of_rank[1:], self.total)
         return np.searchsorted(last_start, index, side="right")
 
-    def find(self, keys: np.ndarray) -> np.ndarray:
+    def find(self, keys: Indices) -> Indices:
         """Return the global index of each key, -1 where there is none (any shape; collective)."""
         wanted, inverse = np.unique(np.asarray(keys, np.int64), return_inverse=True)
         route = Route(self.comm, self.owner(wanted))
         index = route.answer(self._index(route.send(wanted)))
         return index[inverse].reshape(np.shape(keys))
 
-    def rows_of(self, keys: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def rows_of(self, keys: Indices, rows: Array) -> Array:
         """Return the row of each key (k,), all of which there are; ``rows`` go with this rank's keys (collective)."""
         route = Route(self.comm, self.owner(keys))
         return route.answer(rows[self._index(route.send(keys)) - self.first])
 
-    def _index(self, keys: np.ndarray) -> np.ndarray:
+    def _index(self, keys: Indices) -> Indices:
         if len(self.keys) == 0:
             return np.full(len(keys), -1, np.int64)
         slot = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)

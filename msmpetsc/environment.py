@@ -58,7 +58,7 @@ class Environment:
     def begin_step(self, q: Positions, v: Rows, time: float) -> None:
         """Evaluate the forces that are functions, at the state (l, 3) [m], [m/s] that starts a step; they then stay.
 
-        So a step is explicit in them: they are of first order in its length, whatever the integrator.
+        So a step is explicit in them: they are of first order in its length, with any integrator.
         """
         owned = self.lattice.owned
         for number, force in enumerate(self.own_forces):
@@ -106,7 +106,7 @@ class Environment:
     def prescribed(self, q: Positions, time: float, begin: float = 0.0, share: float = 1.0) -> Positions | None:
         """Return q with the anchored nodes where they will be; None if there are none.
 
-        begin, share : they have made but this share of their path from ``begin`` [s] to ``time`` [s]
+        begin, share : they have made but this share of their path from begin [s] to ``time`` [s]
         """
         anchors = self.anchors_at(time)
         if not anchors:
@@ -122,7 +122,7 @@ class Environment:
         def at(time: float) -> list[Any]:
             loads = [load.state_at(time) for load in self.pulling]
             anchors = [anchor.holds_at(time) and tuple(anchor.path.value_at(time)) for anchor in self.anchors]
-            obstacles = [o.acts_at(time) and tuple(o.path.displacement_at(time)) for o in self.obstacles]
+            obstacles = [o.acts_at(time) and tuple(o.path.value_at(time)) for o in self.obstacles]
             return [*loads, *anchors, *obstacles]
 
         return at(begin) == at(end)
@@ -151,7 +151,7 @@ class Environment:
         return sides
 
     def same_push(self, q: Positions, time: float, sides_a: Indices, sides_b: Indices) -> bool:
-        """Return whether penalties press on this rank's nodes at q just the same with either sides (o, l)."""
+        """Return whether penalties press on this rank's nodes at q alike with either sides (o, l)."""
         rows = q[: self.lattice.owned]
         states = zip(self._states(time, sides_a), self._states(time, sides_b), strict=True)
         return all(
@@ -161,7 +161,7 @@ class Environment:
     def contact(
         self, q: Positions, end: Positions, time: float, time_step: float, sides: Indices | None, last: Positions | None
     ) -> Contact | None:
-        """Return what presses in the step from q to about ``end``, friction included; None if nothing does.
+        """Return what presses in the step from q to about ``end``, with friction; None if nothing does.
 
         last : (l, 3) [m] positions one step before q, of a step that looks back to them
         """
@@ -184,7 +184,7 @@ class Environment:
         return self._contacts.touch(q) if self._contacts else Touch()
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
-        """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""
+        """Return what presses at a time, without friction; None if nothing does."""
         states = self._states(time, sides)
         return Contact(states, self.lattice.owned) if states else None
 
@@ -194,7 +194,7 @@ class Environment:
     def apply_friction(
         self, nodes: Movers, time: float, duration: float, substep: tuple[float, float], sides: Indices
     ) -> None:
-        """Apply friction of obstacles as they stand at a time, for a ``duration`` [s], to this rank's nodes.
+        """Apply friction of obstacles at a time, for a ``duration`` [s], to this rank's nodes.
 
         substep : its begin and end [s], between which an obstacle carries along what it holds
         """
@@ -206,7 +206,7 @@ class Environment:
                 apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
 
     def contact_stiffness_bound(self, q: Positions, speed: float, start: float, time: float, sides: Indices) -> Floats:
-        """Return (owned,) [N/m] no less than what obstacles add to a node's stiffness from start to ``time``.
+        """Return a bound (owned,) [N/m] of what obstacles add to a node's stiffness from start to ``time``.
 
         q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
             makes good is counted as inside already
@@ -221,7 +221,7 @@ class Environment:
         return stiffness
 
     def power(self, q: Positions, time: float, begin: float, end: float, sides: Indices) -> float:
-        """Return the power [W] of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m].
+        """Return the power [W] of penalties' push at ``time`` on this rank's nodes (owned, 3) [m].
 
         begin, end : the substep [s] as in which obstacles move
         """
@@ -252,7 +252,7 @@ class Environment:
         return work
 
     def change_of_push(self, before: Placed, after: Placed, time: float, time_step: float) -> Floats:
-        """Return how much the push of penalties on this rank's nodes changes in a step, (owned,) [N]."""
+        """Return how much penalties' push on this rank's nodes changes in a step, (owned,) [N]."""
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
             deeper = np.zeros_like(change)

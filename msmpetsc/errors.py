@@ -58,7 +58,7 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
 
 
 def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
-    """Return the error as one of ours, if it is one that a user can meet: memory that is not enough is.
+    """Return the error as one of ours, if a user can meet it: lack of memory is one.
 
     extra : the one that is named for a package which several extras bring
     """

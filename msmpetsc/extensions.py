@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.errors import InputError, did_you_mean
 
-ForceFunction = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
-DistanceFunction = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+# positions (k, 3) [m] and velocities (k, 3) [m/s] of this rank's nodes in the region, time [s] -> (k, 3) [N/kg]
+ForceFunction = Callable[[Positions, Rows, float], Rows]
+# positions (k, 3) [m], at the obstacle's place at time 0 -> signed distances (k,) [m], and their gradients (k, 3)
+DistanceFunction = Callable[[Positions], tuple[Floats, Rows]]
 T = TypeVar("T")
 
 
@@ -27,7 +28,7 @@ class Extensions(Generic[T]):
         self._registered: dict[str, T] = {}
 
     def register(self, name: str, value: T) -> None:
-        """Give a value its name, in place of one that had it before."""
+        """Give a value a name that scenes then mean, in place of the one before; on all ranks."""
         self._registered[name] = value
 
     def names(self) -> list[str]:
@@ -43,32 +44,18 @@ class Extensions(Generic[T]):
             near = did_you_mean(name, self.names())
             raise InputError(f"no {self.kind} {name!r} is registered, or installed under {self.group}{near}")
         try:
-            return next(iter(points)).load()
+            value: T = next(iter(points)).load()
         except Exception as error:  # of whatever was installed
             raise InputError(f"the {self.kind} {name!r} that is installed cannot be imported: {error}") from error
+        return value
 
 
 FORCES: Extensions[ForceFunction] = Extensions("force")
 OBSTACLES: Extensions[DistanceFunction] = Extensions("obstacle")
 PRESETS: Extensions[Mapping[str, Any]] = Extensions("preset")
 
-
-def register_force(name: str, function: ForceFunction) -> None:
-    """Give a force a name, which ``[[force]] function = "name"`` then means; on all ranks.
-
-    function : of positions (k, 3) [m] and velocities (k, 3) [m/s] of this rank's nodes in the region, and the time [s];
-        returns the force on each per its mass, (k, 3) [N/kg]. It is called once a step, with the state that starts it
-    """
-    FORCES.register(name, function)
-
-
-def register_obstacle(name: str, function: DistanceFunction) -> None:
-    """Give a solid a name, which ``[[obstacle]] shape = "function", function = "name"`` then means; on all ranks.
-
-    function : of positions (k, 3) [m], at the obstacle's place at time 0; returns the signed distances to its surface
-        (k,) [m], negative within, and their gradients (k, 3), of length 1. It is called many times a step
-    """
-    OBSTACLES.register(name, function)
+register_force = FORCES.register
+register_obstacle = OBSTACLES.register
 
 
 def register_preset(name: str, options: Mapping[str, Any], based_on: str = "newton", about: str = "") -> None:

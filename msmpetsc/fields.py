@@ -36,7 +36,7 @@ def _number(dtype: str, unit: str, long_name: str) -> Field:
 
 
 def _of_nodes(unit: str, long_name: str) -> Field:
-    """Return the field of what is computed of cells, its mean over those around a node by their volume."""
+    """Return the field of what cells have, its mean over those around a node by their volume."""
     return Field("f4", ("T", "n"), unit, long_name)
 
 
@@ -49,7 +49,7 @@ def _of_cells(unit: str, long_name: str) -> Field:
 class Frame:
     """One simulated time of a run: arrays hold this rank's rows, numbers are of the whole body.
 
-    The errors and counts are of the steps since the frame stored before: errors the greatest, counts the sum.
+    Errors are the greatest, counts the sum, of the steps since the frame stored before.
 
     index      : number of the step that it shows, 0 for the start
     position   : (n_local, 3) [m]
@@ -162,5 +162,5 @@ FIELDS = {f"{group}/{name}": field for group, fields in GROUPS.items() for name,
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of dataset `name`, such as "frames/time"; "1" where the table does not have it."""
+    """Return the unit of a dataset, "frames/time"; "1" where the table does not have it."""
     return FIELDS[name].unit if name in FIELDS else "1"

@@ -178,7 +178,7 @@ def error_of_lobes(run: Result) -> float:
 def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trachea(result):
     run = result("lung_press")
     plate = run.scene.obstacle[1]
-    low = plate.box[0][2] + np.array([Motion.through(plate.path).displacement_at(time)[2] for time in run.time])
+    low = plate.box[0][2] + np.array([Motion.through(plate.path).value_at(time)[2] for time in run.time])
     there = run.time < plate.stop - 1e-9
     assert low.min() < 0.82 * 0.21  # the lobes are 0.21 m high
     assert run.surface[:, :, 2].min() > -0.4 * run.h  # the tips it lands on

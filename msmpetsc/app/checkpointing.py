@@ -1,19 +1,18 @@
 """When a run writes a checkpoint, and when a signal stops it."""
 
 import os
-import re
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from time import perf_counter
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
 from msmpetsc.comm import Stop
-from msmpetsc.errors import InputError, StepStopped
+from msmpetsc.errors import StepStopped
 from msmpetsc.fields import Frame
 from msmpetsc.results.writer import ResultFile
 
@@ -22,40 +21,21 @@ if TYPE_CHECKING:  # PETSc must first be given its options
 
 STATUS: dict[int, int] = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
 CHECKPOINT_TIME = 0.01  # part of the time that checkpoints may take
-SECONDS = {"s": 1, "min": 60, "h": 3600}
-
-
-class Interval(NamedTuple):
-    """How often a checkpoint is due: after so many frames, or seconds; without either, as takes 1% of the time."""
-
-    frames: int | None = None
-    seconds: float | None = None
-
-    @classmethod
-    def parsed(cls, given: int | str | None) -> "Interval":
-        """Parse 3, "3", "5min", or None. Raises InputError."""
-        if given is None:
-            return cls()
-        match = re.fullmatch(r"0*([1-9]\d{0,17})(s|min|h)?", str(given), re.ASCII)
-        if match is None:
-            raise InputError(f"--checkpoint-every takes a number of frames, or 30s, 5min, 2h; not {given}")
-        if match[2] is None:
-            return cls(frames=int(match[1]))
-        return cls(seconds=float(match[1]) * SECONDS[match[2]])
 
 
 class Checkpoints:
     """Write a checkpoint when it is due, at the first and the last step, and when a signal asks the run to stop.
 
+    every  : number of frames after which one is due; None: as takes 1% of the time
     signal : the one that ended the run before its last step; 0 for none
     """
 
-    def __init__(self, file: ResultFile, simulation: "TimeLoop", interval: Interval, signals: "Signals"):
-        self.file, self.simulation, self.interval, self.signals = file, simulation, interval, signals
+    def __init__(self, file: ResultFile, simulation: "TimeLoop", every: int | None, signals: "Signals"):
+        self.file, self.simulation, self.every, self.signals = file, simulation, every, signals
         self.signal = 0
         self._written = -1  # step of the last checkpoint
-        self._seconds = interval.seconds or 0.0
         self._frames = 0
+        self._seconds = 0.0  # until the next one
         self._ended = perf_counter()
 
     def steps(self) -> Iterator[Frame | None]:
@@ -81,15 +61,14 @@ class Checkpoints:
                 self.file.write_checkpoint(saved)
                 self._written = saved.step
             self._frames, self._ended = 0, perf_counter()
-            if self.interval == Interval():
-                self._seconds = (self._ended - began) / CHECKPOINT_TIME
+            self._seconds = (self._ended - began) / CHECKPOINT_TIME
         if simulation.step < simulation.steps:  # after the last step there is nothing to stop
             self.signal = number
         return number != 0
 
     def _is_due(self) -> bool:
-        if self.interval.frames is not None:
-            return self._frames >= self.interval.frames
+        if self.every is not None:
+            return self._frames >= self.every
         return perf_counter() - self._ended >= self._seconds
 
 
@@ -121,7 +100,7 @@ class Signals:
         self._stepping = True
 
     def agree(self, due: bool) -> tuple[bool, int]:
-        """Return whether any rank has a checkpoint due, and the signal that any has got, or 0 (collective)."""
+        """Return whether a checkpoint is due, and the greatest signal of any rank, or 0 (collective)."""
         own = 2 * Stop.signal + due
         greatest = self.comm.allreduce(own, MPI.MAX) if self.comm.size > 1 else own
         return bool(greatest), greatest // 2

@@ -4,27 +4,25 @@ Of its rows are made the keywords of ``msmpetsc.run`` with their types and their
 of ``msmpetsc run``, and the table of options in README.
 """
 
-import inspect
+# ruff: noqa: RUF009  # a call of given() is a field, made once
+
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, fields
-from functools import partial, wraps
+from dataclasses import KW_ONLY, dataclass, field, fields
 from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 from msmpetsc.app.checks import MEASURE_NAMES, RESULT_NAMES, checked_file, checked_path, refuse_other_format
 from msmpetsc.errors import InputError
-from msmpetsc.scene.toml import overrides_of, toml_of
+from msmpetsc.scene.toml import overrides_of
 from msmpetsc.solve.petsc.words import words_of
 
 if TYPE_CHECKING:  # --help, which shows the table, needs neither numpy nor a scene
     from msmpetsc.fields import Frame
     from msmpetsc.scene.reading import Scene
 
-P = ParamSpec("P")
-T = TypeVar("T")
 File = str | os.PathLike[str]
 
 
@@ -47,63 +45,60 @@ class Option:
     python: bool = False
 
 
+def given(default: Any, option: Option) -> Any:
+    """Return a field of the request with its default and with what is said of it."""
+    return field(default=default, metadata={"option": option})
+
+
 @dataclass(frozen=True)
 class RunRequest:
     """A run that is asked for."""
 
-    scene: Annotated[
-        "File | Mapping[str, Any] | Scene | None",
-        Option("scene file (TOML); in Python a Scene, too, or its tables", "SCENE", checked_path),
-    ] = None
-    output: Annotated[
-        File | None,
-        Option("result file, .h5 or .hdf5; out/SCENE.h5 if not given", "OUT.h5", checked_file, short="-o"),
-    ] = None
+    scene: "File | Mapping[str, Any] | Scene | None" = given(
+        None, Option("scene file (TOML); in Python a Scene, too, or its tables", "SCENE", checked_path)
+    )
+    output: File | None = given(
+        None, Option("result file, .h5 or .hdf5; out/SCENE.h5 if not given", "OUT.h5", checked_file, short="-o")
+    )
     _: KW_ONLY
-    preset: Annotated[str | None, Option("solver preset (see --list-presets)", "NAME")] = None
-    error: Annotated[float | None, Option("relative error at which a step is done", "E", float)] = None
-    device: Annotated[
-        Literal["cpu", "cuda"] | None,
-        Option("where to compute: cuda is -mat_type aijcusparse, a CUDA GPU", choices=("cpu", "cuda")),
-    ] = None
-    frames: Annotated[int | None, Option("stop after N steps", "N", int)] = None
-    set: Annotated[
-        Mapping[str, Any] | Sequence[str],
-        Option("override scene keys: cages.count=3000, obstacle.0.friction=0.5", "KEY=VALUE"),
-    ] = ()
-    picture: Annotated[bool, Option("also draw a few moments: OUT.png")] = False
-    overwrite: Annotated[bool, Option("replace OUT.h5 if it exists")] = False
-    resume: Annotated[
-        File | None,
+    preset: str | None = given(None, Option("solver preset (see --list-presets)", "NAME"))
+    error: float | None = given(None, Option("relative error at which a step is done", "E", float))
+    device: Literal["cpu", "cuda"] | None = given(
+        None, Option("where to compute: cuda is -mat_type aijcusparse, a CUDA GPU", choices=("cpu", "cuda"))
+    )
+    frames: int | None = given(None, Option("stop after N steps", "N", int))
+    set: Mapping[str, Any] | Sequence[str] = given(
+        (), Option("override scene keys: cages.count=3000, obstacle.0.friction=0.5", "KEY=VALUE")
+    )
+    picture: bool = given(False, Option("also draw a few moments: OUT.png"))
+    overwrite: bool = given(False, Option("replace OUT.h5 if it exists"))
+    resume: File | None = given(
+        None,
         Option(
             "go on where the run that wrote this file was stopped; with SCENE, start it if there is no such file yet",
             "OUT.h5",
             checked_file,
         ),
-    ] = None
-    force: Annotated[bool, Option("resume with another scene or other options than before")] = False
-    checkpoint_every: Annotated[
-        int | str | None, Option("frames, or 30s, 5min, 2h; default: as takes 1% of the time at most", "N")
-    ] = None
-    gather: Annotated[bool, Option("let rank 0 write for all: where nodes of a cluster do not see one file alike")] = (
-        False
     )
-    true_error: Annotated[
-        int | None, Option("also solve every N-th step to rounding, and store its true error", "N", int)
-    ] = None
-    trace: Annotated[int | None, Option("follow the iterates of step K (needs --measure)", "K", int)] = None
-    measure: Annotated[
-        File | None, Option("write what the run cost: times, products, memory, machine", "OUT.json", checked_file)
-    ] = None
-    petsc_options: Annotated[
-        str | Mapping[str, Any],
-        Option('PETSc\'s options, for this run alone: "-ksp_rtol 1e-3 -ksp_view", {"ksp_rtol": 1e-3}', python=True),
-    ] = ""
-    quiet: Annotated[bool, Option("no notes and no progress; warnings and errors stay", python=True)] = False
-    on_frame: Annotated[
-        "Callable[[Frame], object] | None",
-        Option("called on all ranks with each frame, once that is written", python=True),
-    ] = None
+    force: bool = given(False, Option("resume with another scene or other options than before"))
+    checkpoint_every: int | None = given(
+        None, Option("frames from one checkpoint to the next; default: as take 1% of the time at most", "N", int)
+    )
+    gather: bool = given(False, Option("let rank 0 write for all: where nodes of a cluster do not see one file alike"))
+    true_error: int | None = given(
+        None, Option("also solve every N-th step to rounding, and store its true error", "N", int)
+    )
+    trace: int | None = given(None, Option("follow the iterates of step K (needs --measure)", "K", int))
+    measure: File | None = given(
+        None, Option("write what the run cost: times, products, memory, machine", "OUT.json", checked_file)
+    )
+    petsc_options: str | Mapping[str, Any] = given(
+        "", Option('PETSc\'s options, for this run alone: "-ksp_rtol 1e-3 -ksp_view", {"ksp_rtol": 1e-3}', python=True)
+    )
+    quiet: bool = given(False, Option("no notes and no progress; warnings and errors stay", python=True))
+    on_frame: "Callable[[Frame], object] | None" = given(
+        None, Option("called on all ranks with each frame, once that is written", python=True)
+    )
 
     def __post_init__(self) -> None:
         """Raise InputError for what cannot be meant: paths, numbers, and options that contradict each other."""
@@ -122,48 +117,37 @@ class RunRequest:
         other = self.output is not None and self.resume is not None and Path(self.output) != Path(self.resume)
         if self.resume and (self.overwrite or other):
             raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
-        if self.made and not (self.output or self.resume):
+        if self.scene is not None and not (self.file or self.output or self.resume):
             raise InputError("a scene that is no file gives its result no name: say output")
         if self.trace is not None and self.measure is None:
             raise InputError("--trace needs --measure, the file that it is written to")
 
     @property
     def file(self) -> Path | None:
-        """Path of the scene, if that is a file."""
+        """Return the path of the scene, if that is a file."""
         return Path(self.scene) if isinstance(self.scene, str | os.PathLike) else None
 
     @property
-    def made(self) -> tuple[Path, Mapping[str, Any]] | None:
-        """Folder and tables of the scene, if that is no file."""
-        if self.scene is None or self.file:
-            return None
-        if isinstance(self.scene, Mapping):
-            return Path(), self.scene
-        return cast("Scene", self.scene).folder, toml_of(cast("Scene", self.scene).text)
-
-    @property
     def path(self) -> Path:
-        """Path of the result file."""
+        """Return the path of the result file."""
         named = self.resume or self.output
         return Path(named) if named else Path("out") / f"{self.file.stem if self.file else ''}.h5"
 
     @property
     def measured(self) -> Path | None:
-        """Path of the file of what the run cost."""
+        """Return the path of the file of what the run cost."""
         return Path(self.measure) if self.measure else None
 
     @property
     def overrides(self) -> list[str]:
-        """Changes of the scene, as ``--set`` takes them."""
+        """Return the changes of the scene, as ``--set`` takes them."""
         given = {"solver.preset": self.preset, "solver.error": self.error}
-        method = overrides_of({key: value for key, value in given.items() if value is not None})
-        if isinstance(self.set, Mapping):
-            return [*method, *overrides_of(self.set)]
-        return [*method, *([self.set] if isinstance(self.set, str) else self.set)]
+        method = {key: value for key, value in given.items() if value is not None}
+        return [*overrides_of(method), *overrides_of(self.set)]
 
     @property
     def command(self) -> str:
-        """The command that asks for the same, as the result file and ``--measure`` record it."""
+        """Return the command that asks for the same, as result files and ``--measure`` have it."""
         words = ["msmpetsc", "run", *([str(self.file)] if self.file else [])]
         for name, option in OPTIONS.items():
             value = getattr(self, name)
@@ -176,7 +160,7 @@ class RunRequest:
 
     @property
     def petsc_words(self) -> list[str]:
-        """PETSc's options as words. Raises InputError for what is no option."""
+        """Return PETSc's options as words. Raises InputError for what is no option."""
         return words_of(self.petsc_options)
 
 
@@ -185,28 +169,4 @@ def flag_of(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-OPTIONS: dict[str, Option] = {field.name: cast(Any, field.type).__metadata__[0] for field in fields(RunRequest)}
-
-
-def asked_by(request: Callable[P, RunRequest]) -> Callable[[Callable[[Callable[[], RunRequest]], T]], Callable[P, T]]:
-    """Return a decorator for a function of what makes the request.
-
-    Decorated, it takes the fields of the request as its arguments, with their types, and its help tells of each.
-    """
-
-    def decorate(function: Callable[[Callable[[], RunRequest]], T]) -> Callable[P, T]:
-        @wraps(function)
-        def of_fields(*args: P.args, **keywords: P.kwargs) -> T:
-            signature.bind(*args, **keywords)  # or TypeError at once, on all ranks
-            return function(partial(request, *args, **keywords))
-
-        signature = inspect.signature(request)
-        types = {name: each.annotation.__origin__ for name, each in signature.parameters.items()}
-        types = {name: getattr(kind, "__forward_arg__", kind) for name, kind in types.items()}
-        parameters = [each.replace(annotation=types[name]) for name, each in signature.parameters.items()]
-        told = "\n".join(f"    {name:16} : {option.help}" for name, option in OPTIONS.items())
-        of_fields.__doc__ = f"{function.__doc__}\n{told}\n"
-        of_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # which help() shows
-        return of_fields
-
-    return decorate
+OPTIONS: dict[str, Option] = {each.name: each.metadata["option"] for each in fields(RunRequest)}

@@ -2,9 +2,9 @@
 
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,6 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.app.checks import RESULT_NAMES, refuse_other_format
-from msmpetsc.app.request import RunRequest
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.geometry.registry import MODELS
@@ -30,43 +29,42 @@ if TYPE_CHECKING:  # these import PETSc, which must first be given its options
 OF_NO_EFFECT = re.compile(  # on results
     r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc|^use_gpu_aware_mpi$|^device_"
 )
-OUTPUTS = ("output.every", "output.surface", "output.stress", "output.probe")
-FIXED = ("time.step", "time.integrator", *OUTPUTS)  # a file has one of each
+# a file has one of each
+FIXED = ("time.step", "time.integrator", "output.every", "output.surface", "output.stress", "output.probe")
 OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that may differ without a word
 
 
-def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
-    """Return what is to be resumed, None to run from the start (collective). Raises InputError."""
-    if request.resume is None:
+def earlier_run(comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool) -> Earlier | None:
+    """Return the run that is to be resumed, None to run from the start (collective). Raises InputErr
+
+    may_start : whether there is a scene to start from, where there is no such file yet
+    """
+    if resume is None:
         return None
-    path = Path(request.resume)
-    if request.scene is not None and not comm.bcast(on_root(comm, path.exists)):
+    path = Path(resume)
+    if may_start and not comm.bcast(on_root(comm, path.exists)):
         refuse_other_format("--resume", path, RESULT_NAMES)
         return None  # the first start of a job that may be started again
     on_root(comm, lambda: refuse_deadly(path))
-    return comm.bcast(on_root(comm, lambda: Earlier.read(path)))
+    earlier: Earlier = comm.bcast(on_root(comm, lambda: Earlier.read(path)))
+    return earlier
 
 
-def as_before(request: RunRequest, earlier: Earlier | None) -> RunRequest:
-    """Return the request with what the earlier run was asked for and this one is not.
+def kept_options(earlier: Earlier, given: Sequence[str]) -> list[str]:
+    """Return the earlier run's options of PETSc that affect results and are not given again, as words.
 
-    Of PETSc's options that are those with an effect on results. Raises InputError for an option
-    that could do more than choose a solver, and is not given again: the file may be from anywhere.
+    Raises InputError for one that could do more than choose a solver: the file may be from anywhere.
     """
-    if earlier is None:
-        return request
-    given = request.petsc_words
     kept: list[str] = []
     for name, value in _stored(earlier).items():
         words = [f"-{name}", *filter(None, [value])]
         if name in options_of(given) or OF_NO_EFFECT.search(name):
             continue
         if unsafe_word(words):
-            told = f"{earlier.path} was run with {' '.join(words)}"
-            raise InputError(f"{told}, which is not taken from a file: give it again")
+            text = f"{earlier.path} was run with {' '.join(words)}"
+            raise InputError(f"{text}, which is not taken from a file: give it again")
         kept += words
-    true_error = request.true_error or earlier.true_error or None
-    return replace(request, petsc_options=shlex.join([*kept, *given]), true_error=true_error)
+    return kept
 
 
 def _stored(earlier: Earlier) -> dict[str, str]:
@@ -77,12 +75,12 @@ def _stored(earlier: Earlier) -> dict[str, str]:
         raise InputError(f"{earlier.path} is damaged: its PETSc options cannot be taken apart") from None
 
 
-def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
+def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
     """Return the scene that the earlier run's file has, with changes. Raises InputError."""
     text, file = (earlier.texts.get(name) for name in ("scene", "scene_file"))
     if not text or not file or not file.isprintable():
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
-    scene = scene_of(Path(file), text, changes, presets)
+    scene = scene_of(Path(file), text, changes)
     # The result may be from anywhere, and so may be what it says of the folder in which its scene lay: each file that
     # it names must lie beside it, or be named by that scene's file or by the user.
     given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
@@ -107,7 +105,7 @@ class Resumed:
     """
 
     def __init__(self, earlier: Earlier, scene: Scene, options: dict[str, str], force: bool):
-        """options: PETSc's, of this run. Raises InputError for what may not differ."""
+        """Compare scenes and PETSc's options. Raises InputError for what may not differ."""
         self.earlier = earlier
         self.force = force
         self.stored = scene.stored
@@ -123,7 +121,7 @@ class Resumed:
 
     @property
     def is_done(self) -> bool:
-        """Whether the file has all frames already, or those until rest."""
+        """Return whether the file has all frames already, or those until rest."""
         return self.earlier.finished >= self.stored or (self.earlier.at_rest and not self.differs)
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
@@ -137,7 +135,7 @@ class Resumed:
             if was.get(key) != now.get(key):
                 yield f"{key}: {_shown(was.get(key))} in {earlier.path}, {_shown(now.get(key))} now"
 
-    def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
+    def file(self, comm: MPI.Comm, attributes: dict[str, Any], gathers: bool) -> ResultFile:
         """Open the file that the run writes into (collective)."""
         earlier = self.earlier
         if not (self.differs or self.force) and earlier.planned == self.stored:

@@ -2,6 +2,7 @@
 
 import logging
 import shlex
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import count
@@ -12,12 +13,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc import __version__
-from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
+from msmpetsc.app.checkpointing import Checkpoints, Signals
 from msmpetsc.app.ending import ending_together
-from msmpetsc.app.profile import Cost, refuse_unwritable, versions
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
-from msmpetsc.app.summary import log_end, log_model, tell_stop, warn_of_long_steps
+from msmpetsc.app.summary import Cost, log_end, log_model, refuse_unwritable, tell_stop, versions, warn_of_long_steps
 from msmpetsc.backend.kernel import cache_is_empty
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
@@ -26,12 +26,12 @@ from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import write_xdmf
-from msmpetsc.scene.reading import Scene, load_scene, scene_in
+from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
-from msmpetsc.solve.presets import find_preset, preset_names, shown_options
+from msmpetsc.solve.presets import find_preset, shown_options
 from msmpetsc.solve.refused_options import refuse_early, silence_options_left
 from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 
@@ -40,16 +40,13 @@ from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 class RunPlan:
     """What a run does, once its request is understood.
 
-    attributes : what the file says of the run that made it
     began      : count of perf_counter when that began [s]
     """
 
     request: RunRequest
     scene: Scene
     probes: Probes
-    interval: Interval
     resumed: Resumed | None
-    attributes: dict[str, str | int]
     began: float
 
 
@@ -64,21 +61,30 @@ class RunEnd:
     failure: StepFailed | None
 
 
+def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, started: float) -> int:
+    """Run from the start, or go on from an earlier run; return the exit status (collective).
+
+    started : count of perf_counter at the start of the command [s]
+    """
+    plan = prepare(comm, request, earlier)
+    if plan.resumed and plan.resumed.is_done:
+        return tell_done(comm, request, plan.resumed)
+    return finish(comm, plan, take_steps(comm, plan), started)
+
+
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
-    """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
+    """Read the scene. Raises InputError for what can be refused before there is a model (collective)."""
     refuse_early(comm)
     choose(comm, request.device)
     began = perf_counter()
     if request.measure:
         PETSc.Log.begin()
     probes = Probes(request.true_error, request.trace)
-    interval = Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(scene, probes)
     on_root(comm, lambda: refuse_unwritable(request.measured))
-    attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
-    return RunPlan(request, scene, probes, interval, resumed, attributes, began)
+    return RunPlan(request, scene, probes, resumed, began)
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
@@ -97,7 +103,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
                 numbers = count(start_output(comm, plan, file, model, simulation))
-                checkpoints = Checkpoints(file, simulation, plan.interval, signals)
+                checkpoints = Checkpoints(file, simulation, plan.request.checkpoint_every, signals)
                 is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:
@@ -120,9 +126,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
 
 
 def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) -> int:
-    """Write what stands beside the result and say how the run ended; return the exit status (collective).
-
-    started : count of perf_counter at the start of the command [s]
+    """Write what stands beside the result, say how it ended, and return the exit status (collective).
 
     Raises the StepFailed that ended the run.
     """
@@ -142,11 +146,7 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
 def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int:
     """Finish the files of a run that has all its frames; return the exit status (collective)."""
     write_companions(comm, request, whole=True)
-    earlier = resumed.earlier
-    if earlier.finished < resumed.stored:
-        log.info("%s came to rest after step %d: nothing left to do", request.path, earlier.step)
-    else:
-        log.info("%s has all its %d frames: nothing left to do", request.path, resumed.stored)
+    log.info("%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished)
     return 0
 
 
@@ -169,12 +169,14 @@ def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier 
 def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     """Read the scene with what the request changes; --set comes last and wins."""
     changes = request.overrides
-    if request.made is not None:
-        scene = scene_in(*request.made, changes)
+    if isinstance(request.scene, Scene):
+        scene = request.scene.changed(changes)
+    elif isinstance(request.scene, Mapping):
+        scene = Scene.of(request.scene, changes=changes)
     elif request.file is not None:
-        scene = load_scene(request.file, changes, preset_names())
+        scene = load_scene(request.file, changes)
     elif earlier is not None:
-        scene = stored_scene(earlier, changes, preset_names())
+        scene = stored_scene(earlier, changes)
     else:
         raise InputError("a SCENE is needed, or --resume OUT.h5")
     return scene.changed({"time.duration": request.frames * scene.time.step} if request.frames else {})
@@ -183,7 +185,7 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
     """Return what the file says of the run that made it, with the user's PETSc options alone."""
     options = PETSc.Options().getAll().items()
-    file = request.made[0] / "scene" if request.made else request.file  # where its paths start
+    file = request.file or scene.folder / "scene"  # where its paths start
     return {
         "msmpetsc_version": __version__,
         "petsc_version": versions()["petsc"],
@@ -191,7 +193,7 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
         "ranks": comm.size,
         "command": request.command,
         "scene": scene.text,
-        "scene_file": str(file.resolve()) if file else "",
+        "scene_file": str(file.resolve()) if request.scene is not None else "",
         "true_error": request.true_error or 0,
     }
 
@@ -199,10 +201,11 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
 def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
     """Open the file to write into: a new one, or that of the run that goes on (collective)."""
     request = plan.request
+    attributes = attributes_of(comm, plan.scene, request)
     if plan.resumed:
-        return plan.resumed.file(comm, plan.attributes, request.gather)
+        return plan.resumed.file(comm, attributes, request.gather)
     begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
-    return ResultFile(request.path, comm, plan.attributes, begin, request.gather)
+    return ResultFile(request.path, comm, attributes, begin, request.gather)
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:

@@ -1,21 +1,34 @@
-"""What a run says on stderr: rank 0 alone, from bodies and counts to the files it leaves."""
+"""What a run says on stderr, from bodies and counts to the files it leaves; and what it cost."""
 
+import json
+import platform
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from signal import Signals
+from time import perf_counter
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 from tqdm import tqdm
 
+from msmpetsc import __version__
 from msmpetsc.app.checkpointing import STATUS
+from msmpetsc.backend.arrays import on_host
+from msmpetsc.backend.machine import machine, peak_memory
 from msmpetsc.build import Model
-from msmpetsc.comm import log
-from msmpetsc.constraints.coverage import Reach
+from msmpetsc.comm import log, on_root
+from msmpetsc.errors import StepFailed
+from msmpetsc.fields import Frame
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
+from msmpetsc.results.disk import plain_errors, refuse_no_file, write_whole
 from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
+from msmpetsc.solve.instrumentation import times
+from msmpetsc.solve.integrators.verlet import explicit_limit
+from msmpetsc.solve.petsc.events import FILES, OUTPUT
 from msmpetsc.solve.simulate import TimeLoop
 
 
@@ -39,8 +52,8 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
         "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
         cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
     )  # fmt: skip
-    if named := taken(model.reaches):
-        log.info("%s", ", ".join(named))
+    if model.taken:
+        log.info("%s", ", ".join(model.taken))
 
 
 def warn_of_long_steps(scene: Scene, model: Model) -> None:
@@ -61,18 +74,6 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
             'shows it, time.integrator = "static" goes to rest at once',
             time.step / period, period, period / STEPS_A_PERIOD,
         )  # fmt: skip
-
-
-def taken(reaches: Iterable[Reach]) -> list[str]:
-    """Name what each anchor and force takes; of a force's nodes some may be held."""
-    named = []
-    for reach in reaches:
-        if reach.kind == "anchor":
-            named.append(f"{reach.key} leads {reach.nodes - reach.held} nodes")
-        elif reach.kind == "force":
-            held = f" ({reach.held} of them held)" if reach.held else ""
-            named.append(f"{reach.key} pulls {reach.nodes} nodes{held}")
-    return named
 
 
 def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:
@@ -96,3 +97,71 @@ def tell_stop(number: int, path: Path, simulation: TimeLoop) -> int:
         shlex.quote(str(path)),
     )  # fmt: skip
     return STATUS[number]
+
+
+class Cost:
+    """What a run costs, summed frame by frame.
+
+    setup    : seconds until the first step
+    output   : seconds in which frames and checkpoints are written
+    stepping : seconds of the steps
+    products : with the Hessian
+    """
+
+    def __init__(self, comm: MPI.Comm, simulation: TimeLoop, setup: float):
+        self.comm, self.simulation, self.setup = comm, simulation, setup
+        self.output, self.stepping, self.products = 0.0, 0.0, 0
+        model = simulation.model
+        free = int((~simulation.environment.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())
+        own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, free
+        self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
+
+    @contextmanager
+    def of_output(self) -> Iterator[None]:
+        """Count the time of the block as that of output."""
+        began = perf_counter()
+        with OUTPUT, FILES:
+            yield
+        self.output += perf_counter() - began
+
+    def count(self, frame: Frame) -> None:
+        """Count the steps since the frame before."""
+        self.stepping += frame.wall_time
+        self.products += frame.products
+
+    def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
+        """Leave it all in a file (collective). Raises InputError where that cannot be written."""
+        comm, simulation = self.comm, self.simulation
+        device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"
+        own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
+        time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
+        time["setup"] -= min(time["factor"], time["setup"])
+        record = {
+            "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
+            **self.counts,
+            "time": time,
+            "products": self.products,
+            "memory": comm.allreduce(peak_memory()),
+            "trace": simulation.true_errors.trace,
+            "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),
+            "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
+        }  # fmt: skip
+        on_root(comm, lambda: write_whole(path, json.dumps(record, indent=1)))
+
+
+def refuse_unwritable(path: Path | None) -> None:
+    """Raise InputError for a file that cannot be written, before the run rather than after it."""
+    if path:
+        existed = path.exists()
+        with plain_errors(path):
+            refuse_no_file(path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            open(path, "a").close()
+            if not existed:
+                path.unlink()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, PETSc and Python."""
+    petsc = ".".join(map(str, PETSc.Sys.getVersion()))
+    return {"msmpetsc": __version__, "petsc": petsc, "python": platform.python_version()}

@@ -1,9 +1,11 @@
-"""A CUDA GPU: what is missing for one, arrays in its memory. (Threads on it: backend.launcher.)
+"""A CUDA GPU: what is missing for one, and arrays in its memory.
 
 CuPy and numba's CUDA target are imported by those alone who ask for a GPU: a CPU's run needs neither.
 """
 
 import numpy as np
+
+from msmpetsc.backend.arrays import Array, Floats
 
 
 def missing() -> str | None:
@@ -29,32 +31,27 @@ def use_device(rank: int) -> None:
     cupy.cuda.Device(rank % cupy.cuda.runtime.getDeviceCount()).use()
 
 
-def send(array: np.ndarray) -> np.ndarray:
+def send(array: Array) -> Array:
     """Return a copy of an array in the memory of the GPU."""
     import cupy
 
-    return cupy.asarray(array)
+    copy: Array = cupy.asarray(array)
+    return copy
 
 
-def view(pointer: int, size: int) -> np.ndarray:
+def view(pointer: int, size: int) -> Floats:
     """Return memory of someone else, (size,) numbers, as an array; valid as long as that memory."""
     import cupy
 
-    if not size:
-        return cupy.empty(0)
-    memory = cupy.cuda.UnownedMemory(pointer, 8 * size, None, cupy.cuda.Device().id)
-    return cupy.ndarray((size,), np.float64, cupy.cuda.MemoryPointer(memory, 0))
-
-
-def wait() -> None:
-    """Wait until the GPU has done all that it was given."""
-    import cupy
-
-    cupy.cuda.Device().synchronize()
+    numbers: Floats = cupy.empty(0)
+    if size:
+        memory = cupy.cuda.UnownedMemory(pointer, 8 * size, None, cupy.cuda.Device().id)
+        numbers = cupy.ndarray((size,), np.float64, cupy.cuda.MemoryPointer(memory, 0))
+    return numbers
 
 
 def name() -> str:
     """Return the name of the GPU in use."""
     import cupy
 
-    return cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode()
+    return str(cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode())

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
+from typing import Any
 
 import numba
 
@@ -27,7 +28,7 @@ def kernel(body: Callable[..., None]) -> Callable[..., None]:
     compiled = numba.njit(cache=True)(body)
 
     @wraps(body)
-    def everywhere(count, *arguments):
+    def everywhere(count: int, *arguments: Any) -> None:
         if on_host(arguments[0]):
             compiled(0, count, 1, *arguments)
         else:

@@ -14,14 +14,17 @@ from functools import cache, lru_cache
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import cupy
 import numba
 import numpy as np
-from numba import cuda
+from numba import cuda as untyped
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import MsmpetscError
 
+cuda: Any = untyped
 THREADS = 128  # of a block: registers, not their number, bound the kernels that look at all neighbours of a node
 KEPT = 4096  # descriptions of arrays
 SCALARS = {bool: "?7x", int: "q", float: "d"}  # as the driver takes them (struct): each in eight bytes of its own
@@ -33,9 +36,9 @@ Words = tuple[float, ...]  # of an argument, as the kernel takes them
 @cache
 def launcher(body: Callable[..., None]) -> Callable[..., None]:
     """Return what backend.kernel calls: one thread for each index below a count, in CuPy's current stream."""
-    known: dict[tuple, Launch] = {}
+    known: dict[tuple[str, ...], Launch] = {}
 
-    def launch(count, *arguments):
+    def launch(count: int, *arguments: Any) -> None:
         if count:
             kinds, words = zip(*map(as_argument, arguments), strict=True)
             if kinds not in known:
@@ -45,7 +48,7 @@ def launcher(body: Callable[..., None]) -> Callable[..., None]:
     return launch
 
 
-def as_argument(value: np.ndarray | float) -> tuple[str, Words]:
+def as_argument(value: Array | float) -> tuple[str, Words]:
     """Return an argument's kind, which its type and its words' format follow from, and the words."""
     if isinstance(value, cupy.ndarray):
         return described(value.data.ptr, value.shape, value.strides, value.dtype.str)
@@ -55,8 +58,10 @@ def as_argument(value: np.ndarray | float) -> tuple[str, Words]:
 
 @lru_cache(maxsize=KEPT)
 def described(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: str) -> tuple[str, Words]:
-    """Return the kind of an array, "f8 2 C", and what numba's kernels take for it: no owner, no
-    parent, its size, where it lies."""
+    """Return the kind of an array, "f8 2 C", and the words that numba's kernels take for it.
+
+    These are no owner, no parent, its size, and where it lies.
+    """
     size = np.dtype(dtype).itemsize
     by_row = tuple(np.cumprod((size, *shape[:0:-1]))[::-1])
     by_column = tuple(np.cumprod((size, *shape[:-1])))
@@ -92,7 +97,7 @@ class Launch:
         first, number = ctypes.addressof(self.memory), len(self.memory) // 8
         self.pointers = (ctypes.c_void_p * number)(*range(first, first + 8 * number, 8))
 
-    def __call__(self, count: int, words: chain) -> None:
+    def __call__(self, count: int, words: chain[float]) -> None:
         self.pack(self.memory, 0, count, *words)  # the driver copies them before it returns
         stream = cupy.cuda.get_current_stream().ptr
         blocks = -(-count // THREADS)
@@ -118,15 +123,17 @@ def compiled(body: Callable[..., None], kinds: tuple[str, ...]) -> str:
 
 def ptx_of(body: Callable[..., None], kinds: tuple[str, ...], capability: tuple[int, int]) -> str:
     """Return the PTX of a body for arguments of these kinds."""
-    signature = numba.types.void(numba.types.int64, numba.types.Tuple([type_of(kind) for kind in kinds]))
-    return cuda.compile_ptx(kernel_of(body), signature, cc=capability)[0]
+    arguments = numba.types.Tuple([type_of(kind) for kind in kinds])  # type: ignore[no-untyped-call]
+    signature = numba.types.void(numba.types.int64, arguments)
+    ptx, _ = cuda.compile_ptx(kernel_of(body), signature, cc=capability)
+    return str(ptx)
 
 
 def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
     """Return the kernel of a body: it takes a count and the tuple of the further arguments."""
     inlined = cuda.jit(device=True)(body)
 
-    def threads(count, arguments):
+    def threads(count: int, arguments: tuple[Any, ...]) -> None:
         inlined(cuda.grid(1), count, cuda.gridsize(1), *arguments)
 
     return threads

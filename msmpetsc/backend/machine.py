@@ -1,4 +1,4 @@
-"""The machine that a program runs on, as figures of cost are to be read with."""
+"""The machine that a program runs on, and the memory that it takes of it."""
 
 import platform
 from pathlib import Path
@@ -21,3 +21,13 @@ def machine() -> dict[str, Any]:
     return {
         "cpu": processor(), "cores": psutil.cpu_count(), "memory": memory, "system": platform.platform(terse=True),
     }  # fmt: skip
+
+
+def peak_memory() -> int:
+    """Return the most memory of this process that ever was resident [byte].
+
+    getrusage counts that of its parent, too, as it was when this process was started; the kernel's own count does not.
+    """
+    lines = Path("/proc/self/status").read_text().splitlines() if psutil.LINUX else []
+    peaks = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
+    return 1024 * peaks[0] if peaks else psutil.Process().memory_info().rss

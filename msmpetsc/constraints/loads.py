@@ -16,7 +16,7 @@ from msmpetsc.scene.values import Vector
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-SAME = 1e-12  # relative: a number of steps may come out a little less than the time it was meant to be
+SAME = 1e-12  # relative: a number of steps may come out a little less than the time meant
 
 
 def within(time: float, start: float, stop: float | None) -> bool:
@@ -47,12 +47,8 @@ class Motion(Lines):
 
     @property
     def leads_away(self) -> bool:
-        """Whether the motion leaves where it starts."""
+        """Return whether the motion leaves where it starts."""
         return len(self.times) > 1
-
-    def displacement_at(self, time: float) -> Floats:
-        """Return the displacement (3,) [m] at a time [s]."""
-        return self.value_at(time)
 
     def displacement_between(self, begin: float, end: float) -> Floats:
         """Return the way (3,) [m] that the motion makes good from one time [s] to another."""
@@ -61,7 +57,7 @@ class Motion(Lines):
 
 @dataclass(frozen=True)
 class RigidMotion(Lines):
-    """Displacements [m] and turns [rad], rotation vectors, side by side (k, 6); none at time 0, the first.
+    """Displacements [m] and rotation vectors [rad], side by side (k, 6); none at time 0, the first.
 
     center : (3,) about which it turns [m], at rest
     """
@@ -75,7 +71,7 @@ class RigidMotion(Lines):
         return cls(np.array([time for time, _ in stops]), np.array([pose for _, pose in stops]), center)
 
     def moved(self, x: Positions, pose: Floats) -> Positions:
-        """Return where points x (n, 3) [m] are in a pose (6,): c + R (x - c) + by, R of Rodrigues' formula."""
+        """Return where points x (n, 3) [m] are in a pose (6,): c + R (x - c) + by."""
         by, turn = like(x, pose[:3]), pose[3:]
         if not turn.any():
             return x + by
@@ -119,7 +115,7 @@ class Timed:
 
     @property
     def events(self) -> list[float]:
-        """Times [s] at which it begins, ends or turns."""
+        """Return the times [s] at which it begins, ends or turns."""
         return [self.start, *([] if self.stop is None else [self.stop])]
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
@@ -150,7 +146,7 @@ class Load(Timed):
 
     @property
     def events(self) -> list[float]:
-        """Times [s] at which the force begins, ends or turns."""
+        """Return the times [s] at which the force begins, ends or turns."""
         return [*super().events, *([] if self.table is None else self.table.times.tolist())]
 
 
@@ -181,8 +177,8 @@ class OwnForce(Timed):
         try:
             force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
         except ValueError:
-            told = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
-            raise InputError(f"{self.key}.function: {told}") from None
+            words = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
+            raise InputError(f"{self.key}.function: {words}") from None
         if not np.isfinite(force).all():
             raise InputError(f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)")
         return force

@@ -10,7 +10,7 @@ from msmpetsc.scene.motion import AnchorTable, Force, Pin, Start
 from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.values import ListOf, Table
 
-MOST_CONTRAST = 1e6  # of parts: at 1e8 a squashed body took newton more than 1,200 iterations a step
+MOST_CONTRAST = 1e6  # of parts: at 1e8 a squashed body took newton over 1,200 iterations a step
 OF_REGIONS = ("part", "pin", "anchor", "force")  # tables that take a region of one body, or of all
 
 
@@ -39,12 +39,12 @@ class OfBody(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The path as messages have it, "body.1.pin.0"."""
+        """Return the path as messages have it, "body.1.pin.0"."""
         return ".".join(map(str, self.path))
 
 
 def tables_of(scene: Any, kind: str) -> Iterator[OfBody]:
-    """Yield the tables of a kind of a scene: its own, which are of all bodies, then those of each body."""
+    """Yield the tables of a kind: the scene's own, which are of all bodies, then those of each body."""
     for number, table in enumerate(getattr(scene, kind)):
         yield OfBody((kind, number), None, table)
     for body, tables in enumerate(scene.body):

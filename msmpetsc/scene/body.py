@@ -20,7 +20,6 @@ from msmpetsc.scene.values import (
     only_for,
 )
 
-DEFAULT_STIFFENING = 10.0
 SOLID = "neo-hookean"
 
 PoissonRatio = Annotated[float, Field(ge=0, le=0.4999)]
@@ -103,9 +102,7 @@ class Material(Table):
         description="neo-hookean: a solid; linear, stiffening: how springs pull, whose Poisson's ratio is 1/4",
     )
     poisson_ratio: PoissonRatio = Field(0.25, description='of law = "neo-hookean"; tissue has 0.45 to 0.49 [-]')
-    stiffening: Positive | None = Field(
-        None, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s; 10 if absent [-]'
-    )
+    stiffening: Positive = Field(10.0, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s [-]')
 
     damping: NotNegative = Field(
         0.0, description="of velocities, by the mass: what nothing else moves slows down as exp(-damping t) [1/s]"
@@ -125,12 +122,12 @@ class Material(Table):
 
     @property
     def law_stiffening(self) -> float:
-        """b of the springs' law, 0 for Hooke's."""
-        return self.stiffening or DEFAULT_STIFFENING if self.law == "stiffening" else 0.0
+        """Return b of the springs' law, 0 for Hooke's."""
+        return self.stiffening if self.law == "stiffening" else 0.0
 
     @property
     def poisson(self) -> float | None:
-        """Poisson's ratio of a solid; None of springs."""
+        """Return Poisson's ratio of a solid; None of springs."""
         return self.poisson_ratio if self.law == SOLID else None
 
 
@@ -149,7 +146,7 @@ class HalfSpace(Table):
 
 
 class Region(Table):
-    """A part of space at rest; the body in it is meant: its nodes, or of a part the cells whose middles it holds."""
+    """A part of space at rest: its nodes are meant, or of a part the cells with their middles in it."""
 
     one_of = ("box", "sphere", "half_space", "painted")
     box: Box | None = Field(
@@ -190,6 +187,6 @@ class OwnMaterial(Table):
 
 
 class PartTable(OwnMaterial):
-    """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
+    """Cells of another material; of two parts that hold a cell, the last that gives a key counts."""
 
     region: Region = Field(description="the cells whose middles lie in it")

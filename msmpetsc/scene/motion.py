@@ -1,22 +1,19 @@
 """Tables of what moves the body: its start, gravity, pins, anchors, forces."""
 
 from itertools import pairwise
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
-    ConfigDict,
+    Discriminator,
     Field,
-    PlainSerializer,
-    PlainValidator,
-    TypeAdapter,
-    WithJsonSchema,
+    Tag,
     field_validator,
     model_validator,
 )
 
 from msmpetsc.scene.body import Region
-from msmpetsc.scene.problems import rule
+from msmpetsc.scene.problems import TAGS, rule
 from msmpetsc.scene.values import Direction, FunctionName, ListOf, NotNegative, Positive, Table, Vector, after_start
 
 
@@ -30,7 +27,7 @@ class Twist(Table):
 
 
 class Start(Table):
-    """How the body is at time 0, if not at rest in its rest shape; scale, twist, scatter in this order.
+    """How the body is at time 0, if not at rest in its rest shape: scaled, twisted, then scattered.
 
     Nodes that are pinned or led stay where they are.
     """
@@ -61,14 +58,14 @@ class Gravity(Table):
 
 
 class Keyframe(Table):
-    """A place on a path."""
+    """A displacement at a time of a path."""
 
     time: Positive = Field(description="when it is reached [s]")
     by: Vector = Field(description="displacement from the start [m]")
 
 
 class Pose(Keyframe):
-    """A place on a path on which nodes turn as one rigid body."""
+    """A displacement and a turn at a time of a path."""
 
     by: Vector = Field((0.0, 0.0, 0.0), description="displacement from the start [m]")
     turn: Vector = Field(
@@ -113,21 +110,10 @@ class ForceTable(Table):
         return self
 
 
-VECTOR = TypeAdapter(Vector, config=ConfigDict(strict=True, allow_inf_nan=False))
-
-
-def _total(value: Any) -> tuple[float, float, float] | ForceTable:
-    """Return a vector, or a table that has been checked: a plain union would report both for a mistake in one."""
-    if isinstance(value, dict | ForceTable):
-        return ForceTable.model_validate(value)
-    return VECTOR.validate_python(value)
-
-
+# of one kind or the other: a plain union would report both for a mistake in one
 Total = Annotated[
-    Vector | ForceTable,
-    PlainValidator(_total),
-    PlainSerializer(lambda total: total.model_dump() if isinstance(total, ForceTable) else total),
-    WithJsonSchema({"anyOf": [VECTOR.json_schema(), ForceTable.model_json_schema()]}),
+    Annotated[Vector, Tag(TAGS[0])] | Annotated[ForceTable, Tag(TAGS[1])],
+    Discriminator(lambda total: TAGS[isinstance(total, dict | ForceTable)]),
 ]
 
 
@@ -151,7 +137,7 @@ class Force(Table):
 
     @property
     def pulls(self) -> bool:
-        """Whether the force is not zero at some time."""
+        """Return whether the force is not zero at some time."""
         if self.total is None:
             return True  # a function, which may
         values = self.total.values if isinstance(self.total, ForceTable) else (self.total,)
@@ -159,7 +145,7 @@ class Force(Table):
 
 
 class AnchorTable(Table):
-    """Nodes that are led along a path as one rigid body, each keeping its place among them."""
+    """Nodes that are led along a path as one rigid body."""
 
     region: Region = Field(description="the nodes led")
     path: Annotated[ListOf[Pose], AfterValidator(_ascending)] = Field(

@@ -16,6 +16,7 @@ KeyPath = tuple[str | int, ...]
 Broken = tuple[str, PydanticCustomError]  # a key of a table, and the rule that it breaks
 
 SEARCHED_LINES, SEARCHED = 300, 30_000  # lines, characters: finding a line parses every prefix of the file: 0.2 s
+TAGS = ("a vector", "a table")  # of the kinds of a value that may be either: pydantic adds them to the path of its key
 MOST_REPORTED = 100  # problems of a file
 
 WORDS = {  # pydantic's error types: {gt} and the like are its own figures
@@ -39,8 +40,6 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "rule": "{words}, got {got}",
     "one_of": "must give exactly one of {names}; has {given}",
 }
-POISSON = 'poisson_ratio, with material.law = "neo-hookean"; that of springs is 1/4'
-NO_KEYS = {name: POISSON for name in ("poissons_ratio", "poisson", "nu")}
 EXAMPLES = {"gravity": "acceleration = [0, 0, -9.81]"}  # of tables that are taken for numbers
 
 
@@ -77,7 +76,8 @@ def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]
     meant = {_nearest(key, known) for key in unknown[:MOST_REPORTED]}
     problems: dict[Any, InitErrorDetails] = {}
     for number, e in enumerate(errors):
-        kind, loc, context = e["type"], e["loc"], dict(e.get("ctx", {}))
+        kind, context = e["type"], dict(e.get("ctx", {}))
+        loc = tuple(key for key in e["loc"] if key not in TAGS)
         identity: Any = number
         if kind == "extra_forbidden" and len(loc) == 1:
             context["valid"] = known
@@ -130,8 +130,6 @@ def _got(value: Any) -> str:
 
 def _words(e: ErrorDetails) -> str:
     kind, context = e["type"], e.get("ctx", {})
-    if kind == "extra_forbidden" and e["loc"][-1] in NO_KEYS:
-        return f"unknown key: {NO_KEYS[e['loc'][-1]]}"
     if kind == "model_type" and e["loc"][-1:] and e["loc"][-1] in EXAMPLES:
         return f"must be a table, {{ {EXAMPLES[e['loc'][-1]]} }}, got {_got(e['input'])}"
     if kind == "extra_forbidden":

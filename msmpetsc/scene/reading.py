@@ -3,7 +3,6 @@
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
-from html import escape
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
@@ -19,6 +18,7 @@ from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 MESHES = (".ply", ".mz3", ".vtu", ".vtk", ".obj", ".stl", ".off", ".glb", ".gltf")  # those of geometry/readers.py
+Changes = Mapping[str, Any] | Iterable[str]  # {"cages.count": 3000}, or ["cages.count=3000"]
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
 
 
@@ -28,30 +28,35 @@ class Scene(SceneFile):
         scene = msmpetsc.Scene.load("scenes/bunny_fall.toml", {"cages.count": 3000})
         softer = scene.changed({"material.young_modulus": 2e4})
 
-    Changes are those of ``--set``: any key of a scene, items of lists by their numbers ("pin.0.region").
+    Changes are those of ``--set``: any key of a scene, items of lists by number ("pin.0.region").
     """
 
     text: str = Field("", description="the TOML text, overrides included")
     folder: Path = Field(Path(), description="folder of the file")
 
     @classmethod
-    def load(cls, path: str | PathLike[str], changes: Mapping[str, Any] | None = None) -> "Scene":
+    def load(cls, path: str | PathLike[str], changes: Changes = ()) -> "Scene":
         """Read a scene file. Raises InputError naming every problem, one a line."""
-        return load_scene(Path(path), overrides_of(changes or {}))
+        return load_scene(Path(path), changes)
 
     @classmethod
-    def of(
-        cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Mapping[str, Any] | None = None
-    ) -> "Scene":
-        """Make a scene of tables as its file would have them: {"mesh": {"source": "body.obj"}, ...}.
+    def of(cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Changes = ()) -> "Scene":
+        """Make a scene of tables as a file would have them: {"mesh": {"source": "body.obj"}, ...}.
 
         folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
 
         Raises InputError naming every problem, one a line.
         """
-        return scene_in(Path(folder), tables, overrides_of(changes or {}))
+        path = Path(folder) / "scene"
+        data = plain(tables)
+        keys = {_override(data, override): override for override in overrides_of(changes)}
+        checked = _checked(path, data, "", keys)
+        try:
+            return Scene(**_given(checked), text=tomli_w.dumps(data), folder=path.parent)
+        except TypeError as error:
+            raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
-    def changed(self, changes: Mapping[str, Any]) -> "Scene":
+    def changed(self, changes: Changes) -> "Scene":
         """Return this scene with changes, checked as a whole. Raises InputError."""
         return Scene.of(toml_of(self.text), self.folder, changes) if changes else self
 
@@ -64,51 +69,34 @@ class Scene(SceneFile):
 
     __str__ = __repr__
 
-    def _repr_html_(self) -> str:
-        """Return the scene as a notebook shows it: its title over its text."""
-        title = f"<b>{escape(self.title)}</b>" if self.title else ""
-        return f"{title}<pre>{escape(self.text)}</pre>"
 
-
-def load_scene(
-    path: str | Path, overrides: Iterable[str] = (), presets: Collection[str] | None = None, by_user: bool = True
-) -> Scene:
+def load_scene(path: str | Path, changes: Changes = (), by_user: bool = True) -> Scene:
     """Read and check a scene file.
 
-    overrides: "key.path=value" each, as of --set: value in TOML (a bare word is a string), list items by
-        number; they replace or insert before anything is checked.
-    presets: the known names of solver presets; any name will do if None. by_user: whether the
-    overrides are a user's own words, which may name files outside the folder; a file's may not.
+    changes : a value in TOML may be a bare word, which is a string; they replace or insert before anything is checked
+    by_user : whether the changes are a user's own words, which may name files outside the folder; a file's may not
 
     Raises InputError naming every problem of the file, one a line.
     """
     path = Path(path)
     if path.name.lower().endswith(MESHES) and path.is_file():
         raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {path.with_suffix('.toml')} --mesh {path}")
-    return scene_of(path, _read(path, "scene"), overrides, presets, by_user)
+    return scene_of(path, _read(path, "scene"), changes, by_user)
 
 
-def scene_of(
-    path: Path,
-    file_text: str,
-    overrides: Iterable[str] = (),
-    presets: Collection[str] | None = None,
-    by_user: bool = True,
-    to_read: bool = True,
-) -> Scene:
+def scene_of(path: Path, text: str, changes: Changes = (), by_user: bool = True, to_read: bool = True) -> Scene:
     """Check the text of a scene file as ``load_scene`` does the file.
 
-    to_read: whether the files that it names are to be read
+    to_read : whether the files that it names are to be read
     """
-    overrides, data = list(overrides), _parse(path, file_text)
+    data = _parse(path, text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a study, no scene: msmpetsc study {path}")
-    keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, presets, file_text, keys)
+    keys = {_override(data, override): override for override in overrides_of(changes)}
+    checked = _checked(path, data, text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else None)
-    text = tomli_w.dumps(data) if overrides else file_text
-    return Scene(**_given(checked), text=text, folder=path.parent)
+    return Scene(**_given(checked), text=tomli_w.dumps(data) if keys else text, folder=path.parent)
 
 
 def _given(scene: SceneFile) -> dict[str, Any]:
@@ -116,28 +104,10 @@ def _given(scene: SceneFile) -> dict[str, Any]:
     return {name: getattr(scene, name) for name in scene.model_fields_set}
 
 
-def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] = ()) -> Scene:
-    """Check a scene that Python has as tables; its files are the user's own words, and may lie anywhere.
-
-    folder : where the paths that it names start
-
-    Raises InputError naming every problem, one a line.
-    """
-    path, data = folder / "scene", plain(tables)
-    keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, None, "", keys)
-    try:
-        return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
-    except TypeError as error:
-        raise InputError(f"{path}: cannot be written as TOML: {error}") from None
-
-
-def _checked(
-    path: Path, data: dict[str, Any], presets: Collection[str] | None, text: str, keys: dict[KeyPath, str]
-) -> SceneFile:
+def _checked(path: Path, data: dict[str, Any], text: str, keys: dict[KeyPath, str]) -> SceneFile:
     """Return the tables checked; of a problem InputError names the line of ``text`` or the override of these keys."""
     try:
-        return SceneFile.model_validate(data, context={"presets": presets})
+        return SceneFile.model_validate(data)
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
 
@@ -168,7 +138,7 @@ def lies_below(folder: Path, name: str) -> bool:
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # whoever opens it says so
             path.resolve(strict=True)  # from Python 3.13 on a loop of links is an error only so
         return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a name too long
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a long name
         return False
 
 
@@ -180,7 +150,7 @@ def _read(path: Path, kind: str) -> str:
             content = file.read(LONGEST + 1)
         if len(content) > LONGEST:
             raise InputError(f"{path}: is too long for a {kind} file: more than {LONGEST / 2**20:g} MiB")
-        return content.decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
+        return content.decode("utf-8-sig")  # -sig: some editors begin with a byte order mark
     except FileNotFoundError:
         raise InputError(f"{path}: no such {kind} file") from None
     except IsADirectoryError:

@@ -59,7 +59,7 @@ class Output(Table):
 
 
 class BudgetTable(Table):
-    """The surface error that a plan expects: rms over surface and time, of the largest displacement."""
+    """The surface error that a plan expects: rms over surface and time, of the greatest motion."""
 
     target: Positive = Field(description="asked for [-]")
     cells: NotNegative = Field(description="of the cells [-]")
@@ -98,11 +98,13 @@ class SceneFile(Table):
     pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
     anchor: ListOf[AnchorTable] = Field((), description="nodes led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
-    solver: Solver = Field(Solver.model_validate({}), description="how a step is solved")
-    safety: Safety = Field(Safety.model_validate({}), description="what is done about a step that fails")
-    output: Output = Field(Output.model_validate({}), description="what is stored")
+    solver: Solver = Field(default_factory=lambda: Solver.model_validate({}), description="how a step is solved")
+    safety: Safety = Field(
+        default_factory=lambda: Safety.model_validate({}), description="what is done about a failed step"
+    )
+    output: Output = Field(default_factory=lambda: Output.model_validate({}), description="what is stored")
     budget: BudgetTable | None = Field(None, description="the surface error that `plan` expects; for the reader")
-    picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
+    picture: Picture = Field(default_factory=lambda: Picture.model_validate({}), description="how the result is drawn")
 
     @model_validator(mode="before")
     @classmethod
@@ -118,24 +120,24 @@ class SceneFile(Table):
 
     @property
     def stored(self) -> int:
-        """Number of frames, frame 0 included."""
+        """Return the number of frames, frame 0 included."""
         return self.stored_until(self.time.steps)
 
     def stored_until(self, step: int) -> int:
-        """Number of frames of the first steps: one for every ``every``-th and for the last."""
+        """Return the number of frames of the first steps: of every ``every``-th and of the last."""
         every = self.output.every
         return 1 + (-(-step // every) if step == self.time.steps else step // every)
 
     @property
     def meshes(self) -> dict[KeyPath, MeshTable]:
-        """The surface of each body, by the path of its key."""
+        """Return the surface of each body, by the path of its key."""
         if self.mesh is not None:
             return {("mesh",): self.mesh}
         return {("body", number, "mesh"): body.mesh for number, body in enumerate(self.body)}
 
     @property
     def starts(self) -> list[Start | None]:
-        """Starts of all bodies at time 0."""
+        """Return the starts of all bodies at time 0."""
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, kind: str) -> Iterator[OfBody]:
@@ -143,7 +145,7 @@ class SceneFile(Table):
         return tables_of(self, kind)
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:
-        """Key path and name of each file that it names; a mesh's name may be one of the registry's too."""
+        """Yield key path and name of each file that it names; a mesh's name may be one of the registry's too."""
         solids = {("obstacle", number, "mesh"): o.mesh for number, o in enumerate(self.obstacle) if o.mesh is not None}
         for path, mesh in (self.meshes | solids).items():
             yield (*path, "source"), mesh.source

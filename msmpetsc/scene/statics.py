@@ -1,5 +1,7 @@
-"""Rules of a scene that depend on its integrator: in statics, where nothing moves, much has no
-meaning; exchange and a surface that meets itself want implicit steps."""
+"""Rules of a scene that depend on its integrator.
+
+In statics, where nothing moves, much has no meaning; exchange and a surface that meets itself want implicit steps.
+"""
 
 from collections.abc import Iterator
 from typing import Any, Final
@@ -58,7 +60,7 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
 
 
 def _moving(scene: Any) -> Iterator[Broken]:
-    """Yield the rules that a scene of statics breaks by what moves, goes by the state, bounces or rubs."""
+    """Yield the rules that a scene of statics breaks by what moves, depends on motion or rubs."""
     if scene.material.damping:
         words = f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves'
         yield "time", rule(words, "material")

@@ -62,5 +62,5 @@ class Time(Table):
 
     @property
     def steps(self) -> int:
-        """Number of time steps."""
+        """Return the number of time steps."""
         return round(self.duration / self.step)

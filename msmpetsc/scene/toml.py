@@ -6,7 +6,7 @@ It needs none of the packages that check a scene.
 import json
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from os import PathLike, fspath
 from typing import Any
 
@@ -43,6 +43,8 @@ def toml_value(value: Any) -> str:
     return json.dumps(value, default=str)
 
 
-def overrides_of(changes: Mapping[str, Any]) -> list[str]:
-    """Return changes {"cages.count": 3000} as words of ``--set``: "cages.count=3000"."""
-    return [f"{key}={toml_value(value)}" for key, value in changes.items()]
+def overrides_of(changes: Mapping[str, Any] | Iterable[str]) -> list[str]:
+    """Return changes {"cages.count": 3000} as words of ``--set``, "cages.count=3000"; or the words."""
+    if isinstance(changes, Mapping):
+        return [f"{key}={toml_value(value)}" for key, value in changes.items()]
+    return [changes] if isinstance(changes, str) else list(changes)

@@ -13,7 +13,7 @@ from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.comm import Route
-from msmpetsc.constraints.reactions import sums_by
+from msmpetsc.constraints.holders import sums_by
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.stress import StressField

@@ -14,7 +14,6 @@ from typing import Any
 from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import Scene, load_scene
-from msmpetsc.solve.presets import preset_names
 from msmpetsc.study.forkserver import COLD
 from msmpetsc.study.study_file import Axis, Length, Map, MapCase, Study, StudyScene, Sweep
 
@@ -189,16 +188,11 @@ def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep
         yield changed, sweep.model_copy(update={"label": ", ".join(filter(None, (sweep.label, law)))})
 
 
-def checked_scene(file: Path, changes: Sequence[str]) -> Scene:
-    """Return a scene with changes that a study file has. Raises InputError."""
-    return load_scene(file, changes, preset_names(), by_user=False)
-
-
 def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> Iterator[Case]:
     """Yield the cases of a sweep over a scene, the product of its lists."""
     file = folder / scene.file
     changes = (*scene.set, *sweep.set)
-    as_given = checked_scene(file, changes)
+    as_given = load_scene(file, changes, by_user=False)
     for cells, integrator in product(sweep.cells or (None,), sweep.integrators):
         base = Case(
             scene=scene.name, file=file, content=digest(file, as_given), integrator=integrator, cells=cells,
@@ -207,7 +201,7 @@ def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> 
         )  # fmt: skip
         base = replace(base, reference=_reference(base, scene, as_given))
         for case in _methods(base, scene, sweep, as_given):
-            checked_scene(file, case.set)  # what is wrong is said before anything is run
+            load_scene(file, case.set, by_user=False)  # what is wrong is said before anything is run
             yield case
 
 
@@ -290,7 +284,7 @@ def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
     """Yield the cases of a map, each method at each of its points. Raises InputError."""
     for x, y, run in map_points(map):
         file = folder / run.file
-        scene = checked_scene(file, run.set)
+        scene = load_scene(file, run.set, by_user=False)
         step = scene.time.step
         duration = run.steps * step if run.steps else run.duration or scene.time.duration
         for method in study.method:

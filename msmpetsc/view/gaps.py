@@ -90,7 +90,7 @@ def gaps_to_obstacles(
     gaps = np.full(len(points), np.inf)
     for number, obstacle in enumerate(obstacles):
         if within(time, obstacle.start, obstacle.stop):
-            seen_from_it = points - Motion.through(obstacle.path).displacement_at(time)
+            seen_from_it = points - Motion.through(obstacle.path).value_at(time)
             own = _gaps(obstacle, seen_from_it) if number not in solids else _gaps_to(solids[number], seen_from_it)
             gaps = np.minimum(gaps, own)
     return gaps

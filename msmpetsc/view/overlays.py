@@ -84,7 +84,7 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
     for number, obstacle in enumerate(scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):
             continue
-        by = Motion.through(obstacle.path).displacement_at(time)
+        by = Motion.through(obstacle.path).value_at(time)
         if obstacle.shape == "box":
             shown.glass.extend(_box(np.array(obstacle.box) + by, bodies))
         elif obstacle.shape == "sphere":

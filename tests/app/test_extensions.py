@@ -107,7 +107,7 @@ def test_presets_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     msm.register_preset("tight", {"ksp_rtol": 1e-8, "ksp_max_it": 400}, about="a narrow one")
     msm.register_force("drag", lambda x, v, t: -RATE * v * x[:, :1])  # it bends the block
     scene = flying(tmp_path, "drag", 2)
-    tight, usual = ([frame for frame in msm.frames(scene, preset=name)] for name in ("tight", "newton"))
+    tight, usual = ([frame for frame in msm.frames(scene, set={"solver.preset": name})] for name in ("tight", "newton"))
     assert np.allclose(tight[-1].position, usual[-1].position, atol=1e-8)
     assert tight[-1].ksp_its > usual[-1].ksp_its  # its option has a say
     path = msm.run(scene, tmp_path / "x.h5", preset="tight", quiet=True)
@@ -118,7 +118,7 @@ def test_presets_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "tight" in (listed := capsys.readouterr().out) and "a narrow one" in listed
     msm.register_preset("wrong", {}, based_on="none")
     with pytest.raises(InputError, match="the preset 'wrong' is no table of"):
-        list(msm.frames(scene, preset="wrong"))
+        list(msm.frames(scene, set={"solver.preset": "wrong"}))
 
 
 PLUGIN = """

@@ -75,7 +75,7 @@ def test_changes_are_checked_as_a_file_is(scene: Path):
     with pytest.raises(InputError, match="frames must be at least 1"):
         simulation.frames(0)
     with pytest.raises(InputError, match="unknown preset 'newtno', did you mean 'newton'"):
-        next(simulation.frames(preset="newtno"))
+        next(simulation.frames(set={"solver.preset": "newtno"}))
     with pytest.raises(InputError, match="scene: must give exactly one of mesh, body"):
         msm.Scene.of({"cages": {"count": 3}})
 
@@ -114,7 +114,7 @@ def test_a_loop_may_end_early_and_leaves_nothing_behind(scene: Path):
 
 
 def test_two_simulations_may_go_side_by_side(scene: Path):
-    one, other = msm.frames(scene), msm.frames(scene, preset="anderson")
+    one, other = msm.frames(scene), msm.frames(scene, set={"solver.preset": "anderson"})
     both = [(a.position, b.position) for a, b in zip(one, other, strict=True)]
     alone = [frame.position for frame in msm.frames(scene)]
     assert np.array_equal([a for a, _ in both], alone)
@@ -131,7 +131,7 @@ def test_two_simulations_may_go_side_by_side(scene: Path):
 def test_a_step_that_fails_raises_after_the_frames_before_it(tmp_path: Path):
     pull = [{"region": {"box": [[-1, -1, -1], [0.1, 2, 2]]}, "total": [1e4, 0, 0], "start": 0.015}]
     scene = block_scene(tmp_path, time=FALL["time"], force=pull)
-    frames = msm.frames(scene, error=1e-12, petsc_options="-snes_max_it 1")
+    frames = msm.frames(scene, set={"solver.error": 1e-12}, petsc_options="-snes_max_it 1")
     assert [next(frames).index for _ in range(2)] == [0, 1]
     with pytest.raises(StepFailed, match="frame 2 "):
         next(frames)
@@ -164,20 +164,16 @@ def test_frames_are_those_of_every_third_step_and_the_last(tmp_path: Path):
         assert frame.step_error == max(step.step_error for step in steps) > 0
 
 
-def test_scenes_frames_and_simulations_print_one_line(scene: Path):
+def test_scenes_and_frames_print_one_line(scene: Path):
     simulation = msm.Simulation(scene)
-    before = repr(simulation)
     last = list(simulation.frames(2))[-1]
-    for shown in (repr(simulation.scene), str(simulation.scene), before, repr(simulation), repr(last)):
+    for shown in (repr(simulation.scene), str(simulation.scene), repr(last)):
         assert "\n" not in shown and len(shown) < 200, shown
     assert "cells of 0.125 m of scene.ply, implicit-euler" in repr(simulation.scene)
-    assert before != repr(simulation) and "step 2, t = " in repr(simulation)
     assert repr(last).startswith("Frame(2: t = ") and str(last.position.shape) in repr(last)
 
 
-def test_the_notebook_shows_text_and_no_markup_of_the_scenes(scene: Path, tmp_path: Path):
-    shown = msm.Scene.load(scene, {"title": "<script>"})._repr_html_()
-    assert "<b>&lt;script&gt;</b>" in shown and "density = 1000" in shown and "<script>" not in shown
+def test_the_notebook_shows_a_result_and_no_markup_of_its_title(scene: Path, tmp_path: Path):
     with msm.open(msm.run(scene, tmp_path / "x.h5", set={"title": "<b>a"}, quiet=True)) as result:
         html = result._repr_html_()
         assert "&lt;b&gt;a" in html and "4 frames" in html and f"{len(result.lattice.nodes)} nodes" in html

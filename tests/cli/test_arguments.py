@@ -78,7 +78,7 @@ TOO_MUCH = {
     ),
     "ranks": (["inspect", "scene.toml", "--ranks", "9999999999"], "--ranks must be at most 1000000"),
     "part": (["study", "study.toml", "--part", "1/" + "9" * 5000], "--part must read I/N"),
-    "frames": (["run", "scene.toml", "--checkpoint-every", "9" * 5000], "--checkpoint-every takes"),
+    "frames": (["run", "scene.toml", "--checkpoint-every", "9" * 5000], "--checkpoint-every: invalid int value"),
 }
 
 

@@ -117,10 +117,10 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
 
 
 def test_memory_is_that_of_the_process_not_of_its_parent():
-    code = "from msmpetsc.app.profile import peak_memory; print(peak_memory())"
+    code = "from msmpetsc.backend.machine import peak_memory; print(peak_memory())"
     large = np.ones(75_000_000)  # 600 MB
     told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-    assert 2e7 < int(told.stdout) < large.nbytes
+    assert 1e7 < int(told.stdout) < large.nbytes
 
 
 @pytest.fixture

@@ -22,21 +22,14 @@ def test_all_tables_and_keys_are_listed():
     assert len({each.name for each in keys()}) == len(keys())
 
 
-def test_unit_default_and_range_are_those_of_the_schema():
+def test_default_range_and_meaning_are_those_of_the_schema():
     density = key("material.density")
-    assert (density.unit, density.default, density.bounds, density.about) == (
-        "kg/m^3",
-        "required",
-        "> 0",
-        "mass density",
-    )
+    assert (density.default, density.bounds, density.about) == ("required", "> 0", "mass density [kg/m^3]")
     assert key("time.error").bounds == "> 0, < 1"
-    assert key("cages.boundary").bounds == "fill | whole" and key("cages.boundary").default == "fill"
+    assert key("cages.boundary").bounds == "fill | whole" and key("cages.boundary").default == '"fill"'
     assert key("output.surface").default == "true"
     assert key("material.young_modulus").default == "one of young_modulus, stiffness"
-    assert key("obstacle.N.stop").default == "to the end" and "absent" not in key("obstacle.N.stop").about
-    assert key("mesh.prepare").unit == ""  # the units in its examples are not its own
-    assert key("pin.N.region.box").unit == "m or -"
+    assert key("obstacle.N.stop").default == "none" and key("obstacle.N.stop").about.endswith("to the end if absent")
 
 
 def test_a_table_or_a_key_is_chosen_by_its_name_and_a_number_does_not_matter():

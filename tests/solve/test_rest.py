@@ -78,7 +78,7 @@ def test_a_run_at_rest_is_whole(tmp_path: Path, capsys: pytest.CaptureFixture):
         assert result.frames.time.planned == (count,) and np.isfinite(times).all()
         assert times[-1] < 75
     assert main(["run", "--resume", path]) == 0
-    assert "came to rest after step" in capsys.readouterr().err
+    assert "nothing left to do" in capsys.readouterr().err
     assert main(["run", "--resume", path, "--set", 'time.until="duration"', "--force"]) == 0
     with Result(path) as result:
         assert len(result.frames.time) == 1 + -(-200 // 7)

@@ -15,7 +15,7 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.static import LoadPath, LoadSteps
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
-from msmpetsc.solve.presets import PRESETS, find_preset
+from msmpetsc.solve.presets import find_preset
 
 COLUMN = np.array([0.25, 0.25, 2.0])  # [m]: 2 x 2 x 16 cells
 TOP = {"box": [[-9, -9, 1.99], [9, 9, 9]]}
@@ -116,7 +116,7 @@ OF_MOTION = {
 @pytest.mark.parametrize("words", OF_MOTION)
 def test_what_only_motion_has_is_refused(tmp_path: Path, words: str):
     with pytest.raises(InputError, match=words):
-        load_scene(column(tmp_path, pin=[{"region": BOTTOM}], **OF_MOTION[words]), (), PRESETS)
+        load_scene(column(tmp_path, pin=[{"region": BOTTOM}], **OF_MOTION[words]))
 
 
 @pytest.mark.parametrize("sideways", [0.0, 1e-3])

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.profile import peak_memory
 from msmpetsc.backend.arrays import Floats
+from msmpetsc.backend.machine import peak_memory
 from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
@@ -36,9 +36,8 @@ def run(args: argparse.Namespace) -> int:
     if args.ranks > MOST_RANKS:
         raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     initialise(MPI.COMM_WORLD, [])
-    from msmpetsc.solve.presets import preset_names
 
-    scene = load_scene(args.scene, args.set, preset_names())
+    scene = load_scene(args.scene, args.set)
     before = peak_memory()
     bodies = read_bodies(MPI.COMM_WORLD, scene)
     mesh = peak_memory() - before

@@ -2,11 +2,10 @@
 
 import argparse
 import json
-from dataclasses import astuple
 
 from msmpetsc.scene.key_table import json_schema, keys
 
-HEAD = ("key", "unit", "default", "range", "meaning")
+HEAD = ("key", "default", "range", "meaning [unit]")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -14,7 +13,7 @@ def run(args: argparse.Namespace) -> int:
     if args.command == "schema":
         print(json.dumps(json_schema(), indent=1))
         return 0
-    rows = [HEAD, *(astuple(key) for key in keys(args.table or ""))]
+    rows = [HEAD, *keys(args.table or "")]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
     for *columns, meaning in rows:
         print("  ".join([*(f"{text:{width}}" for text, width in zip(columns, widths, strict=True)), meaning]).rstrip())

@@ -11,7 +11,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.scene.values import IntegratorName
-from msmpetsc.solve.presets import preset_names
 from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
@@ -55,7 +54,7 @@ class Sizer:
         self.bench = bench
         self.target = asked.target
         self.ranks = asked.ranks
-        self.as_given = load_scene(scene, (), preset_names())
+        self.as_given = load_scene(scene)
         count = asked.cells or self.as_given.cages.count
         if count is None:
             raise InputError(f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has")

@@ -278,9 +278,9 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     cages = scene.cages
     cell_size = cages.cell_size
     if cages.count is not None:
-        cell_size = choose_cell_size(bodies, cages.count, cages.method, cages.max_cells, cages.boundary)
+        cell_size = choose_cell_size(bodies, cages.count, cages.max_cells, cages.boundary)
     assert cell_size is not None  # the schema has one of the two
-    return fill(bodies, cell_size, cages.method, cages.max_cells, cages.boundary)
+    return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 
 def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:

@@ -19,7 +19,7 @@ from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_ins
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
-from msmpetsc.geometry.touched_cells import sampled_cells, touched_cells
+from msmpetsc.geometry.touched_cells import touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
@@ -27,7 +27,6 @@ WHOLE = 1 - 1e-9  # a share above this is rounding away from 1
 LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
 TOLERANCE = 0.01  # of a wanted number of cells
 SEARCH_LIMIT = 30  # sizes tried; a real model needs three to six
-MARK = {"exact": touched_cells, "sample": sampled_cells}
 
 
 @dataclass(frozen=True)
@@ -94,21 +93,14 @@ class SlabCells:
         return int(comm.allreduce(len(self.boundary) + int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum())))
 
 
-def fill(
-    bodies: Sequence[BodySurface],
-    cell_size: float,
-    method: str = "exact",
-    max_cells: int = 5_000_000,
-    boundary: str = "fill",
-) -> Cages:
+def fill(bodies: Sequence[BodySurface], cell_size: float, max_cells: int = 5_000_000, boundary: str = "fill") -> Cages:
     """Return the valid cells of side ``cell_size`` [m] of all bodies (collective).
 
-    method   : "exact", or "sample" for the paper's sample points
     boundary : "fill": a boundary cell counts for the share of it that is inside; "whole", as in the paper
     raises   : InputError if there would be more than ``max_cells``
     """
     comm, grids = bodies[0].comm, BodyGrids.covering([body.bounds for body in bodies], cell_size)
-    found = slabs_of_all(bodies, grids, method, max_cells, boundary)
+    found = slabs_of_all(bodies, grids, max_cells, boundary)
     refuse_beyond_memory(comm, sum(cells.count(comm) for cells in found))
     parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, found, strict=True)]
     keys = encode_morton(np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(parts)]))
@@ -163,9 +155,7 @@ def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
     return counted, squares + (counted - share).mean(axis=(1, 2, 3))[:, None] / 4
 
 
-def slabs_of_all(
-    bodies: Sequence[BodySurface], grids: BodyGrids, method: str, max_cells: int, boundary: str
-) -> list[SlabCells]:
+def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str) -> list[SlabCells]:
     """Return the valid cells of this rank's slab of each body (collective); arguments as of ``fill``."""
     found: list[SlabCells] = []
     comm, before = bodies[0].comm, 0
@@ -173,18 +163,18 @@ def slabs_of_all(
         least = before + _least_cells(body, grid)
         _refuse_above(max_cells, least, grid)
         refuse_beyond_memory(comm, least)
-        found.append(_slab_cells(body, grid, method, boundary))
+        found.append(_slab_cells(body, grid, boundary))
         before += found[-1].count(comm)
         _refuse_above(max_cells, before, grid)
     return found
 
 
-def _slab_cells(body: BodySurface, grid: Grid, method: str, boundary: str) -> SlabCells:
+def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
     """Return the valid cells of this rank's slab (collective); arguments as of ``fill``."""
     axes = _axes(body)
     slab = Slab.of_rank(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     corners = _slab_triangles(body, grid, axes)
-    touched = _mark(corners, grid.shape[axes], slab, method)
+    touched = _mark(corners, grid.shape[axes], slab)
     if not body.report.closed:
         return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
     gaps = enclosed_gaps(body.comm, touched, slab)
@@ -246,15 +236,11 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices) -> Rows:
     return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
 
 
-def _mark(corners: Rows, shape: Indices, slab: Slab, method: str) -> Indices:
-    """Return the distinct boundary cells (b, 3) of the slab in lexicographic order.
-
-    The paper's samples of a triangle may lie in another slab than its rank's, but then the
-    triangle was sent there too.
-    """
+def _mark(corners: Rows, shape: Indices, slab: Slab) -> Indices:
+    """Return the distinct boundary cells (b, 3) of the slab in lexicographic order."""
     keys = [np.empty(0, np.int64)]
     for start in range(0, len(corners), CHUNK):
-        cells = MARK[method](corners[start : start + CHUNK], *_limits(shape, slab))
+        cells = touched_cells(corners[start : start + CHUNK], *_limits(shape, slab))
         keys.append(np.unique(packed(cells)))
     return unpacked(np.unique(np.concatenate(keys)))
 
@@ -281,7 +267,7 @@ def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, b
 
 
 def choose_cell_size(
-    bodies: Sequence[BodySurface], count: int, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+    bodies: Sequence[BodySurface], count: int, max_cells: int = 5_000_000, boundary: str = "fill"
 ) -> float:
     """Return the cell size [m] that gives bodies ``count`` cells within 1%, or the nearest with a warning (collective).
 
@@ -298,7 +284,7 @@ def choose_cell_size(
     guess = np.log(_first_guess(bodies, count))
     for _ in range(SEARCH_LIMIT):
         grids = BodyGrids.covering(bounds, np.exp(guess))
-        found = slabs_of_all(bodies, grids, method, 20 * max_cells, boundary)
+        found = slabs_of_all(bodies, grids, 20 * max_cells, boundary)
         excess[guess] = np.log(sum(cells.count(comm) for cells in found) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
         if abs(np.expm1(excess[nearest])) <= TOLERANCE:

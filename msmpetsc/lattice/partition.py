@@ -87,8 +87,8 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, 
         area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
         cells = enclosed / h**3 + 3 / 4 * area / h**2
     if h is None or cells > most:
-        h = choose_cell_size(bodies, int(min(cells, most)), wanted.method, MOST, wanted.boundary)
-    cages = fill(bodies, h, wanted.method, MOST, wanted.boundary)
+        h = choose_cell_size(bodies, int(min(cells, most)), MOST, wanted.boundary)
+    cages = fill(bodies, h, MOST, wanted.boundary)
     partition = count_partition(build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
     counted = int(partition.cells.sum())
     return partition.scaled(round(cells)) if cells > most else partition, counted

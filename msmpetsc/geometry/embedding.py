@@ -4,11 +4,9 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import Route, SortedKeys
@@ -26,25 +24,10 @@ CELLS_AROUND = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1
 NODES_AROUND = np.stack(np.unravel_index(np.arange(64), (4, 4, 4)), axis=1) - 1
 
 
-@dataclass(frozen=True)
-class Embedding:
-    """Rows of W in the order of the surface's points, a contiguous range of them on each rank.
-
-    indptr, indices, weights : CSR of this rank's rows; the columns are global node numbers
-    """
-
-    indptr: Indices
-    indices: Indices
-    weights: Floats
-
-    @property
-    def points(self) -> int:
-        """Number of surface points of this rank."""
-        return len(self.indptr) - 1
-
-
-def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> Embedding:
+def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> csr_array:
     """Return W for the surface points of all bodies, one after the other (collective).
+
+    Each rank has a contiguous range of its rows; columns are global node numbers.
 
     points    : of each body (v, 3) [m] on rank 0, (0, 3) on the others: all must lie in valid cells of the body
     nodes     : the lattice's node numbers by grid key
@@ -66,7 +49,11 @@ def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: st
 
     parts = (slice(start, start + CHUNK) for start in range(0, max(len(u), 1), CHUNK))
     rows, columns, weights = (np.concatenate(part) for part in zip(*map(entries, parts), strict=True))
-    return _gather_rows(comm, rows, columns, weights, total, nodes.total)
+    first = total * np.arange(comm.size + 1) // comm.size  # of the rows that each rank keeps
+    route = Route(comm, np.searchsorted(first[1:], rows, side="right"))
+    start, stop = first[comm.rank : comm.rank + 2]
+    own = route.send(rows) - start, route.send(columns)
+    return coo_array((route.send(weights), own), shape=(int(stop - start), nodes.total)).tocsr()
 
 
 def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indices, Rows]:
@@ -77,16 +64,6 @@ def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indic
     ijk = np.concatenate([of_body + cages.grids.first(body) for body, of_body in enumerate(cells)])
     route = Route(cages.table.comm, cages.table.owner(encode_morton(ijk)))
     return route.send(np.arange(len(u))), route.send(ijk), route.send(u)
-
-
-def _gather_rows(comm: MPI.Comm, rows: Indices, columns: Indices, weights: Floats, total: int, nodes: int) -> Embedding:
-    """Bring rows to the ranks that keep them: equal contiguous ranges."""
-    first = total * np.arange(comm.size + 1) // comm.size
-    route = Route(comm, np.searchsorted(first[1:], rows, side="right"))
-    start, stop = first[comm.rank], first[comm.rank + 1]
-    shape = (int(stop - start), nodes)
-    csr = coo_array((route.send(weights), (route.send(rows) - start, route.send(columns))), shape=shape).tocsr()
-    return Embedding(csr.indptr, csr.indices, csr.data)
 
 
 def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0) -> Rows:

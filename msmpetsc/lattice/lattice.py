@@ -377,15 +377,3 @@ def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int
             springs[s, 0], springs[s, 1] = node, far
             kind[s], shared[s] = KIND[direction], sharing[node, direction]
     return springs, low, kind, shared
-
-
-# bytes of each array of a Lattice, for one cell, node (ghosts too) or spring: a forecast of memory asks for them
-BYTES_OF_CELL = {"cells": 8 * 8, "cell_kind": 1, "cell_share": 8, "local_cells": 8 * 8, "cell_stiffness": 8}
-BYTES_OF_NODE = {"nodes": 3 * 8, "mass": 8, "pinned": 1, "table": 8}
-BYTES_OF_SPRING = {"springs": 2 * 4, "rest_length": 8, "stiffness": 8}
-
-
-def lattice_bytes(cells: float | Array, nodes: float | Array, springs: float | Array) -> float | Array:
-    """Return the bytes of a lattice's arrays, of which there are so many; numbers, or arrays of a number a rank."""
-    counts = ((cells, BYTES_OF_CELL), (nodes, BYTES_OF_NODE), (springs, BYTES_OF_SPRING))
-    return sum(count * sum(sizes.values()) for count, sizes in counts)

@@ -390,19 +390,24 @@ def add_coarse(
                         own = m * (g[a, 0] * g[c, 0] + g[a, 1] * g[c, 1] + g[a, 2] * g[c, 2])
                         for mode in range(4):
                             own += t2 * modes[a, mode] * pushed[c, mode]
-                        _add_block(values[places[i, pair]], own, curvature, n[a], n[c], slope, f, g[a], g[c])
+                        _add_square(values[places[i, pair]], own, curvature, n[a], n[c])
+                        _add_turn(values[places[i, pair]], slope, f, g[a], g[c])
 
 
 @numba.njit(cache=True)
-def _add_block(
-    block: Floats, own: float, curvature: float, m: Floats, n: Floats, slope: float, f: Rows, g: Floats, h: Floats
-) -> None:
-    """Add own I + curvature m n^T + slope [t]_x with t = F (h x g), what v . (F x (u (x) h)) g is of u and v."""
-    x, y, z = h[1] * g[2] - h[2] * g[1], h[2] * g[0] - h[0] * g[2], h[0] * g[1] - h[1] * g[0]
+def _add_square(block: Floats, own: float, curvature: float, m: Floats, n: Floats) -> None:
+    """Add own I + curvature m n^T."""
     for r in range(3):
         block[4 * r] += own
         for c in range(3):
             block[3 * r + c] += curvature * m[r] * n[c]
+
+
+@numba.njit(cache=True)
+def _add_turn(block: Floats, slope: float, f: Rows, g: Floats, h: Floats) -> None:
+    """Add slope [t]_x with t = F (h x g), what v . (F x (u (x) h)) g is of u and v."""
+    x, y, z = h[1] * g[2] - h[2] * g[1], h[2] * g[0] - h[0] * g[2], h[0] * g[1] - h[1] * g[0]
+    for r in range(3):
         t = slope * (f[r, 0] * x + f[r, 1] * y + f[r, 2] * z)
         one, two = (r + 1) % 3, (r + 2) % 3
         block[3 * two + one] += t

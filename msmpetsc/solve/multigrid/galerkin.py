@@ -192,7 +192,7 @@ def add_springs(
             s, kind = order[at], 28 * code[at, 0] + code[at, 1]
             m, n = springs[s, 0], springs[s, 1]
             x, y, z = q[m, 0] - q[n, 0], q[m, 1] - q[n, 1], q[m, 2] - q[n, 2]
-            c, ex, ey, ez = spring_block(x, y, z, rest[s], k[s], b, True)
+            c, ex, ey, ez = spring_block((x, y, z), rest[s], k[s], b, True)
             xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
             for entry in range(begin[kind], begin[kind + 1]):
                 f, place = t2 * factor[entry], places[i, pair[entry]]

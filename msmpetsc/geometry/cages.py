@@ -61,18 +61,14 @@ class Cages:
     squares: Rows | None = None
     fills: tuple[bool, ...] = (False,)
 
-    def squares_of(self, ijk: Indices) -> Rows | None:
-        """Return the squares (c, 3) of valid cells (c, 3) of any rank; None where all are whole (collective)."""
-        return None if self.squares is None else self.table.rows_of(encode_morton(ijk), self.squares)
-
     @property
     def ijk(self) -> Indices:
         """Grid index (n_local, 3) of this rank's cells."""
         return decode_morton(self.table.keys)
 
-    def share_of(self, ijk: Indices) -> Rows | None:
-        """Return the shares (c, 2, 2, 2) of valid cells (c, 3) of any rank; None where all are whole (collective)."""
-        return None if self.share is None else self.table.rows_of(encode_morton(ijk), self.share)
+    def of_cells(self, ijk: Indices, rows: Rows | None) -> Rows | None:
+        """Return the rows, those of ``share`` or ``squares``, of valid cells (c, 3) of any rank (collective)."""
+        return None if rows is None else self.table.rows_of(encode_morton(ijk), rows)
 
 
 @dataclass(frozen=True)
@@ -180,7 +176,7 @@ def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
     gaps = enclosed_gaps(body.comm, touched, slab)
     columns = _columns(body, corners, grid.shape[axes], slab) if boundary == "fill" else None
     if columns is not None:  # a cave that a surface of its own bounds is enclosed, but not inside
-        gaps = gaps[columns.corner_shares(gaps[:, [0, 1, 3]])[:, 0, 0, 0] > OUTSIDE]
+        gaps = gaps[columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > OUTSIDE]
     return SlabCells(touched, gaps, columns)
 
 

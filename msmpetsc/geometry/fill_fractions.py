@@ -81,10 +81,6 @@ class Columns:
         lowest = np.diff(self.keys // LIMIT, prepend=-1) != 0
         return float(np.abs(self.below[lowest]).max(initial=0.0))
 
-    def corner_shares(self, cells: Indices) -> Rows:
-        """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3)."""
-        return self.inside(cells)[0]
-
     def inside(self, cells: Indices) -> tuple[Rows, Rows]:
         """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3), and their squares (k, 3)."""
         if len(self.keys) == 0:

@@ -46,8 +46,6 @@ def inside_bodies(region: Region, points: Positions, bounds: Rows, body: Indices
     body   : (n,) the body of each point
     meant  : the body whose region it is; None: all
     """
-    if len(bounds) == 1:
-        return inside(region, points, bounds[0])
     where = np.zeros(len(points), bool)
     for number in range(len(bounds)) if meant is None else (meant,):
         own = body == number

@@ -166,8 +166,7 @@ def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
     from scipy.spatial.transform import Rotation  # a slow import for what few scenes do
 
     axis = np.asarray(turn["axis"], float)
-    angle = np.deg2rad(turn["degrees"])
-    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    rotation = Rotation.from_rotvec(np.deg2rad(turn["degrees"]) * axis / np.linalg.norm(axis))
     return Surface(rotation.apply(surface.points), surface.triangles)
 
 

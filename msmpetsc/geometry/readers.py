@@ -145,23 +145,14 @@ def _read_mixed_ply(data: bytes) -> Arrays:
 
 
 class _FolderResolver(FilePathResolver):
-    """Reads the files that a glTF names: those in its folder or below it, links followed, and no others.
-
-    A file that is named again is not read again.
-    """
-
-    def __init__(self, path: Path):
-        super().__init__(str(path))
-        self._read: dict[str, bytes] = {}
+    """Reads the files that a glTF names: those in its folder or below it, links followed, and no others."""
 
     def get(self, name: str) -> bytes:
         """Return the content of a named file; ValueError if it is none that may be read."""
         path = Path(self.parent, name)
         if not lies_below(Path(self.parent), name) or not path.is_file():
             raise ValueError(f"it names {name}, which is no file in its folder")
-        if name not in self._read:
-            self._read[name] = path.read_bytes()
-        return self._read[name]
+        return path.read_bytes()
 
 
 def _read_trimesh(path: Path, data: bytes) -> Arrays:
@@ -169,7 +160,7 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
     scene = trimesh.load_scene(
         BytesIO(data),
         file_type=kind,
-        resolver=_FolderResolver(path),
+        resolver=_FolderResolver(str(path)),
         process=False,
         skip_materials=True,
         maintain_order=True,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from mpi4py import MPI
+from scipy.spatial.transform import Rotation
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.lattice.lattice import Lattice
@@ -55,15 +56,12 @@ def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Posit
     """Return q (n, 3) [m] turned about the axis through the middle of the bounds.
 
     The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin,
-    all degrees where they end. Rodrigues: p cos(angle) + (a x p) sin(angle) + a (a . p) (1 -
-    cos(angle))
+    all degrees where they end.
     """
     a, middle = np.array(twist.axis) / np.linalg.norm(twist.axis), bounds.mean(axis=0)
     extent = np.abs(a) @ (bounds[1] - bounds[0])
     angle = np.radians(twist.degrees) * ((nodes - middle) @ a / extent + 0.5)[:, None]
-    p = q - middle
-    along = (p @ a)[:, None] * a
-    turned: Positions = middle + along + (p - along) * np.cos(angle) + np.cross(a, p) * np.sin(angle)
+    turned: Positions = middle + Rotation.from_rotvec(angle * a).apply(q - middle)
     return turned
 
 

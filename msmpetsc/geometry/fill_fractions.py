@@ -34,8 +34,9 @@ LEAK = 1e-6  # windings left below a column: above rounding, far below what one 
 SEEN, SUMS = 6, 17  # sums of a piece: those that count for the cells below it too, and all
 
 # barycentric coordinates and weights that integrate polynomials of degree 4 over a triangle (Dunavant 1985)
-_ONE, _TWO = 0.445948490915965, 0.091576213509771
-POINTS = np.array([np.roll([1 - 2 * a, a, a], turn) for a in (_ONE, _TWO) for turn in range(3)])
+POINTS = np.array(
+    [np.roll([1 - 2 * a, a, a], turn) for a in (0.445948490915965, 0.091576213509771) for turn in range(3)]
+)
 WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 

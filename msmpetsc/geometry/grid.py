@@ -13,8 +13,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.errors import InputError
 
-BITS = 21  # an axis: three of them fill 63 bits of a key
-LIMIT = 1 << BITS
+LIMIT = 1 << 21  # cells along an axis: three times 21 bits fill 63 of a key
 PACK = np.array([LIMIT**2, LIMIT, 1])
 CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
 SAME = 1e-9  # cells: a body that is this close to a whole number of cells long has that number

@@ -144,20 +144,16 @@ def set_square(square: int, view: PointView) -> None:
 
 
 @numba.njit(cache=True)
-def square_limit(a: float, b: float) -> Weights:
-    """Return the normalised weights (w00, w10, w11, w01) at (a, b) on a square: barycentric in the triangle there."""
-    low, high = min(a, b), max(a, b)
-    return 1.0 - high, max(a - b, 0.0), low, max(b - a, 0.0)
-
-
-@numba.njit(cache=True)
 def set_limit(square: int, view: PointView, weights: Floats) -> bool:
-    """Set the weights of p on the cage's surface if it lies on this closed square; return whether it does."""
+    """Set the weights of p on the cage's surface if it lies on this closed square; return whether it does.
+
+    They are barycentric in the triangle there.
+    """
     a0, a1, b0, b1, d = square_frame(square, view)
     if d != 0.0 or not (a0 <= 0.0 <= a1 and b0 <= 0.0 <= b1):
         return False
     weights[:] = 0.0
-    limit = square_limit(-a0, -b0)
+    limit = 1.0 - max(-a0, -b0), max(b0 - a0, 0.0), min(-a0, -b0), max(a0 - b0, 0.0)
     for i in range(4):
         weights[NODES[square, i]] = limit[i]
     return True

@@ -68,10 +68,8 @@ def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
 def _kind(path: Path) -> str:
     """Return the format by the file's name; raise InputError if it is not one we read."""
     kind = path.suffix.lower().removeprefix(".")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, not a mesh file")
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: is a pipe or a device, not a mesh file")
+        raise InputError(f"{path}: is a folder, a pipe or a device, not a mesh file")
     if kind not in _READERS:
         raise InputError(f"{path}: not a mesh format that is read here ({', '.join(_READERS)})")
     return kind

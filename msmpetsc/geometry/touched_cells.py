@@ -10,8 +10,6 @@ import numpy as np
 from msmpetsc.backend.arrays import Indices, Rows
 from msmpetsc.geometry.clipping import clip_between, extent, grown
 
-Limits = tuple[int, int]
-
 SLACK = 1e-12  # of the largest coordinate: above the rounding of an interpolated one, below anything that matters
 
 

@@ -195,5 +195,5 @@ def cell_materials(scene: Scene, finder: Finder) -> Callable[[Indices], CellMate
 
 def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
     """Return a number of a body's own material; the scene's where it gives none."""
-    value = None if own is None else getattr(own, name)
-    return getattr(material, name) if value is None else value
+    value: float | None = getattr(own, name, None)
+    return float(getattr(material, name)) if value is None else value

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host, to_host
 from msmpetsc.elasticity.cell_volume import Cells
@@ -78,7 +77,7 @@ class Elasticity:
     call. Where there is viscosity E has its D, of the step that it was given last.
     """
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+    def __init__(self, lattice: Lattice):
         self.owned, self.flops = lattice.owned, Flops.of_lattice(lattice)
         on_cpu = on_host(lattice.nodes)
         self.springs: SpringScatter | SpringGather | None = None

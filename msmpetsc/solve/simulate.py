@@ -107,7 +107,7 @@ class TimeLoop:
         self.probe = (
             ProbePoints(comm, model.lattice, points) if points else None
         )  # or refused, before PETSc has objects
-        self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
+        self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
         swings = scene.time.integrator != "implicit-euler"
         checks = scene.safety.checks
         self.balance = EnergyBalance(comm, self.environment, self.elasticity, swings, checks)

@@ -140,10 +140,11 @@ class GalerkinSum:
             add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
         add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]
+        weights = self.t2**0.5 * self.weights  # a Hessian is of second degree in them
         if solid:
-            add_coarse(*self.cells, solid.blocks, solid.state(q, True), self.t2, self.weights, self.places, values)
+            add_coarse(self.cells, solid.blocks, solid.state(q, True), weights, self.places, values)
         if viscosity := self.elasticity.viscosity:
-            add_coarse(*self.cells, viscosity.blocks, viscosity.state, self.t2, self.weights, self.places, values)
+            add_coarse(self.cells, viscosity.blocks, viscosity.state, weights, self.places, values)
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)

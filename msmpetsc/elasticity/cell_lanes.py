@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Rows
-from msmpetsc.elasticity.springs import Vector
+from msmpetsc.elasticity.springs import Four, Vector
 from msmpetsc.lattice.cell_moments import FORM
 
 LANES = 8
@@ -74,7 +74,7 @@ def strain(w: Floats, at: int, lane: int) -> Seven:
 
 
 @numba.njit(cache=True, inline="always")
-def modes_forces(w: Floats, lane: int, a: float, b: float, c: float, d: float) -> tuple[float, float, float, float]:
+def modes_forces(w: Floats, lane: int, a: float, b: float, c: float, d: float) -> Four:
     """Return the slopes of the modes' energy by the modes."""
     k = CONSTANTS + lane
     xy, xz, yz, of_yz, of_xz, of_xy = w[k + 48], w[k + 56], w[k + 64], w[k + 72], w[k + 80], w[k + 88]

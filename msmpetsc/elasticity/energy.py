@@ -46,7 +46,7 @@ class Flops:
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "Flops":
-        """Return those of a lattice, M included."""
+        """Return the operations on a lattice, M included."""
         springs, stiffens, owned = len(lattice.springs), lattice.stiffening > 0, lattice.owned
         if lattice.solid is not None:
             around = len(lattice.local_cells) * (2 if lattice.viscous else 1)

@@ -29,6 +29,7 @@ from msmpetsc.lattice.lattice import Lattice
 
 Product = Callable[[Array, Array], None]  # adds (a Hessian) v [N] to the second argument
 Vector = tuple[float, float, float]
+Four = tuple[float, float, float, float]
 
 SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a symmetric block stand among 6
 
@@ -79,7 +80,7 @@ def spring_pull(e: Vector, r: float, k: float, b: float) -> float:
 
 
 @numba.njit(cache=True)
-def spring_block(spring: Vector, r: float, k: float, b: float, projected: bool) -> tuple[float, float, float, float]:
+def spring_block(spring: Vector, r: float, k: float, b: float, projected: bool) -> Four:
     """Return c, e of a spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
 
     It is k (1 + 3 b s^2) along the spring and k (1 - r/l) (1 + b s^2) across it, l its length;
@@ -239,7 +240,8 @@ def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Row
     """
     ends, rest_length, stiffness, stiffening = springs
     for s in range(len(ends)):
-        block = spring_block(between(q, ends[s, 1], ends[s, 0]), rest_length[s], stiffness[s], stiffening, projected)
+        e = between(q, ends[s, 1], ends[s, 0])
+        block = spring_block(e, rest_length[s], stiffness[s], stiffening, projected)
         for i in range(4):
             blocks[s, i] = block[i]
 

@@ -73,7 +73,7 @@ class Cages:
 
 @dataclass(frozen=True)
 class SlabCells:
-    """What a rank finds in its slab of the grid, axes cycled, the longest first.
+    """Valid cells in a rank's slab of the grid, whose axes are cycled so that the longest is first.
 
     boundary : (b, 3) cells that the surface touches
     gaps     : (g, 4) interior cells (geometry.interior)
@@ -116,12 +116,12 @@ Inside = tuple[Rows, Rows]  # shares (n, 2, 2, 2) of cells' corners, and their s
 
 
 def _whole(count: int) -> Inside:
-    """Return what is inside whole cells."""
+    """Return the shares and squares of whole cells."""
     return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
 
 
 def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Inside | None]:
-    """Return grid index (n, 3), kind (n,) and inside of this rank's cells of a body (collective)."""
+    """Return grid index (n, 3), kind (n,), shares and squares of a rank's cells (collective)."""
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(cells.boundary), len(interior)])
@@ -133,7 +133,7 @@ def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) ->
 
 
 def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
-    """Return what of boundary cells is inside; None, with a warning, if the surface does not tell.
+    """Return shares and squares of boundary cells; None, with a warning, where none are defined.
 
     A share that is raised to the least, or lowered to 1, is mass put into or taken out of that very corner, which then
     counts in the squares, too.
@@ -152,7 +152,7 @@ def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
 
 
 def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str) -> list[SlabCells]:
-    """Return the valid cells of this rank's slab of each body (collective); arguments as of ``fill``."""
+    """Return the valid cells of each body in this rank's slab (collective)."""
     found: list[SlabCells] = []
     comm, before = bodies[0].comm, 0
     for body, grid in zip(bodies, grids.grids, strict=True):
@@ -166,7 +166,7 @@ def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int
 
 
 def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
-    """Return the valid cells of this rank's slab (collective); arguments as of ``fill``."""
+    """Return the valid cells of a body in this rank's slab (collective)."""
     axes = _axes(body)
     slab = Slab.of_rank(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     corners = _slab_triangles(body, grid, axes)
@@ -181,7 +181,7 @@ def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
 
 
 def _columns(body: BodySurface, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
-    """Return what the triangles cut out of this rank's cells, None if they are not wound one way (collective)."""
+    """Return the cells that triangles cut; None if those are wound inconsistently (collective)."""
     outwards = corners if body.report.volume > 0 else corners[:, ::-1]
     columns = Columns.crossed(outwards, *_limits(shape, slab))
     return columns if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK else None
@@ -193,12 +193,12 @@ def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
 
 
 def _least_cells(body: BodySurface, grid: Grid) -> float:
-    """Return fewer cells than there will be, known before they are made."""
+    """Return a lower bound of the number of cells."""
     return max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
 
 
 def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
-    """Raise InputError for a lattice of which no rank's share could be held, whatever the scene asks of it."""
+    """Raise InputError for a lattice whose parts cannot fit into memory (collective)."""
     memory, needed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), cells * LEAST_OF_A_CELL / comm.size
     with together(comm):
         if needed > memory:
@@ -219,7 +219,7 @@ def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
 
 
 def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices) -> Rows:
-    """Return the triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
+    """Return the triangles (f, 3, 3), in cell units, that reach this rank's slab (collective)."""
     corners = np.empty((0, 3, 3))
     if body.surface is not None:
         corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
@@ -242,7 +242,7 @@ def _mark(corners: Rows, shape: Indices, slab: Slab) -> Indices:
 
 
 def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices) -> Indices:
-    """Return the interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size.
+    """Return the interior cells of an open surface, by the winding numbers of their centres.
 
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
     An open surface has no slabs of its own meaning: every rank needs all of it.
@@ -265,10 +265,11 @@ def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, b
 def choose_cell_size(
     bodies: Sequence[BodySurface], count: int, max_cells: int = 5_000_000, boundary: str = "fill"
 ) -> float:
-    """Return the cell size [m] that gives bodies ``count`` cells within 1%, or the nearest with a warning (collective).
+    """Return the cell size [m] that gives ``count`` cells within 1% (collective).
 
     The number of cells falls about as a power of the size, so this is a secant search in logarithms,
-    kept inside the bracket found so far: the number is a step function and not quite monotone.
+    kept inside a bracket: the number is a step function and not quite monotone. Where it has no such
+    size the nearest is taken, with a warning.
 
     raises : InputError if ``count`` is more than ``max_cells``, or than memory can hold
     """
@@ -292,14 +293,14 @@ def choose_cell_size(
 
 
 def _first_guess(bodies: Sequence[BodySurface], count: int) -> float:
-    """Return the size h with V / h^3 + 3/4 A / h^2 = count: the volume, and what boundary cells stick out."""
+    """Return h with V / h^3 + 3/4 A / h^2 = count, as boundary cells stick out of the volume V."""
     area, volume = sum(body.report.area for body in bodies), sum(abs(body.report.volume) for body in bodies)
     roots = np.roots([count, 0, -0.75 * area, -volume])
     return float(roots.real.max())
 
 
 def _next_guess(excess: dict[float, float], nearest: float) -> float:
-    """Return where the secant through the two best tries meets zero, else the middle of the bracket."""
+    """Return the zero of the secant through the two best tries, else the middle of the bracket."""
     slope = -2.5  # between that of a shell and that of a solid
     if len(excess) > 1:
         second = min((size for size in excess if size != nearest), key=lambda size: abs(excess[size]))

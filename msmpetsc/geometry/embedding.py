@@ -1,4 +1,4 @@
-"""The embedding W: one sparse matrix that carries the surface along, surface = W @ positions (paper 3.1).
+"""The embedding W, a sparse matrix: surface points = W @ positions of nodes (paper 3.1).
 
 ``stencil_weights`` is the one interface to its kinds: mean value coordinates of a cell (geometry.mvc), and two that
 are smooth across cells, *Cages coordinates (Eq. 7-9) and affine maps (ours).
@@ -78,7 +78,7 @@ def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: st
 
 
 def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indices, Rows]:
-    """Send each point to its cell's rank: its number there, its cell (p, 3), its coordinates in the cell (p, 3)."""
+    """Send points to the ranks of their cells: number, cell (p, 3), coordinates in it (p, 3)."""
     at = [grid.to_cells(of_body) for grid, of_body in zip(cages.grids.grids, points, strict=True)]
     cells = [np.floor(of_body).astype(np.int64) for of_body in at]
     u = np.concatenate([x - ijk for x, ijk in zip(at, cells, strict=True)])
@@ -88,7 +88,7 @@ def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indic
 
 
 def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0) -> Rows:
-    """Return the weights (p,64) of the nodes around points in valid cells; lengths in units of the cell size.
+    """Return the weights (p,64) of the nodes around points in valid cells, lengths in cells.
 
     u          : (p,3) coordinates in the cell, in [0,1]
     neighbours : (p,27) bool; column (dx+1)*9 + (dy+1)*3 + (dz+1): the cell at that offset is valid. 13 is the cell
@@ -118,7 +118,7 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
 
 @numba.njit(cache=True)
 def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
-    """Return b(p) of Eq. 9: 0 on everything shared with a valid neighbour, 1 away from it; f_h is smoothstep(x / h).
+    """Return b(p) of Eq. 9, f_h = smoothstep(x / h): 0 on what valid neighbours share, else up to 1.
 
     own (64,): the cell's own coordinates; the sum in Eq. 9 is taken over the corners shared with that neighbour.
     """
@@ -135,7 +135,7 @@ def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
 
 @numba.njit(cache=True)
 def boundary_blends(u: Floats, valid: Mask, blends: Floats) -> float:
-    """Set W(v, p) of Eq. 8 in blends (8,), 0 off B_c: the corners shared with another valid cell. Return their sum."""
+    """Set W(v, p) of Eq. 8 in blends (8,), 0 at corners of no other valid cell; return their sum."""
     for v in range(8):
         mask = cells_around(v, valid)
         alone = mask & (mask - 1) == 0

@@ -29,7 +29,7 @@ FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with 
 
 
 class PointView(NamedTuple):
-    """What a point p sees of its block: see new_view and set_view. The last two are filled where a cage asks."""
+    """Geometry of a point p in its block, by new_view and set_view; the last two on demand."""
 
     planes: Rows  # (3,4) heights of the block's grid planes over p
     angles: Floats  # (144,) g_jk of the grid edges; 0 = not yet
@@ -44,7 +44,7 @@ def new_view() -> PointView:
 
 @numba.njit(cache=True)
 def set_view(u: Floats, view: PointView) -> None:
-    """Make the view that of the point u (3,)."""
+    """Set the view to that of the point u (3,)."""
     for axis in range(3):
         for i in range(4):
             view.planes[axis, i] = i - 1 - u[axis]
@@ -65,7 +65,7 @@ def edge_angle(edge: int, view: PointView) -> float:
 
 @numba.njit(cache=True)
 def turn_from_plane(c: float, length2: float, dot: float, d2: float) -> float:
-    """Return sign(c) times (beta |c| / |e_j x e_k| - the angle that the edge subtends from p's foot in the plane).
+    """Return sign(c) (beta |c| / |e_j x e_k| - the edge's angle from p's foot in the plane).
 
     c = (e_j x e_k)_n, dot = e_j . e_k in the plane, d2 = height^2. The angles of a triangle that does not hold the
     foot sum to 0, so these differences, each of order d2, sum to 2 m_n without cancelling.

@@ -176,7 +176,7 @@ STEPS: dict[str, Callable[..., Surface]] = {
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """Carry out a step, its failures as InputError with its name."""
+    """Run a step; raise its failures as InputError with its name."""
     try:
         result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:
@@ -192,7 +192,7 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
 
 
 def cached(step: Callable[..., Surface], surface: Surface, *values: object) -> Surface:
-    """Return what a step makes of a surface and values, of a large one from the disk where it was computed before."""
+    """Return the result of a step; of a large mesh it is kept in a cache on disk."""
     if len(surface.triangles) < LARGE:
         return step(surface, *values)
     versions = [package.version for name in LIBRARIES for package in distributions(name=name)]

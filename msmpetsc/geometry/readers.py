@@ -1,4 +1,4 @@
-"""Surface meshes read from files: formats, and limits on what a damaged or hostile file may claim."""
+"""Reading of surface meshes from files, which may be damaged or hostile."""
 
 import resource
 import struct
@@ -79,8 +79,6 @@ def _content(path: Path) -> bytes:
     """Return the file's bytes."""
     try:
         data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except (OSError, MemoryError) as error:
         reason = getattr(error, "strerror", None) or error or "too large for the memory"
         raise InputError(f"{path}: cannot be read ({reason})") from error
@@ -91,7 +89,7 @@ def _content(path: Path) -> bytes:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep what the readers print, log or warn from the terminal; half-read numbers are errors."""
+    """Suppress what readers print, log or warn; half-read numbers are errors."""
     log = getLogger("trimesh")
     level = log.level
     log.setLevel(CRITICAL)

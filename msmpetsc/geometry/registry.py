@@ -1,4 +1,4 @@
-"""Named meshes: where each comes from, under which licence (registry.toml), and where it lies on this machine.
+"""Named meshes: their sources and licences (registry.toml), and their files on this machine.
 
 A name gives the same body wherever it is found: a converted copy in $MSMPETSC_MESH_DIR is taken
 as it is, or the same file inside an installed package; an original that was fetched goes through the model's own

@@ -1,4 +1,4 @@
-"""How bodies are at time 0: where their nodes are, and how fast."""
+"""State of bodies at time 0: positions and velocities of their nodes."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ InitialState = tuple[Positions, Rows]  # positions (l, 3) [m] and velocities (l,
 def initial_state(
     comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
 ) -> InitialState:
-    """Return where nodes are, and how fast, as each body's start has it (collective).
+    """Return positions and velocities of nodes by the starts of their bodies (collective).
 
     starts : of each body; None: at rest
     held   : (l,) bool, nodes that stay at rest where they are
@@ -41,7 +41,7 @@ def initial_state(
 
 
 def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Positions:
-    """Return where a start moves a body's nodes (n, 3) [m]; ``numbers`` (n,) are their global ones."""
+    """Return the initial positions (n, 3) [m] of a body's nodes, by their global numbers (n,)."""
     middle = bounds.mean(axis=0)
     q: Positions = middle + np.array(start.scale) * (nodes - middle)
     if start.twist is not None:

@@ -151,7 +151,8 @@ def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology |
 
     topology : that of the cages, where it is known already
     """
-    h, net, is_solid = cages.grids.cell_size, topology or topology_of(cages), material.poisson is not None
+    h, net = cages.grids.cell_size, topology or topology_of(cages)
+    is_solid = material.poisson is not None
     first_owned = net.cells[:, 0] < len(net.octants)
     others = ~first_owned & (material.stiffening > 0 or is_solid)  # they matter only where the law is of cells too
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])

@@ -1,4 +1,4 @@
-"""From a material to a law's constants: Lame's, or how stiff the three kinds of spring of a cubic lattice are.
+"""Constants of a law by its material: Lame's, or the stiffness of springs of a cubic lattice.
 
 Central forces between the corners of cubes give Poisson's ratio 1/4 whatever the stiffness.
 """
@@ -57,7 +57,7 @@ def edge_stiffness(young_modulus: float | Floats, cell_size: float) -> float | F
 
 
 def bending_period(length: float, thick: float, young_modulus: float, density: float) -> float:
-    """Return the period [s] of a bar clamped at one end, which bends to and fro: of its motions the slowest.
+    """Return the period [s] of the first bending mode of a bar clamped at one end.
 
     length, thick : of the bar, and across it where it bends [m]
     """

@@ -1,4 +1,4 @@
-"""What each of R ranks would hold of a lattice that is built on one: counted without MPI.
+"""Parts of a lattice that R ranks would hold, counted on one rank.
 
 Ranks own equal parts of cells and of nodes along the Morton curve; those that R ranks make themselves, by a sample
 (comm.SortedKeys), are as large within an eighth.
@@ -53,7 +53,9 @@ class Partition:
         What fills it grows with the cells, the surface with their power 2/3; ghosts and cut springs
         as they do around a cube of as many nodes as a rank has.
         """
-        f, nodes, before = cells / self.cells.sum(), self.nodes.sum(), self.cells.sum()
+        nodes = self.nodes.sum()
+        before = self.cells.sum()
+        f = cells / before
         grown = cells + (nodes - before) * f ** (2 / 3)
         springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * before) * f ** (2 / 3)
         side, side_before = np.cbrt(np.array([grown, nodes]) / len(self.nodes))

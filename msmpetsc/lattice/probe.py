@@ -1,4 +1,4 @@
-"""Points of a body that are followed: each goes with the corners of its cell, by their trilinear functions."""
+"""Probes: points of a body that move with the corners of their cells, by trilinear functions."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Selection of nodes or cells a scene means by a region, and the materials of the parts that regions make.
+"""Nodes and cells in the regions of a scene, and the materials of its parts.
 
 A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is. Where
 skin widens from a clamp's edge, nodes just past that are nearest to skin that is free. So of nodes that lie in the
@@ -135,7 +135,8 @@ class Finder:
         path = self.folder / painted
         numbers: list[int] = []
         with suppress(OSError, ValueError):
-            numbers = [int(word) for word in path.read_text().split()] if path.is_file() else []
+            if path.is_file():
+                numbers = [int(word) for word in path.read_text().split()]
         if not numbers or not 0 <= min(numbers) <= max(numbers) < 2**63:
             raise InputError(f"{key}.region.painted: {path} must be a file of point numbers, from 0")
         return numbers

@@ -219,7 +219,7 @@ def test_it_is_refused_in_one_line_that_names_the_file(tmp_path, name, capfd):
 def test_what_is_no_file_is_refused(tmp_path):
     (tmp_path / "folder.ply").mkdir()
     os.mkfifo(tmp_path / "pipe.ply")
-    for name, words in {"none": "no such file", "folder": "is a folder", "pipe": "a pipe or a device"}.items():
+    for name, words in {"none": "No such file", "folder": "is a folder", "pipe": "a pipe or a device"}.items():
         assert words in refusal(lambda name=name: read_surface(tmp_path / f"{name}.ply"))
 
 

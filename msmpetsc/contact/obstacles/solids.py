@@ -1,4 +1,4 @@
-"""What nodes stay out of: planes and boxes, balls, closed meshes, and what a function of the user's own describes.
+"""Solids that nodes stay out of: planes, boxes and balls.
 
 Each at its place at time 0; where an obstacle has moved, positions are as seen from it.
 """

@@ -35,7 +35,7 @@ from msmpetsc.comm import Route, SortedKeys
 from msmpetsc.geometry.block import AROUND, ITSELF, cells_around, corner_bit, corner_blend, corner_node, smoothstep
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
-from msmpetsc.geometry.mvc import joined_cage, mvc_weights, new_view, set_view
+from msmpetsc.geometry.mvc import joined_cage, new_view, set_view
 
 ROUNDING = 1e-9  # how far outside its cell a point may be computed to lie
 ON_FACE = 1e-14  # nearer than this to a face of its cell, a point is on it
@@ -107,12 +107,12 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
     u = np.ascontiguousarray(np.where(u < ON_FACE, 0.0, np.where(u > 1.0 - ON_FACE, 1.0, u)))
     neighbours = np.ascontiguousarray(neighbours, bool)  # one memory layout: the kernels are compiled once
     weights = np.empty((len(u), 64))
-    if kind == "mvc":
-        mvc_weights(u, weights)
-    elif kind == "cages":
-        cages_weights(u, neighbours, smoothing, weights)
-    else:
+    if kind == "mvc":  # *Cages coordinates of a cell without neighbours
+        neighbours = neighbours & (np.arange(27) == ITSELF)
+    if kind == "affine":
         affine_weights(u, neighbours, gradient_table(), weights)
+    else:
+        cages_weights(u, neighbours, smoothing, weights)
     return weights
 
 
@@ -152,10 +152,10 @@ def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) ->
     for p in range(len(u)):
         set_view(u[p], view)
         joined_cage(0, alone, view, weights[p])  # x(p)
-        total = boundary_blends(u[p], neighbours[p], blends)
         b = own_weight(weights[p], neighbours[p], smoothing)
         if b == 1.0:
             continue
+        total = boundary_blends(u[p], neighbours[p], blends)
         weights[p] *= b
         for v in range(8):
             if blends[v] > 0.0:

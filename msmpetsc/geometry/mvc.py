@@ -19,7 +19,7 @@ import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Mask, Rows
-from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, ITSELF, NODES, OF_CORNER, SQUARE
+from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, NODES, OF_CORNER, SQUARE
 
 Frame = tuple[float, float, float, float, float]
 Angles = tuple[float, float, float, float, float]
@@ -181,14 +181,3 @@ def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> N
             for i in range(4):
                 weights[NODES[square, i]] += outwards * view.squares[square, i]
     weights /= weights.sum()
-
-
-@numba.njit(cache=True)
-def mvc_weights(u: Rows, weights: Rows) -> None:
-    """Set the mean value coordinates of points in their own cells: u (p,3) in [0,1]; weights (p,64), result."""
-    alone = np.zeros(27, np.bool_)
-    alone[ITSELF] = True
-    view = new_view()
-    for p in range(len(u)):
-        set_view(u[p], view)
-        joined_cage(0, alone, view, weights[p])

@@ -6,6 +6,7 @@ from functools import cached_property, reduce
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
@@ -23,7 +24,7 @@ from msmpetsc.contact.surface.pairs import CollisionSurface
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
-from msmpetsc.geometry.embedding import Embedding, embed
+from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.nearest import nearest_in_bodies
 from msmpetsc.geometry.prepare import prepare
@@ -48,7 +49,7 @@ USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 class Model:
     """A scene made ready to step. Arrays hold this rank's share; the surfaces are on rank 0 only.
 
-    embedding : None where the scene stores no surface
+    embedding : this rank's rows of W (geometry.embedding); None where the scene stores no surface
     loads     : gravity first, where there is any
     own_forces : forces that are functions of the state that starts a step
     start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
@@ -64,7 +65,7 @@ class Model:
 
     surface: Surface | None
     lattice: Lattice
-    embedding: Embedding | None
+    embedding: csr_array | None
     loads: list[Load]
     anchors: list[Anchor]
     exchanges: list[Exchange]
@@ -117,7 +118,7 @@ class Geometry:
         return self.source == (scene.folder, scene.meshes, scene.cages)
 
     @cached_property
-    def embedding(self) -> Embedding:
+    def embedding(self) -> csr_array:
         """Return how the surfaces follow the nodes (collective)."""
         points = [np.empty((0, 3)) if body.surface is None else body.surface.points for body in self.bodies]
         _, _, cages = self.source
@@ -278,9 +279,9 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     cages = scene.cages
     cell_size = cages.cell_size
     if cages.count is not None:
-        cell_size = choose_cell_size(bodies, cages.count, cages.method, cages.max_cells, cages.boundary)
+        cell_size = choose_cell_size(bodies, cages.count, cages.max_cells, cages.boundary)
     assert cell_size is not None  # the schema has one of the two
-    return fill(bodies, cell_size, cages.method, cages.max_cells, cages.boundary)
+    return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 
 def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:

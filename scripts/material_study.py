@@ -72,7 +72,7 @@ def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS)
 def hessian(lattice: Lattice) -> csc_array:
     """Hessian of E at rest (3n, 3n) [N/m], from its products: nodes three cells apart share no cell."""
     n, ijk = len(lattice.nodes), np.rint((lattice.nodes - lattice.nodes.min(axis=0)) / lattice.cell_size).astype(int)
-    colour, product, triplets = ijk % 3 @ [9, 3, 1], Elasticity(COMM, lattice).hessian_at(lattice.nodes), []
+    colour, product, triplets = ijk % 3 @ [9, 3, 1], Elasticity(lattice).hessian_at(lattice.nodes), []
     neighbours = csc_array(
         (np.ones(8 * len(lattice.cells)), lattice.cells.ravel(), 8 * np.arange(len(lattice.cells) + 1))
     )

@@ -19,7 +19,7 @@ import manifold3d
 import numpy as np
 import skfem
 import trimesh
-from material_study import COMM, LAWS, SPRINGS
+from material_study import LAWS, SPRINGS
 from scipy.spatial.transform import Rotation
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
@@ -288,7 +288,7 @@ def force(poisson: float | None, half: float, high: int) -> float:
     tables = {"pin": [held(2, 0, -1)], "anchor": [anchor], "time": {"integrator": "static", "step": 1, "duration": 1}}
     of = run(box(WIDE, WIDE, 1), poisson, cages={"cell_size": 1 / high}, **tables)
     gradient = np.zeros_like(of.lattice.nodes)
-    Elasticity(COMM, of.lattice).add_gradient(of.frames[-1].position, gradient)
+    Elasticity(of.lattice).add_gradient(of.frames[-1].position, gradient)
     return -gradient[np.isclose(of.lattice.nodes[:, 2], 1), 2].sum()
 
 

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Rows
-from msmpetsc.elasticity.springs import Vector
+from msmpetsc.elasticity.springs import Four, Vector
 from msmpetsc.lattice.cell_moments import FORM
 
 LANES = 8
@@ -74,7 +74,7 @@ def strain(w: Floats, at: int, lane: int) -> Seven:
 
 
 @numba.njit(cache=True, inline="always")
-def modes_forces(w: Floats, lane: int, a: float, b: float, c: float, d: float) -> tuple[float, float, float, float]:
+def modes_forces(w: Floats, lane: int, a: float, b: float, c: float, d: float) -> Four:
     """Return the slopes of the modes' energy by the modes."""
     k = CONSTANTS + lane
     xy, xz, yz, of_yz, of_xz, of_xy = w[k + 48], w[k + 56], w[k + 64], w[k + 72], w[k + 80], w[k + 88]
@@ -82,19 +82,12 @@ def modes_forces(w: Floats, lane: int, a: float, b: float, c: float, d: float) -
 
 
 @numba.njit(cache=True, inline="always")
-def write_forces(w: Floats, k: int, lane: int, p: Vector, strain: Seven) -> None:
-    """Write a component's forces on the corners: p by 4 h times its slopes, and those of its modes."""
-    x, y, z, v = modes_forces(w, lane, strain[3], strain[4], strain[5], strain[6])
-    _to_corners(w, RESULT + k, lane, p[0], p[1], p[2], x, y, z, v)
-
-
-@numba.njit(cache=True, inline="always")
-def _to_corners(
-    w: Floats, at: int, lane: int, p: float, q: float, r: float, a: float, b: float, c: float, d: float
-) -> None:
-    """Write the forces of a component on the corners: p, q, r by 4 h times its slopes, a to d by its modes."""
-    k = CONSTANTS + lane
-    cx, cy, cz, mxy, mxz, myz = w[k], w[k + 8], w[k + 16], w[k + 24], w[k + 32], w[k + 40]
+def write_forces(w: Floats, k: int, lane: int, slopes: Vector, strain: Seven) -> None:
+    """Write a component's forces on the corners: ``slopes`` by 4 h times its slopes, and those of its modes."""
+    at, of_form, (p, q, r) = RESULT + k, CONSTANTS + lane, slopes
+    a, b, c, d = modes_forces(w, lane, strain[3], strain[4], strain[5], strain[6])
+    cx, cy, cz = w[of_form], w[of_form + 8], w[of_form + 16]
+    mxy, mxz, myz = w[of_form + 24], w[of_form + 32], w[of_form + 40]
     xyz = d + a * cz + b * cy + c * cx + p * myz + q * mxz + r * mxy
     xy, xz, yz = a + p * cy + q * cx, b + p * cz + r * cx, c + q * cz + r * cy
     x0, x1, y0, y1, xy0, xy1 = p - xz, p + xz, q - yz, q + yz, xy - xyz, xy + xyz

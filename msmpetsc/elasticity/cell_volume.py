@@ -20,7 +20,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.springs import Product, Vector, between
+from msmpetsc.elasticity.springs import Product, Vector, between, dot
 from msmpetsc.lattice.lattice import Lattice
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed
@@ -34,11 +34,6 @@ Frame = tuple[Vector, Vector, Vector]  # of a corner's three edges, one each
 @numba.njit(cache=True, inline="always")
 def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@numba.njit(cache=True, inline="always")
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @numba.njit(cache=True)
@@ -61,7 +56,7 @@ def cofactors(e: Frame) -> Frame:
 @numba.njit(cache=True)
 def _volume(a: Vector, b: Vector, c: Vector) -> float:
     """Return a . (b x c)."""
-    return _dot(a, _cross(b, c))
+    return dot(a, _cross(b, c))
 
 
 @numba.njit(cache=True)
@@ -81,15 +76,15 @@ def corner_change(e: Frame, before: Frame, d: Frame, resistance: float, least: f
     lack_before = lack_of(_volume(before[0], before[1], before[2]), least)
     if lack <= 0.0 or lack_before <= 0.0:
         return resistance * (max(lack, 0.0) ** 3 - max(lack_before, 0.0) ** 3)
-    larger = _dot(d[0], _cross(e[1], e[2])) + _dot(d[1], _cross(e[2], before[0]))
-    larger += _dot(d[2], _cross(before[0], before[1]))
+    larger = dot(d[0], _cross(e[1], e[2])) + dot(d[1], _cross(e[2], before[0]))
+    larger += dot(d[2], _cross(before[0], before[1]))
     return -resistance * larger / least * (lack**2 + lack * lack_before + lack_before**2)
 
 
 @numba.njit(cache=True)
 def corner_slope(e: Frame, n: Frame, resistance: float, least: float) -> float:
     """Return d energy / d volume of a corner with the edges e and cofactors n [N/m^2]: not positive."""
-    lack = max(lack_of(_dot(e[0], n[0]), least), 0.0)
+    lack = max(lack_of(dot(e[0], n[0]), least), 0.0)
     return -3.0 * resistance * lack * lack / least
 
 
@@ -100,20 +95,19 @@ def corner_product(e: Frame, n: Frame, w: Frame, resistance: float, least: float
     projected : without what the curvature of J adds
     """
     slope, curvature = corner_slope(e, n, resistance, least), corner_curvature(e, n[0], resistance, least)
-    change = curvature * (_dot(n[0], w[0]) + _dot(n[1], w[1]) + _dot(n[2], w[2]))
+    change = curvature * (dot(n[0], w[0]) + dot(n[1], w[1]) + dot(n[2], w[2]))
     if projected:
         slope = 0.0
     return (
-        _turned(change, n[0], slope, w[1], e[2], e[1], w[2]),
-        _turned(change, n[1], slope, w[2], e[0], e[2], w[0]),
-        _turned(change, n[2], slope, w[0], e[1], e[0], w[1]),
+        _turned(change, n[0], slope, _cross(w[1], e[2]), _cross(e[1], w[2])),
+        _turned(change, n[1], slope, _cross(w[2], e[0]), _cross(e[2], w[0])),
+        _turned(change, n[2], slope, _cross(w[0], e[1]), _cross(e[0], w[1])),
     )
 
 
 @numba.njit(cache=True, inline="always")
-def _turned(change: float, n: Vector, slope: float, w_1: Vector, e_2: Vector, e_1: Vector, w_2: Vector) -> Vector:
-    """Return change n + slope (w_1 x e_2 + e_1 x w_2)."""
-    a, b = _cross(w_1, e_2), _cross(e_1, w_2)
+def _turned(change: float, n: Vector, slope: float, a: Vector, b: Vector) -> Vector:
+    """Return change n + slope (a + b)."""
     return (
         change * n[0] + slope * (a[0] + b[0]),
         change * n[1] + slope * (a[1] + b[1]),
@@ -188,7 +182,7 @@ def _add_corner(rows: Rows, at: Indices, frame: int, factor: float, vectors: Fra
 def corner_curvature(e: Frame, n: Vector, resistance: float, least: float) -> float:
     """Return d^2 energy / d volume^2 of a corner with the edges e, n the first of its cofactors
     [N/m^5]: not negative, and 0 where it does not resist."""
-    return 6.0 * resistance * max(lack_of(_dot(e[0], n), least), 0.0) / least**2
+    return 6.0 * resistance * max(lack_of(dot(e[0], n), least), 0.0) / least**2
 
 
 @numba.njit(cache=True)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host, to_host
 from msmpetsc.elasticity.cell_volume import Cells
@@ -47,7 +46,7 @@ class Flops:
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "Flops":
-        """Return those of a lattice, M included."""
+        """Return the operations on a lattice, M included."""
         springs, stiffens, owned = len(lattice.springs), lattice.stiffening > 0, lattice.owned
         if lattice.solid is not None:
             around = len(lattice.local_cells) * (2 if lattice.viscous else 1)
@@ -78,7 +77,7 @@ class Elasticity:
     call. Where there is viscosity E has its D, of the step that it was given last.
     """
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+    def __init__(self, lattice: Lattice):
         self.owned, self.flops = lattice.owned, Flops.of_lattice(lattice)
         on_cpu = on_host(lattice.nodes)
         self.springs: SpringScatter | SpringGather | None = None

@@ -15,9 +15,9 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
     rows, measure : (k,) local nodes, and what is measured of each
     """
     rows, measure = to_host(rows), np.nan_to_num(to_host(measure), nan=np.inf)
-    best = int(np.argmax(measure)) if len(rows) else 0
     candidate: tuple[float, int, Floats | None] = (-1.0, 0, None)
     if len(rows):
+        best = int(np.argmax(measure))
         candidate = measure[best], lattice.global_numbers[rows[best]], to_host(lattice.nodes[int(rows[best])])
     _, number, point = max(comm.allgather(candidate), key=lambda candidate: candidate[0])
     return f"node {number}, {rest_point(lattice, number, point)}"

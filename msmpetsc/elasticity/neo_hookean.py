@@ -351,25 +351,25 @@ def add_concavity(blocks: Blocks, h4: float, q: Positions, concavity: Floats) ->
 
 @numba.njit(cache=True)
 def add_coarse(
-    start: Indices, order: Indices, code: Array, blocks: Blocks, state: Rows, t2: float, weights: Rows, places: Indices,
-    values: Rows,
-) -> None:  # fmt: skip
+    fine: tuple[Indices, Indices, Array], blocks: Blocks, state: Rows, weights: Rows, places: Indices, values: Rows
+) -> None:
     """Add t^2 times the Hessians of cells, whose corners follow coarse cells of 2 x 2 x 2, to these cells' blocks.
 
-    start, order, code : the fine cells of each coarse one (solve.multigrid.galerkin.ByCell)
-    weights            : (28, 8) of a coarse cell's corners at the place of each code
-    places, values     : (c, 36) rows of values (b, 9), the blocks of a coarse cell's pairs of corners; -1 of none
+    fine           : the fine cells of each coarse one (solve.multigrid.galerkin.ByCell)
+    weights        : (28, 8) of a coarse cell's corners at the place of each code, times t [s]
+    places, values : (c, 36) rows of values (b, 9), the blocks of a coarse cell's pairs of corners; -1 of none
     """
     w, g, modes, pushed, n = np.zeros(WORK), np.empty((8, 3)), np.empty((8, 4)), np.empty((8, 4)), np.empty((8, 3))
     f = np.empty((3, 3))
+    start, order, code = fine
     for i in range(len(start) - 1):
         for at in range(start[i], start[i + 1]):
             b, lane = order[at] // LANES, order[at] % LANES
             load(blocks.constants, blocks.which[b], w, CONSTANTS)
             load(state, b, w, AT_STATE)
-            s, m = AT_STATE + lane, t2 * w[CONSTANTS + 104 + lane]
+            s, m = AT_STATE + lane, w[CONSTANTS + 104 + lane]
             of_f = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
-            slope, curvature, k = t2 * w[s + 72], t2 * w[s + 80], cofactors(of_f)
+            slope, curvature, k = w[s + 72], w[s + 80], cofactors(of_f)
             for r in range(9):
                 f[r // 3, r % 3] = of_f[r]
             for a in range(8):
@@ -389,7 +389,7 @@ def add_coarse(
                     if places[i, pair] >= 0:
                         own = m * (g[a, 0] * g[c, 0] + g[a, 1] * g[c, 1] + g[a, 2] * g[c, 2])
                         for mode in range(4):
-                            own += t2 * modes[a, mode] * pushed[c, mode]
+                            own += modes[a, mode] * pushed[c, mode]
                         _add_block(values[places[i, pair]], own, curvature, n[a], n[c], slope, f, g[a], g[c])
 
 

@@ -29,6 +29,7 @@ from msmpetsc.lattice.lattice import Lattice
 
 Product = Callable[[Array, Array], None]  # adds (a Hessian) v [N] to the second argument
 Vector = tuple[float, float, float]
+Four = tuple[float, float, float, float]
 
 SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a symmetric block stand among 6
 
@@ -36,10 +37,16 @@ SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a sy
 TINY = 1e-300
 
 
+@numba.njit(cache=True, inline="always")
+def dot(a: Vector, b: Vector) -> float:
+    """Return a . b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 @numba.njit(cache=True)
-def spring_energy(x: float, y: float, z: float, r: float, k: float, b: float) -> float:
-    """Return 1/2 k (|(x, y, z)| - r)^2 (Eq. 13), and what stiffening b adds, [J]."""
-    stretch = math.sqrt(x * x + y * y + z * z) - r
+def spring_energy(e: Vector, r: float, k: float, b: float) -> float:
+    """Return 1/2 k (|e| - r)^2 (Eq. 13) of a spring e, and what stiffening b adds, [J]."""
+    stretch = math.sqrt(dot(e, e)) - r
     energy = 0.5 * k * stretch * stretch
     if b > 0.0:
         strain = stretch / r
@@ -48,23 +55,23 @@ def spring_energy(x: float, y: float, z: float, r: float, k: float, b: float) ->
 
 
 @numba.njit(cache=True)
-def spring_change(u: float, v: float, w: float, dx: float, dy: float, dz: float, r: float, k: float, b: float) -> float:
-    """Return the energy of a spring that was (u, v, w) and changed by (dx, dy, dz) less what it was [J]."""
-    x, y, z = u + dx, v + dy, w + dz
-    length, before = math.sqrt(x * x + y * y + z * z), math.sqrt(u * u + v * v + w * w)
-    total = length + before
-    longer = (dx * (x + u) + dy * (y + v) + dz * (z + w)) / max(total, TINY)
+def spring_change(before: Vector, d: Vector, r: float, k: float, b: float) -> float:
+    """Return the energy of a spring that changed by d less what it was ``before`` [J]."""
+    e = before[0] + d[0], before[1] + d[1], before[2] + d[2]
+    length, length_before = math.sqrt(dot(e, e)), math.sqrt(dot(before, before))
+    total = length + length_before
+    longer = (d[0] * (e[0] + before[0]) + d[1] * (e[1] + before[1]) + d[2] * (e[2] + before[2])) / max(total, TINY)
     change = 0.5 * k * longer * (total - 2.0 * r)
     if b > 0.0:  # s^4 / 4 changes by (s^2 + s_0^2) / 2 for each unit that s^2 / 2 does
-        strain, strain_before = length / r - 1.0, before / r - 1.0
+        strain, strain_before = length / r - 1.0, length_before / r - 1.0
         change *= 1.0 + 0.5 * b * (strain * strain + strain_before * strain_before)
     return change
 
 
 @numba.njit(cache=True)
-def spring_pull(x: float, y: float, z: float, r: float, k: float, b: float) -> float:
-    """Return f [N/m]: the gradient at the end that (x, y, z) points to is f times that."""
-    length = math.sqrt(x * x + y * y + z * z)
+def spring_pull(e: Vector, r: float, k: float, b: float) -> float:
+    """Return f [N/m]: the gradient at the end that a spring e points to is f e."""
+    length = math.sqrt(dot(e, e))
     f = k * (1.0 - r / max(length, TINY))
     if b > 0.0:
         strain = length / r - 1.0
@@ -73,15 +80,13 @@ def spring_pull(x: float, y: float, z: float, r: float, k: float, b: float) -> f
 
 
 @numba.njit(cache=True)
-def spring_block(
-    x: float, y: float, z: float, r: float, k: float, b: float, projected: bool
-) -> tuple[float, float, float, float]:
-    """Return c, e of the spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
+def spring_block(spring: Vector, r: float, k: float, b: float, projected: bool) -> Four:
+    """Return c, e of a spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
 
     It is k (1 + 3 b s^2) along the spring and k (1 - r/l) (1 + b s^2) across it, l its length;
     ``projected`` leaves out the negative part that a compressed spring has across.
     """
-    length, tangent = math.sqrt(max(x * x + y * y + z * z, TINY)), 1.0
+    length, tangent = math.sqrt(max(dot(spring, spring), TINY)), 1.0
     across = 1.0 - r / length
     if b > 0.0:
         strain = length / r - 1.0
@@ -90,16 +95,14 @@ def spring_block(
     if projected:
         across = max(across, 0.0)
     along = math.sqrt(k * (tangent - across)) / length  # across is never the greater
-    return k * across, along * x, along * y, along * z
+    return k * across, along * spring[0], along * spring[1], along * spring[2]
 
 
 @numba.njit(cache=True)
-def block_product(
-    c: float, ex: float, ey: float, ez: float, dx: float, dy: float, dz: float
-) -> tuple[float, float, float]:
+def block_product(c: float, e: Vector, d: Vector) -> Vector:
     """Return (c I + e e^T) d."""
-    along = ex * dx + ey * dy + ez * dz
-    return c * dx + along * ex, c * dy + along * ey, c * dz + along * ez
+    along = dot(e, d)
+    return c * d[0] + along * e[0], c * d[1] + along * e[1], c * d[2] + along * e[2]
 
 
 class Springs(NamedTuple):
@@ -128,8 +131,7 @@ def between(q: Positions, a: int, b: int) -> Vector:
 def _elastic_energy(first, count, step, q, ends, rest_length, stiffness, stiffening, sums):
     energy = 0.0
     for s in range(first, count, step):
-        x, y, z = between(q, ends[s, 1], ends[s, 0])
-        energy += spring_energy(x, y, z, rest_length[s], stiffness[s], stiffening)
+        energy += spring_energy(between(q, ends[s, 1], ends[s, 0]), rest_length[s], stiffness[s], stiffening)
     if first < count:
         sums[first] = energy
 
@@ -138,10 +140,10 @@ def _elastic_energy(first, count, step, q, ends, rest_length, stiffness, stiffen
 def _elastic_change(first, count, step, base, moved, ends, rest_length, stiffness, stiffening, sums):
     change = 0.0
     for s in range(first, count, step):
-        u, v, w = between(base, ends[s, 1], ends[s, 0])
+        before = between(base, ends[s, 1], ends[s, 0])
         # how the ends moved, from node to node: a difference of springs would keep only the digits of a spring
-        dx, dy, dz = between(moved, ends[s, 1], ends[s, 0])
-        change += spring_change(u, v, w, dx, dy, dz, rest_length[s], stiffness[s], stiffening)
+        d = between(moved, ends[s, 1], ends[s, 0])
+        change += spring_change(before, d, rest_length[s], stiffness[s], stiffening)
     if first < count:
         sums[first] = change
 
@@ -205,14 +207,14 @@ def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None
     for s in range(len(ends)):
         a = ends[s, 0]
         b = ends[s, 1]
-        x, y, z = between(q, b, a)
-        f = spring_pull(x, y, z, rest_length[s], stiffness[s], stiffening)
-        gradient[a, 0] += f * x
-        gradient[a, 1] += f * y
-        gradient[a, 2] += f * z
-        gradient[b, 0] -= f * x
-        gradient[b, 1] -= f * y
-        gradient[b, 2] -= f * z
+        e = between(q, b, a)
+        f = spring_pull(e, rest_length[s], stiffness[s], stiffening)
+        gradient[a, 0] += f * e[0]
+        gradient[a, 1] += f * e[1]
+        gradient[a, 2] += f * e[2]
+        gradient[b, 0] -= f * e[0]
+        gradient[b, 1] -= f * e[1]
+        gradient[b, 2] -= f * e[2]
 
 
 @numba.njit(cache=True)
@@ -224,8 +226,8 @@ def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> N
     """
     ends, rest_length, stiffness, stiffening = springs
     for s in range(len(ends)):
-        x, y, z = between(q, ends[s, 1], ends[s, 0])
-        push = -2.0 * min(spring_pull(x, y, z, rest_length[s], stiffness[s], stiffening), 0.0)
+        e = between(q, ends[s, 1], ends[s, 0])
+        push = -2.0 * min(spring_pull(e, rest_length[s], stiffness[s], stiffening), 0.0)
         concavity[ends[s, 0]] += push  # also where there is none: to step over these takes longer
         concavity[ends[s, 1]] += push
 
@@ -238,8 +240,8 @@ def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Row
     """
     ends, rest_length, stiffness, stiffening = springs
     for s in range(len(ends)):
-        x, y, z = between(q, ends[s, 1], ends[s, 0])
-        block = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, projected)
+        e = between(q, ends[s, 1], ends[s, 0])
+        block = spring_block(e, rest_length[s], stiffness[s], stiffening, projected)
         for i in range(4):
             blocks[s, i] = block[i]
 
@@ -249,8 +251,8 @@ def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
     ends, rest_length, stiffness, stiffening = springs
     for s in range(len(ends)):
-        x, y, z = between(q, ends[s, 1], ends[s, 0])
-        c, ex, ey, ez = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, True)
+        e = between(q, ends[s, 1], ends[s, 0])
+        c, ex, ey, ez = spring_block(e, rest_length[s], stiffness[s], stiffening, True)
         for end in range(2):
             add_spring_block(blocks[ends[s, end]], c, ex, ey, ez)
 
@@ -272,8 +274,8 @@ def add_elastic_product(ends: Indices, blocks: Rows, v: Rows, product: Rows) -> 
                 product[first, 1] += sy
                 product[first, 2] += sz
             first, x, y, z, sx, sy, sz = a, v[a, 0], v[a, 1], v[a, 2], none, none, none
-        dx, dy, dz = x - v[b, 0], y - v[b, 1], z - v[b, 2]
-        fx, fy, fz = block_product(blocks[s, 0], blocks[s, 1], blocks[s, 2], blocks[s, 3], dx, dy, dz)
+        d = x - v[b, 0], y - v[b, 1], z - v[b, 2]
+        fx, fy, fz = block_product(blocks[s, 0], (blocks[s, 1], blocks[s, 2], blocks[s, 3]), d)
         sx += fx
         sy += fy
         sz += fz
@@ -361,11 +363,11 @@ def _gradient_around(first, count, step, q, neighbour, kind, stiffness, lengths,
             j = neighbour[s, i]
             if j < 0:
                 break
-            x, y, z = q[i, 0] - q[j, 0], q[i, 1] - q[j, 1], q[i, 2] - q[j, 2]
-            f = spring_pull(x, y, z, lengths[kind[s, i]], stiffness[s, i], stiffening)
-            gx += f * x
-            gy += f * y
-            gz += f * z
+            e = between(q, j, i)
+            f = spring_pull(e, lengths[kind[s, i]], stiffness[s, i], stiffening)
+            gx += f * e[0]
+            gy += f * e[1]
+            gz += f * e[2]
         gradient[i, 0] += gx
         gradient[i, 1] += gy
         gradient[i, 2] += gz
@@ -379,8 +381,7 @@ def _concavity_around(first, count, step, q, neighbour, kind, stiffness, lengths
             j = neighbour[s, i]
             if j < 0:
                 break
-            x, y, z = q[i, 0] - q[j, 0], q[i, 1] - q[j, 1], q[i, 2] - q[j, 2]
-            total -= 2.0 * min(spring_pull(x, y, z, lengths[kind[s, i]], stiffness[s, i], stiffening), 0.0)
+            total -= 2.0 * min(spring_pull(between(q, j, i), lengths[kind[s, i]], stiffness[s, i], stiffening), 0.0)
         concavity[i] += total
 
 
@@ -392,13 +393,12 @@ def _product_around(first, count, step, q, neighbour, kind, stiffness, lengths, 
             j = neighbour[s, i]
             if j < 0:
                 break
-            x, y, z = q[i, 0] - q[j, 0], q[i, 1] - q[j, 1], q[i, 2] - q[j, 2]
-            c, ex, ey, ez = spring_block(x, y, z, lengths[kind[s, i]], stiffness[s, i], stiffening, projected)
-            dx, dy, dz = v[i, 0] - v[j, 0], v[i, 1] - v[j, 1], v[i, 2] - v[j, 2]
-            fx, fy, fz = block_product(c, ex, ey, ez, dx, dy, dz)
-            px += fx
-            py += fy
-            pz += fz
+            length, k = lengths[kind[s, i]], stiffness[s, i]
+            c, ex, ey, ez = spring_block(between(q, j, i), length, k, stiffening, projected)
+            f = block_product(c, (ex, ey, ez), between(v, j, i))
+            px += f[0]
+            py += f[1]
+            pz += f[2]
         product[i, 0] += px
         product[i, 1] += py
         product[i, 2] += pz
@@ -411,5 +411,5 @@ def _diagonal_around(first, count, step, q, neighbour, kind, stiffness, lengths,
             j = neighbour[s, i]
             if j < 0:
                 break
-            x, y, z = q[i, 0] - q[j, 0], q[i, 1] - q[j, 1], q[i, 2] - q[j, 2]
-            add_spring_block(blocks[i], *spring_block(x, y, z, lengths[kind[s, i]], stiffness[s, i], stiffening, True))
+            length, k = lengths[kind[s, i]], stiffness[s, i]
+            add_spring_block(blocks[i], *spring_block(between(q, j, i), length, k, stiffening, True))

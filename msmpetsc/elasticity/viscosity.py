@@ -84,7 +84,7 @@ class Viscosity:
 
     @classmethod
     def of_solid(cls, solid: NeoHookean, factor: float, rest: Positions) -> "Viscosity":
-        """Return that of a solid; ``factor`` is beta / tau, ``rest`` the nodes (l, 3) [m]."""
+        """Return the viscosity of a solid; ``factor`` is beta / tau, ``rest`` the nodes (l, 3) [m]."""
         constants = solid.blocks.constants.copy().reshape(-1, ROWS, LANES)
         constants[:, 6 : ROWS - 2] = 0.0
         constants[:, ROWS - 2 :] *= factor

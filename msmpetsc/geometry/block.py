@@ -1,4 +1,4 @@
-"""The 3x3x3 cells, 4x4x4 nodes, 108 squares and 144 edges around a cell: their numbering, as tables of constants.
+"""Numbering of the 3x3x3 cells around a cell, and of their nodes, squares and edges, as tables.
 
 Lengths are in units of the cell size, with the cell's low corner at 0. Cell (x,y,z), each 0..2, of the block is
 entry 9x + 3y + z and lies at offset (x-1, y-1, z-1): the cell itself is 13. Node (x,y,z), each 0..3, is entry
@@ -72,7 +72,7 @@ def corner_node(v: int) -> int:
 
 @numba.njit(cache=True)
 def cells_around(v: int, valid: Mask) -> int:
-    """Return which of the 8 cells around corner v are valid: bit 4i + 2j + k for the cell at (i,j,k) in {0,1}^3."""
+    """Return a bit mask of the valid cells around corner v: bit 4i + 2j + k of the cell (i,j,k)."""
     first = 9 * corner_bit(v, 0) + 3 * corner_bit(v, 1) + corner_bit(v, 2)
     mask = 0
     for bit in range(8):

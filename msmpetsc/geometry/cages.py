@@ -19,7 +19,7 @@ from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_ins
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
-from msmpetsc.geometry.touched_cells import sampled_cells, touched_cells
+from msmpetsc.geometry.touched_cells import touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
@@ -27,7 +27,6 @@ WHOLE = 1 - 1e-9  # a share above this is rounding away from 1
 LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
 TOLERANCE = 0.01  # of a wanted number of cells
 SEARCH_LIMIT = 30  # sizes tried; a real model needs three to six
-MARK = {"exact": touched_cells, "sample": sampled_cells}
 
 
 @dataclass(frozen=True)
@@ -62,23 +61,19 @@ class Cages:
     squares: Rows | None = None
     fills: tuple[bool, ...] = (False,)
 
-    def squares_of(self, ijk: Indices) -> Rows | None:
-        """Return the squares (c, 3) of valid cells (c, 3) of any rank; None where all are whole (collective)."""
-        return None if self.squares is None else self.table.rows_of(encode_morton(ijk), self.squares)
-
     @property
     def ijk(self) -> Indices:
         """Grid index (n_local, 3) of this rank's cells."""
         return decode_morton(self.table.keys)
 
-    def share_of(self, ijk: Indices) -> Rows | None:
-        """Return the shares (c, 2, 2, 2) of valid cells (c, 3) of any rank; None where all are whole (collective)."""
-        return None if self.share is None else self.table.rows_of(encode_morton(ijk), self.share)
+    def of_cells(self, ijk: Indices, rows: Rows | None) -> Rows | None:
+        """Return the rows, those of ``share`` or ``squares``, of valid cells (c, 3) of any rank (collective)."""
+        return None if rows is None else self.table.rows_of(encode_morton(ijk), rows)
 
 
 @dataclass(frozen=True)
 class SlabCells:
-    """What a rank finds in its slab of the grid, axes cycled, the longest first.
+    """Valid cells in a rank's slab of the grid, whose axes are cycled so that the longest is first.
 
     boundary : (b, 3) cells that the surface touches
     gaps     : (g, 4) interior cells (geometry.interior)
@@ -94,21 +89,14 @@ class SlabCells:
         return int(comm.allreduce(len(self.boundary) + int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum())))
 
 
-def fill(
-    bodies: Sequence[BodySurface],
-    cell_size: float,
-    method: str = "exact",
-    max_cells: int = 5_000_000,
-    boundary: str = "fill",
-) -> Cages:
+def fill(bodies: Sequence[BodySurface], cell_size: float, max_cells: int = 5_000_000, boundary: str = "fill") -> Cages:
     """Return the valid cells of side ``cell_size`` [m] of all bodies (collective).
 
-    method   : "exact", or "sample" for the paper's sample points
     boundary : "fill": a boundary cell counts for the share of it that is inside; "whole", as in the paper
     raises   : InputError if there would be more than ``max_cells``
     """
     comm, grids = bodies[0].comm, BodyGrids.covering([body.bounds for body in bodies], cell_size)
-    found = slabs_of_all(bodies, grids, method, max_cells, boundary)
+    found = slabs_of_all(bodies, grids, max_cells, boundary)
     refuse_beyond_memory(comm, sum(cells.count(comm) for cells in found))
     parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, found, strict=True)]
     keys = encode_morton(np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(parts)]))
@@ -128,12 +116,12 @@ Inside = tuple[Rows, Rows]  # shares (n, 2, 2, 2) of cells' corners, and their s
 
 
 def _whole(count: int) -> Inside:
-    """Return what is inside whole cells."""
+    """Return the shares and squares of whole cells."""
     return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
 
 
 def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Inside | None]:
-    """Return grid index (n, 3), kind (n,) and inside of this rank's cells of a body (collective)."""
+    """Return grid index (n, 3), kind (n,), shares and squares of a rank's cells (collective)."""
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(cells.boundary), len(interior)])
@@ -145,7 +133,7 @@ def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) ->
 
 
 def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
-    """Return what of boundary cells is inside; None, with a warning, if the surface does not tell.
+    """Return shares and squares of boundary cells; None, with a warning, where none are defined.
 
     A share that is raised to the least, or lowered to 1, is mass put into or taken out of that very corner, which then
     counts in the squares, too.
@@ -163,39 +151,37 @@ def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
     return counted, squares + (counted - share).mean(axis=(1, 2, 3))[:, None] / 4
 
 
-def slabs_of_all(
-    bodies: Sequence[BodySurface], grids: BodyGrids, method: str, max_cells: int, boundary: str
-) -> list[SlabCells]:
-    """Return the valid cells of this rank's slab of each body (collective); arguments as of ``fill``."""
+def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str) -> list[SlabCells]:
+    """Return the valid cells of each body in this rank's slab (collective)."""
     found: list[SlabCells] = []
     comm, before = bodies[0].comm, 0
     for body, grid in zip(bodies, grids.grids, strict=True):
         least = before + _least_cells(body, grid)
         _refuse_above(max_cells, least, grid)
         refuse_beyond_memory(comm, least)
-        found.append(_slab_cells(body, grid, method, boundary))
+        found.append(_slab_cells(body, grid, boundary))
         before += found[-1].count(comm)
         _refuse_above(max_cells, before, grid)
     return found
 
 
-def _slab_cells(body: BodySurface, grid: Grid, method: str, boundary: str) -> SlabCells:
-    """Return the valid cells of this rank's slab (collective); arguments as of ``fill``."""
+def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
+    """Return the valid cells of a body in this rank's slab (collective)."""
     axes = _axes(body)
     slab = Slab.of_rank(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     corners = _slab_triangles(body, grid, axes)
-    touched = _mark(corners, grid.shape[axes], slab, method)
+    touched = _mark(corners, grid.shape[axes], slab)
     if not body.report.closed:
         return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
     gaps = enclosed_gaps(body.comm, touched, slab)
     columns = _columns(body, corners, grid.shape[axes], slab) if boundary == "fill" else None
     if columns is not None:  # a cave that a surface of its own bounds is enclosed, but not inside
-        gaps = gaps[columns.corner_shares(gaps[:, [0, 1, 3]])[:, 0, 0, 0] > OUTSIDE]
+        gaps = gaps[columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > OUTSIDE]
     return SlabCells(touched, gaps, columns)
 
 
 def _columns(body: BodySurface, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
-    """Return what the triangles cut out of this rank's cells, None if they are not wound one way (collective)."""
+    """Return the cells that triangles cut; None if those are wound inconsistently (collective)."""
     outwards = corners if body.report.volume > 0 else corners[:, ::-1]
     columns = Columns.crossed(outwards, *_limits(shape, slab))
     return columns if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK else None
@@ -207,12 +193,12 @@ def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
 
 
 def _least_cells(body: BodySurface, grid: Grid) -> float:
-    """Return fewer cells than there will be, known before they are made."""
+    """Return a lower bound of the number of cells."""
     return max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
 
 
 def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
-    """Raise InputError for a lattice of which no rank's share could be held, whatever the scene asks of it."""
+    """Raise InputError for a lattice whose parts cannot fit into memory (collective)."""
     memory, needed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), cells * LEAST_OF_A_CELL / comm.size
     with together(comm):
         if needed > memory:
@@ -233,7 +219,7 @@ def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
 
 
 def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices) -> Rows:
-    """Return the triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
+    """Return the triangles (f, 3, 3), in cell units, that reach this rank's slab (collective)."""
     corners = np.empty((0, 3, 3))
     if body.surface is not None:
         corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
@@ -246,21 +232,17 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices) -> Rows:
     return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
 
 
-def _mark(corners: Rows, shape: Indices, slab: Slab, method: str) -> Indices:
-    """Return the distinct boundary cells (b, 3) of the slab in lexicographic order.
-
-    The paper's samples of a triangle may lie in another slab than its rank's, but then the
-    triangle was sent there too.
-    """
+def _mark(corners: Rows, shape: Indices, slab: Slab) -> Indices:
+    """Return the distinct boundary cells (b, 3) of the slab in lexicographic order."""
     keys = [np.empty(0, np.int64)]
     for start in range(0, len(corners), CHUNK):
-        cells = MARK[method](corners[start : start + CHUNK], *_limits(shape, slab))
+        cells = touched_cells(corners[start : start + CHUNK], *_limits(shape, slab))
         keys.append(np.unique(packed(cells)))
     return unpacked(np.unique(np.concatenate(keys)))
 
 
 def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices) -> Indices:
-    """Return the interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size.
+    """Return the interior cells of an open surface, by the winding numbers of their centres.
 
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
     An open surface has no slabs of its own meaning: every rank needs all of it.
@@ -281,12 +263,13 @@ def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, b
 
 
 def choose_cell_size(
-    bodies: Sequence[BodySurface], count: int, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+    bodies: Sequence[BodySurface], count: int, max_cells: int = 5_000_000, boundary: str = "fill"
 ) -> float:
-    """Return the cell size [m] that gives bodies ``count`` cells within 1%, or the nearest with a warning (collective).
+    """Return the cell size [m] that gives ``count`` cells within 1% (collective).
 
     The number of cells falls about as a power of the size, so this is a secant search in logarithms,
-    kept inside the bracket found so far: the number is a step function and not quite monotone.
+    kept inside a bracket: the number is a step function and not quite monotone. Where it has no such
+    size the nearest is taken, with a warning.
 
     raises : InputError if ``count`` is more than ``max_cells``, or than memory can hold
     """
@@ -298,7 +281,7 @@ def choose_cell_size(
     guess = np.log(_first_guess(bodies, count))
     for _ in range(SEARCH_LIMIT):
         grids = BodyGrids.covering(bounds, np.exp(guess))
-        found = slabs_of_all(bodies, grids, method, 20 * max_cells, boundary)
+        found = slabs_of_all(bodies, grids, 20 * max_cells, boundary)
         excess[guess] = np.log(sum(cells.count(comm) for cells in found) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
         if abs(np.expm1(excess[nearest])) <= TOLERANCE:
@@ -310,14 +293,14 @@ def choose_cell_size(
 
 
 def _first_guess(bodies: Sequence[BodySurface], count: int) -> float:
-    """Return the size h with V / h^3 + 3/4 A / h^2 = count: the volume, and what boundary cells stick out."""
+    """Return h with V / h^3 + 3/4 A / h^2 = count, as boundary cells stick out of the volume V."""
     area, volume = sum(body.report.area for body in bodies), sum(abs(body.report.volume) for body in bodies)
     roots = np.roots([count, 0, -0.75 * area, -volume])
     return float(roots.real.max())
 
 
 def _next_guess(excess: dict[float, float], nearest: float) -> float:
-    """Return where the secant through the two best tries meets zero, else the middle of the bracket."""
+    """Return the zero of the secant through the two best tries, else the middle of the bracket."""
     slope = -2.5  # between that of a shell and that of a solid
     if len(excess) > 1:
         second = min((size for size in excess if size != nearest), key=lambda size: abs(excess[size]))

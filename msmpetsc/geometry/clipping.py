@@ -1,4 +1,4 @@
-"""Clipping of polygons to the layers of a grid, in cell units: what boundary cells and their shares need."""
+"""Clipping of polygons to the layers of a grid, in cell units."""
 
 import numba
 import numpy as np
@@ -8,7 +8,7 @@ from msmpetsc.backend.arrays import Array, Rows
 
 @numba.njit(cache=True)
 def grown(rows: Array, used: int) -> Array:
-    """Return the rows (r, n), of which so many are used, in an array that has room for one more."""
+    """Return an array with the ``used`` first of these rows (r, n) and room for one more."""
     if used < len(rows):
         return rows
     larger = np.empty((2 * len(rows), rows.shape[1]), rows.dtype)
@@ -18,7 +18,7 @@ def grown(rows: Array, used: int) -> Array:
 
 @numba.njit(cache=True)
 def _clip(polygon: Rows, n: int, axis: int, plane: float, side: float, out: Rows) -> int:
-    """Sutherland-Hodgman: the part of the polygon with side * (x[axis] - plane) >= 0. Returns its size."""
+    """Clip a polygon to side * (x[axis] - plane) >= 0 (Sutherland-Hodgman); return its size."""
     m = 0
     for a in range(n):
         p, q = polygon[a], polygon[(a + 1) % n]
@@ -38,7 +38,7 @@ def _clip(polygon: Rows, n: int, axis: int, plane: float, side: float, out: Rows
 
 @numba.njit(cache=True)
 def clip_between(polygon: Rows, n: int, axis: int, planes: tuple[float, float], work: Rows, out: Rows) -> int:
-    """Cut the polygon to between two planes of an axis. Return its size."""
+    """Clip a polygon to the layer between two planes of an axis; return its size."""
     m = _clip(polygon, n, axis, planes[0], 1.0, work)
     return _clip(work, m, axis, planes[1], -1.0, out)
 

@@ -1,4 +1,4 @@
-"""How much of a cell lies inside the surface, and near which of its corners: what a boundary cell weighs.
+"""Shares of a cell and of its corners that lie inside the surface, by which boundary cells weigh.
 
 The share of a corner is 8 times the integral of its trilinear function N over the part of the cell that is inside:
 1 in a whole cell, and on average over the corners the share of the volume. A mean of N alone would spread what a cell
@@ -34,8 +34,9 @@ LEAK = 1e-6  # windings left below a column: above rounding, far below what one 
 SEEN, SUMS = 6, 17  # sums of a piece: those that count for the cells below it too, and all
 
 # barycentric coordinates and weights that integrate polynomials of degree 4 over a triangle (Dunavant 1985)
-_ONE, _TWO = 0.445948490915965, 0.091576213509771
-POINTS = np.array([np.roll([1 - 2 * a, a, a], turn) for a in (_ONE, _TWO) for turn in range(3)])
+POINTS = np.array(
+    [np.roll([1 - 2 * a, a, a], turn) for a in (0.445948490915965, 0.091576213509771) for turn in range(3)]
+)
 WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
@@ -56,7 +57,7 @@ class Columns:
 
     @classmethod
     def crossed(cls, triangles: Rows, low: Indices, high: Indices) -> "Columns":
-        """Return those of triangles (f, 3, 3) within low <= cell < high, (3,) int."""
+        """Return the columns of triangles (f, 3, 3) within low <= cell < high, (3,) int."""
         starts = range(0, max(1, len(triangles)), CHUNK)
         pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
         parts = [_sums_of_keys(packed(cells), values) for cells, values in pieces]
@@ -77,13 +78,9 @@ class Columns:
 
     @property
     def leak(self) -> float:
-        """The greatest winding number left below a column: 0 where the surface is closed and wound one way."""
+        """The greatest winding number below a column: 0 of a closed surface wound one way."""
         lowest = np.diff(self.keys // LIMIT, prepend=-1) != 0
         return float(np.abs(self.below[lowest]).max(initial=0.0))
-
-    def corner_shares(self, cells: Indices) -> Rows:
-        """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3)."""
-        return self.inside(cells)[0]
 
     def inside(self, cells: Indices) -> tuple[Rows, Rows]:
         """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3), and their squares (k, 3)."""
@@ -100,7 +97,7 @@ class Columns:
 
 
 def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
-    """Return the distinct keys (c,) in ascending order, and the sums (c, k) of the rows (p, k) of each."""
+    """Return the distinct keys (c,), ascending, and the sums (c, k) of the rows (p, k) of each."""
     distinct, place = np.unique(keys, return_inverse=True)
     sums: Rows = np.empty((len(distinct), values.shape[1]))
     for column, rows in enumerate(values.T):
@@ -110,7 +107,7 @@ def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
 
 @numba.njit(cache=True)
 def _sums_above(column: Indices, values: Rows) -> Rows:
-    """Return for each row the sum of the values (c, k) from it to the end of its column, (c,) ascending."""
+    """Return for each row the sum of the values (c, k) from it to the end of its column (c,)."""
     sums = values.copy()
     for c in range(len(column) - 2, -1, -1):
         if column[c] == column[c + 1]:
@@ -185,7 +182,7 @@ def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> N
 
 
 def sampled_inside(surface: Surface, grid: Grid, cells: Indices) -> tuple[Rows, Rows]:
-    """Return what ``Columns.inside`` does of the grid's cells (c, 3), by samples in an open surface."""
+    """Return shares and squares of cells (c, 3) as ``Columns.inside``, by samples."""
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     along = np.stack([1 - at, at]) / SAMPLES  # the two linear functions of an axis
     middles = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)

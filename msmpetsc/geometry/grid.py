@@ -1,4 +1,4 @@
-"""The uniform grid that a surface is laid into (paper section 4.1), and the Morton order of its cells and nodes.
+"""Uniform grid of a body (paper section 4.1), and the Morton order of its cells and nodes.
 
 In Morton order, cells and nodes near in space are near in number, so a contiguous range of keys is compact.
 """
@@ -13,8 +13,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.errors import InputError
 
-BITS = 21  # an axis: three of them fill 63 bits of a key
-LIMIT = 1 << BITS
+LIMIT = 1 << 21  # cells along an axis: three times 21 bits fill 63 of a key
 PACK = np.array([LIMIT**2, LIMIT, 1])
 CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
 SAME = 1e-9  # cells: a body that is this close to a whole number of cells long has that number
@@ -54,7 +53,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class BodyGrids:
-    """The grids of bodies, all of one cell size, numbered as one grid: each body's is moved along the first axis.
+    """Grids of bodies, of one cell size, numbered as one grid: each is moved along the first axis.
 
     So no two bodies have a cell or a node in common, wherever they are. A body has ``room`` cells, a power of two and
     more than twice what any body takes along any axis: along the Morton curve one body follows the other, each in the
@@ -125,7 +124,7 @@ def _spread(x: int) -> int:
 
 @numba.njit(cache=True)
 def _gather(x: int) -> int:
-    """Return the bits that ``_spread`` has parted."""
+    """Return the inverse of ``_spread``."""
     x &= 0x1249249249249249
     x = (x | x >> 2) & 0x10C30C30C30C30C3
     x = (x | x >> 4) & 0x100F00F00F00F00F

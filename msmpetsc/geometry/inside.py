@@ -1,4 +1,4 @@
-"""Which points lie in a region of a scene that is a box, a sphere or a half space; needs numpy alone."""
+"""Points in regions that are boxes, spheres or half spaces; needs numpy alone."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ EDGE = 1e-6  # of the longest side: what is this near to a region is on its edge
 
 
 def frame_of(region: Region, bounds: Rows) -> tuple[Floats, Floats, float]:
-    """Return the origin (3,), the scale (3,) and the length [m] that a region's numbers are in."""
+    """Return origin (3,), scale (3,) and length [m] of a region's coordinates."""
     sides = bounds[1] - bounds[0]
     return (bounds[0], sides, sides.max()) if region.relative else (np.zeros(3), np.ones(3), 1.0)
 
@@ -46,8 +46,6 @@ def inside_bodies(region: Region, points: Positions, bounds: Rows, body: Indices
     body   : (n,) the body of each point
     meant  : the body whose region it is; None: all
     """
-    if len(bounds) == 1:
-        return inside(region, points, bounds[0])
     where = np.zeros(len(points), bool)
     for number in range(len(bounds)) if meant is None else (meant,):
         own = body == number

@@ -1,4 +1,4 @@
-"""Interior cells: what an exterior flood fill through the gaps between boundary cells does not reach.
+"""Interior cells, which a flood fill from outside does not reach.
 
 Cells are handled a column at a time: the boundary cells of a column (i, j) leave gaps of cells
 between them, and a gap as a whole is inside or outside. So memory follows the boundary, never the
@@ -70,7 +70,7 @@ def _to_previous(comm: MPI.Comm, rows: Indices) -> Indices:
 
 
 def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) -> Indices:
-    """Return the labels made global and equal wherever components of neighbouring slabs are one."""
+    """Return global labels, equal where components of neighbouring slabs are connected."""
     count = int(label.max(initial=EXTERIOR))
     offset = comm.exscan(count) or 0  # type: ignore[attr-defined]  # an intracommunicator
     label = np.where(label == EXTERIOR, EXTERIOR, label + offset)
@@ -110,7 +110,7 @@ def _gaps(cells: Indices) -> Indices:
 
 
 def _links(cells: Indices, gaps: Indices, asked: Indices, side: Indices) -> Indices:
-    """Return the pairs (2, p) of each gap asked for and what touches it in the column beside it.
+    """Return the pairs (2, p) of each gap asked for and those that touch it in the column to one side.
 
     Gap g is node g + 1 of the graph. A gap that reaches past the column's cells touches EXTERIOR.
     """

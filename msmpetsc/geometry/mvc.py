@@ -19,7 +19,7 @@ import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Mask, Rows
-from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, ITSELF, NODES, OF_CORNER, SQUARE
+from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, NODES, OF_CORNER, SQUARE
 
 Frame = tuple[float, float, float, float, float]
 Angles = tuple[float, float, float, float, float]
@@ -29,7 +29,7 @@ FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with 
 
 
 class PointView(NamedTuple):
-    """What a point p sees of its block: see new_view and set_view. The last two are filled where a cage asks."""
+    """Geometry of a point p in its block, by new_view and set_view; the last two on demand."""
 
     planes: Rows  # (3,4) heights of the block's grid planes over p
     angles: Floats  # (144,) g_jk of the grid edges; 0 = not yet
@@ -44,7 +44,7 @@ def new_view() -> PointView:
 
 @numba.njit(cache=True)
 def set_view(u: Floats, view: PointView) -> None:
-    """Make the view that of the point u (3,)."""
+    """Set the view to that of the point u (3,)."""
     for axis in range(3):
         for i in range(4):
             view.planes[axis, i] = i - 1 - u[axis]
@@ -65,7 +65,7 @@ def edge_angle(edge: int, view: PointView) -> float:
 
 @numba.njit(cache=True)
 def turn_from_plane(c: float, length2: float, dot: float, d2: float) -> float:
-    """Return sign(c) times (beta |c| / |e_j x e_k| - the angle that the edge subtends from p's foot in the plane).
+    """Return sign(c) (beta |c| / |e_j x e_k| - the edge's angle from p's foot in the plane).
 
     c = (e_j x e_k)_n, dot = e_j . e_k in the plane, d2 = height^2. The angles of a triangle that does not hold the
     foot sum to 0, so these differences, each of order d2, sum to 2 m_n without cancelling.
@@ -144,20 +144,16 @@ def set_square(square: int, view: PointView) -> None:
 
 
 @numba.njit(cache=True)
-def square_limit(a: float, b: float) -> Weights:
-    """Return the normalised weights (w00, w10, w11, w01) at (a, b) on a square: barycentric in the triangle there."""
-    low, high = min(a, b), max(a, b)
-    return 1.0 - high, max(a - b, 0.0), low, max(b - a, 0.0)
-
-
-@numba.njit(cache=True)
 def set_limit(square: int, view: PointView, weights: Floats) -> bool:
-    """Set the weights of p on the cage's surface if it lies on this closed square; return whether it does."""
+    """Set the weights of p on the cage's surface if it lies on this closed square; return whether it does.
+
+    They are barycentric in the triangle there.
+    """
     a0, a1, b0, b1, d = square_frame(square, view)
     if d != 0.0 or not (a0 <= 0.0 <= a1 and b0 <= 0.0 <= b1):
         return False
     weights[:] = 0.0
-    limit = square_limit(-a0, -b0)
+    limit = 1.0 - max(-a0, -b0), max(b0 - a0, 0.0), min(-a0, -b0), max(a0 - b0, 0.0)
     for i in range(4):
         weights[NODES[square, i]] = limit[i]
     return True
@@ -185,14 +181,3 @@ def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> N
             for i in range(4):
                 weights[NODES[square, i]] += outwards * view.squares[square, i]
     weights /= weights.sum()
-
-
-@numba.njit(cache=True)
-def mvc_weights(u: Rows, weights: Rows) -> None:
-    """Set the mean value coordinates of points in their own cells: u (p,3) in [0,1]; weights (p,64), result."""
-    alone = np.zeros(27, np.bool_)
-    alone[ITSELF] = True
-    view = new_view()
-    for p in range(len(u)):
-        set_view(u[p], view)
-        joined_cage(0, alone, view, weights[p])

@@ -1,4 +1,4 @@
-"""The points of bodies that are nearest to given points."""
+"""Points of bodies that are nearest to given points."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from msmpetsc.geometry.surface import Surface, is_inside
 
 
 def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: Indices) -> Positions:
-    """Return the point (n, 3) [m] of its body (n,) that each (n, 3) is nearest to: itself, inside (collective)."""
+    """Return the nearest points (n, 3) [m] of bodies (n,) to points (n, 3) (collective)."""
     to_root = Route(bodies[0].comm, np.zeros(len(points), np.int64))
     nearest, of_point = to_root.send(points), to_root.send(body)
     for number in np.unique(of_point):
@@ -24,7 +24,7 @@ def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: In
 
 
 def _drawn_in(surface: Surface, points: Positions) -> Positions:
-    """Return points (n, 3), those outside a surface moved to the nearest of it."""
+    """Return points (n, 3), those outside a surface projected onto it."""
     import igl  # for scenes with regions or obstacles
 
     closest = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[2]

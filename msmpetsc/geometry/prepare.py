@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -17,12 +17,9 @@ import pooch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.backend.arrays import Indices, Mask
+from msmpetsc.backend.arrays import Indices
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.geometry.surface import Surface, bounds_of, compact, edge_use, examine, first_of_equal, merged_triangles
-
-if TYPE_CHECKING:
-    import manifold3d
 
 # A repair that keeps less than this of the area did not mend the body but lost it: of
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
@@ -79,12 +76,21 @@ def union(surface: Surface) -> Surface:
     """Join the closed parts into one solid. Each counts as solid, so a cavity is filled."""
     import manifold3d  # of the extra "mesh"
 
-    surface = merge(surface)
+    surface, solids = merge(surface), []
     labels = part_labels(surface)
-    parts = [
-        _solid(Surface(surface.points, surface.triangles[labels == part]), part) for part in range(labels.max() + 1)
-    ]
-    mesh = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add).to_mesh64()
+    for number in range(labels.max() + 1):
+        part = compact(surface.points, surface.triangles[labels == number])
+        report = examine(part)
+        outwards = part.triangles if report.volume > 0 else part.triangles[:, ::-1]
+        solid = manifold3d.Manifold(manifold3d.Mesh64(part.points, np.ascontiguousarray(outwards, np.uint64)))
+        if solid.status() != manifold3d.Error.NoError or solid.is_empty():
+            raise InputError(
+                f"part {number} is no closed, consistently wound surface "
+                f"({report.boundary_edges} boundary edges, {report.nonmanifold_edges} with more than "
+                f"two triangles, {report.inconsistent_edges} inconsistent)"
+            )
+        solids.append(solid)
+    mesh = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).to_mesh64()
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
 
 
@@ -137,7 +143,14 @@ def orient(surface: Surface) -> Surface:
     A patch is what hangs together by edges of exactly two triangles. An open one is turned by
     the volume of the cone from its own middle.
     """
-    patch, flipped = _consistent_winding(first_of_equal(surface.points)[surface.triangles])
+    import igl
+
+    merged = first_of_equal(surface.points)[surface.triangles]
+    turned, patch = igl.bfs_orient(merged)
+    used, forward = edge_use(turned)
+    if ((used == 2) & (forward != 1)).any():
+        raise InputError("it has one side only, as a Möbius band: no winding is consistent")
+    flipped = (turned != merged).any(axis=1)
     corners = surface.points[surface.triangles]
     count = np.bincount(patch)
     middle = [np.bincount(patch, x) / count for x in corners.mean(axis=1).T]
@@ -153,8 +166,7 @@ def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
     from scipy.spatial.transform import Rotation  # a slow import for what few scenes do
 
     axis = np.asarray(turn["axis"], float)
-    angle = np.deg2rad(turn["degrees"])
-    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    rotation = Rotation.from_rotvec(np.deg2rad(turn["degrees"]) * axis / np.linalg.norm(axis))
     return Surface(rotation.apply(surface.points), surface.triangles)
 
 
@@ -164,7 +176,7 @@ STEPS: dict[str, Callable[..., Surface]] = {
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """Carry out a step, its failures as InputError with its name."""
+    """Run a step; raise its failures as InputError with its name."""
     try:
         result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:
@@ -180,7 +192,7 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
 
 
 def cached(step: Callable[..., Surface], surface: Surface, *values: object) -> Surface:
-    """Return what a step makes of a surface and values, of a large one from the disk where it was computed before."""
+    """Return the result of a step; of a large mesh it is kept in a cache on disk."""
     if len(surface.triangles) < LARGE:
         return step(surface, *values)
     versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
@@ -208,47 +220,3 @@ def part_labels(surface: Surface) -> Indices:
     _, labels = connected_components(coo_array((np.ones(len(links[0])), links), shape=(n, n)))
     parts: Indices = np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
     return parts
-
-
-def _solid(part: Surface, number: int) -> "manifold3d.Manifold":
-    """A part as a solid, turned outwards; InputError if it does not bound one."""
-    import manifold3d
-
-    report = examine(part)
-    part = compact(part.points, part.triangles)
-    triangles = part.triangles if report.volume > 0 else part.triangles[:, ::-1]
-    solid = manifold3d.Manifold(manifold3d.Mesh64(part.points, np.ascontiguousarray(triangles, np.uint64)))
-    if solid.status() != manifold3d.Error.NoError or solid.is_empty():
-        raise InputError(
-            f"part {number} is no closed, consistently wound surface "
-            f"({report.boundary_edges} boundary edges, {report.nonmanifold_edges} with more than "
-            f"two triangles, {report.inconsistent_edges} inconsistent)"
-        )
-    return solid
-
-
-def _consistent_winding(triangles: Indices) -> tuple[Indices, Mask]:
-    """Return for each of the (f, 3) merged triangles its patch, and whether to flip it.
-
-    Every triangle stands twice in a graph, as it is and flipped; neighbours are linked in the
-    two ways that agree. A patch then makes two components, each the other one flipped: take
-    the first. If it makes a single one, it has no consistent winding.
-    """
-    f = len(triangles)
-    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    edge = np.minimum(start, end) * (triangles.max() + 1) + np.maximum(start, end)
-    order = np.argsort(edge, kind="stable")
-    first = np.flatnonzero(np.diff(edge[order], prepend=-1))
-    pairs = first[np.diff(first, append=len(order)) == 2]
-    a, b = order[pairs], order[pairs + 1]
-    against = f * ((start < end)[a] == (start < end)[b])  # same direction: flip one of them
-    a, b = a // 3, b // 3
-    rows = np.concatenate([a, a + f])
-    columns = np.concatenate([b + against, b + f - against])
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * f, 2 * f))
-    _, label = connected_components(graph, directed=False)
-    as_is, flipped = label[:f], label[f:]
-    if (as_is == flipped).any():
-        raise InputError("it has one side only, as a Möbius band: no winding is consistent")
-    patch = np.unique(np.minimum(as_is, flipped), return_inverse=True)[1]
-    return patch, as_is > flipped

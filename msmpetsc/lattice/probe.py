@@ -1,4 +1,4 @@
-"""Points of a body that are followed: each goes with the corners of its cell, by their trilinear functions."""
+"""Probes: points of a body that move with the corners of their cells, by trilinear functions."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,8 @@ class ProbePoints:
         self.comm = comm
         cells = to_host(lattice.local_cells)[: lattice.cells_owned]
         low, numbers = to_host(lattice.nodes)[cells[:, 0]], lattice.global_numbers[cells[:, 0]]
-        self.corners, self.weights = np.zeros((len(points), 8), np.int64), np.zeros((len(points), 8))
+        self.corners = np.zeros((len(points), 8), np.int64)
+        self.weights = np.zeros((len(points), 8))
         for row, point in enumerate(points):
             place = (np.array(point) - low) / lattice.cell_size
             around = np.flatnonzero(((place >= -SAME) & (place <= 1 + SAME)).all(axis=1))

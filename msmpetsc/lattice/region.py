@@ -1,4 +1,4 @@
-"""Selection of nodes or cells a scene means by a region, and the materials of the parts that regions make.
+"""Nodes and cells in the regions of a scene, and the materials of its parts.
 
 A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is. Where
 skin widens from a clamp's edge, nodes just past that are nearest to skin that is free. So of nodes that lie in the
@@ -6,6 +6,7 @@ region themselves those count, too, that have it half a cell away: else a clamp 
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,7 +96,7 @@ class Finder:
         """
         region, grids = table.table.region, self.cages.grids
         if region.painted is None:
-            share = self.cages.share_of(ijk)
+            share = self.cages.of_cells(ijk, self.cages.share)
             middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
             where = self.inside(table, middles, grids.body_of(ijk))
         else:
@@ -132,16 +133,12 @@ class Finder:
         if not isinstance(painted, str):
             return list(painted)
         path = self.folder / painted
-        try:
-            if path.exists() and not path.is_file():
-                raise InputError(f"{key}.region.painted: {path} is not a file of numbers")
-            numbers = [int(word) for word in path.read_text().split()]
-        except OSError as error:
-            raise InputError(f"{key}.region.painted: {path} cannot be read: {error.strerror}") from None
-        except ValueError:
-            raise InputError(f"{key}.region.painted: {path} is no list of whole numbers") from None
+        numbers: list[int] = []
+        with suppress(OSError, ValueError):
+            if path.is_file():
+                numbers = [int(word) for word in path.read_text().split()]
         if not numbers or not 0 <= min(numbers) <= max(numbers) < 2**63:
-            raise InputError(f"{key}.region.painted: {path} must list point numbers, from 0")
+            raise InputError(f"{key}.region.painted: {path} must be a file of point numbers, from 0")
         return numbers
 
 
@@ -199,5 +196,5 @@ def cell_materials(scene: Scene, finder: Finder) -> Callable[[Indices], CellMate
 
 def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
     """Return a number of a body's own material; the scene's where it gives none."""
-    value = None if own is None else getattr(own, name)
-    return getattr(material, name) if value is None else value
+    value: float | None = getattr(own, name, None)
+    return float(getattr(material, name)) if value is None else value

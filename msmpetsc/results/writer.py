@@ -381,4 +381,4 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     indptr = embedding.indptr[1:] + offset
     file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
     file.write("embedding/indices", embedding.indices)
-    file.write("embedding/weights", embedding.weights)
+    file.write("embedding/weights", embedding.data)

@@ -78,7 +78,6 @@ class CagesTable(Table):
     one_of = ("count", "cell_size")
     count: Count | None = Field(None, description="number of valid cells aimed at [-]")
     cell_size: Positive | None = Field(None, description="edge of a cell [m]")
-    method: Literal["exact", "sample"] = Field("exact", description="triangle-box test, or the paper's sample points")
     boundary: Literal["fill", "whole"] = Field(
         "fill",
         description="boundary cells weigh and resist by the share of them that is inside, or whole, as the paper's",

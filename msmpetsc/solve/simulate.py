@@ -20,7 +20,6 @@ from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
-from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.probe import ProbePoints
 from msmpetsc.scene.reading import Scene
@@ -108,7 +107,7 @@ class TimeLoop:
         self.probe = (
             ProbePoints(comm, model.lattice, points) if points else None
         )  # or refused, before PETSc has objects
-        self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
+        self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
         swings = scene.time.integrator != "implicit-euler"
         checks = scene.safety.checks
         self.balance = EnergyBalance(comm, self.environment, self.elasticity, swings, checks)
@@ -119,7 +118,7 @@ class TimeLoop:
         self.recovery = Recovery(scene, self._make, self.balance)
         self.monitors, self.true_errors = Monitors(comm, model.lattice), TrueErrors()
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
-        self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
+        self.surface = None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
         self.forces = Forces(scene, model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
@@ -303,10 +302,10 @@ class TimeLoop:
 class SurfaceMotion:
     """The surface of a frame, W @ positions: this rank's rows of W, and a way to the nodes that they need."""
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: Embedding):
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
         columns, local = np.unique(embedding.indices, return_inverse=True)
-        shape = embedding.points, len(columns)
-        self.weights = csr_array((embedding.weights, local.ravel(), embedding.indptr), shape=shape)
+        shape = embedding.shape[0], len(columns)
+        self.weights = csr_array((embedding.data, local.ravel(), embedding.indptr), shape=shape)
         self.to_owner = Route(comm, lattice.table.owner_of_index(columns))
         self.asked = self.to_owner.send(columns) - lattice.table.first  # own nodes that ranks need
 

@@ -177,7 +177,6 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     lattice, surface, embedding, owned = model.lattice, model.surface, model.embedding, model.lattice.owned
     if surface is None or embedding is None:
         raise InputError(f"{path} has no surface to draw: it says output.surface = false")
-    W = csr_array((embedding.weights, embedding.indices, embedding.indptr), shape=(embedding.points, owned))
     start = np.asarray(model.start[0])[:owned]
     bodies = lattice.body[:owned], model.body_of_point
     arrays = {
@@ -193,8 +192,8 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
         triangles=surface.triangles,
         times=np.zeros(1),
         nodes=lambda _: start,
-        surface=lambda _: W @ start,
-        embedding=W,
+        surface=lambda _: embedding @ start,
+        embedding=embedding,
         array=arrays.__getitem__,
         solids=model.solids,
     )

@@ -166,10 +166,10 @@ def test_a_point_on_the_far_side_is_in_the_last_cell(tmp_path: Path):
 
 WRONG = {
     "[3, 162]": ["pin.0.region.painted", "there is no point 162", "162"],
-    "gone.txt": ["gone.txt cannot be read"],
-    "words.txt": ["words.txt is no list of whole numbers"],
-    "negative.txt": ["negative.txt must list point numbers"],
-    "binary.txt": ["binary.txt is no list of whole numbers"],
+    "gone.txt": ["gone.txt must be a file of point numbers"],
+    "words.txt": ["words.txt must be a file of point numbers"],
+    "negative.txt": ["negative.txt must be a file of point numbers"],
+    "binary.txt": ["binary.txt must be a file of point numbers"],
     "[3, -1]": ["pin.0.region.painted", "point numbers, from 0"],
 }
 

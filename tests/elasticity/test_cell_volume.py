@@ -150,9 +150,9 @@ def test_there_is_no_net_force_and_no_net_torque(q: np.ndarray):
 def test_a_mirrored_lattice_has_no_energy_in_its_springs_but_in_its_cells():
     """K a share of k1 h^2, of an edge inside; (1 - (-1) / 0.5)^3 = 27 in each of 32 corners."""
     mirrored = REST * [1, 1, -1]
-    assert Elasticity(COMM, lattice_of(2, 2, 1, stiffening=0.0)).energy(mirrored) == pytest.approx(0, abs=1e-20)
+    assert Elasticity(lattice_of(2, 2, 1, stiffening=0.0)).energy(mirrored) == pytest.approx(0, abs=1e-20)
     K = RESISTANCE * edge_stiffness(YOUNG, H) * H**2
-    elasticity = Elasticity(COMM, SMALL)
+    elasticity = Elasticity(SMALL)
     assert elasticity.energy(mirrored) == pytest.approx(32 * 27 * K, rel=1e-9)
     assert elasticity.change(mirrored, REST) == pytest.approx(32 * 27 * K, rel=1e-9)
 
@@ -162,7 +162,7 @@ def test_a_mirrored_lattice_has_no_energy_in_its_springs_but_in_its_cells():
 
 @shapes
 def test_only_cells_that_resist_are_looked_at(q: np.ndarray):
-    cells = Elasticity(COMM, SMALL).cells
+    cells = Elasticity(SMALL).cells
     assert len(cells.resisting(REST)[1]) == 0 < len(cells.resisting(q)[1])
 
 
@@ -172,14 +172,14 @@ def test_small_strains_do_not_tell_the_laws_apart():
     products = []
     for lattice in (linear, SMALL):
         product = np.zeros_like(V)
-        Elasticity(COMM, lattice).hessian_at(SMALL.nodes).add_product(V, product)
+        Elasticity(lattice).hessian_at(SMALL.nodes).add_product(V, product)
         products.append(product)
     np.testing.assert_allclose(products[1], products[0], atol=1e-12 * np.abs(products[0]).max())
     strain, forces = 1e-3, []
     stretched = SMALL.nodes * (1 + strain)
     for lattice in (linear, SMALL):
         force = np.zeros_like(V)
-        Elasticity(COMM, lattice).add_gradient(stretched, force)
+        Elasticity(lattice).add_gradient(stretched, force)
         forces.append(force)
     np.testing.assert_allclose(forces[1], forces[0] * (1 + STIFFENING * strain**2), rtol=1e-9, atol=1e-10)
 
@@ -207,7 +207,7 @@ def test_a_cell_folded_into_its_neighbour_comes_back_with_the_stiffening_law_and
     np.testing.assert_allclose(least_volumes(back, bar.local_cells), H**3, rtol=1e-3)
     np.testing.assert_allclose(np.sort(least_volumes(stuck, bar.local_cells)), [-(H**3), H**3, H**3], rtol=1e-3)
     for q in (back, stuck):
-        assert Elasticity(COMM, replace(bar, stiffening=0.0)).energy(q) < 1e-6 * bar.stiffness.max() * H**2
+        assert Elasticity(replace(bar, stiffening=0.0)).energy(q) < 1e-6 * bar.stiffness.max() * H**2
 
 
 def squeezed_step(preset: str, height: float, error: float) -> tuple[np.ndarray, float, Lattice, np.ndarray]:

@@ -66,7 +66,7 @@ cases = pytest.mark.parametrize(("poisson", "cut"), [(0.25, False), (0.0, True),
 def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool):
     """In states from strained to inverted: both branches of U."""
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
-    elastic = Elasticity(COMM, lattice)
+    elastic = Elasticity(lattice)
     for strain in (0.05, 0.5):
         q = lattice.nodes + strain * H * RNG.standard_normal(lattice.nodes.shape)
         v, e = RNG.standard_normal(q.shape), 1e-6 * H
@@ -81,7 +81,7 @@ def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool
 @cases
 def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(poisson: float, cut: bool):
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
-    elastic = Elasticity(COMM, lattice)
+    elastic = Elasticity(lattice)
     q, v = (lattice.nodes + 0.3 * H * RNG.standard_normal(lattice.nodes.shape) for _ in range(2))
     assert elastic.change(q, v) == pytest.approx(elastic.energy(q) - elastic.energy(v), rel=1e-12)
     moved = q + 1e-12 * H * RNG.standard_normal(q.shape)
@@ -91,7 +91,7 @@ def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(poiss
 @cases
 def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: bool):
     lattice = solid(3, 3, 2, poisson=poisson, cut=cut)
-    elastic = Elasticity(COMM, lattice)
+    elastic = Elasticity(lattice)
     turned = Rotation.from_rotvec([1.0, -2.0, 0.5]).apply(lattice.nodes) + np.array([3, 2, 1])
     for q in (lattice.nodes, turned):
         assert np.abs(gradient(elastic, q)).max() < 1e-12 * YOUNG * H
@@ -101,7 +101,7 @@ def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: b
 @cases
 def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_concavity(poisson: float, cut: bool):
     lattice = solid(2, 2, 1, poisson=poisson, cut=cut)
-    elastic, worst = Elasticity(COMM, lattice), 0.0
+    elastic, worst = Elasticity(lattice), 0.0
     shapes = [np.diag([0.6, 1.2, 1.2]), np.diag([1.4, 1.4, 0.9]), np.diag([0.1, 0.1, -0.02]), np.diag([0.9, 0.9, -0.5])]
     for f in (np.eye(3), *shapes, *RNG.normal(size=(8, 3, 3))):
         for noise in (0.0, 0.3):
@@ -131,7 +131,7 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
         lattice = solid(1, 1, 1, poisson=0.25)
         for i in range(0, count, 250):
             cells = SolidCells(forms[i : i + 1], volume[i : i + 1] * H**3, np.array([shear]), np.array([lame]))
-            one = Elasticity(COMM, Lattice(**(vars(lattice) | {"solid": cells})))
+            one = Elasticity(Lattice(**(vars(lattice) | {"solid": cells})))
             h = hessian(one, lattice.nodes)
             assert np.linalg.eigvalsh(h).min() > -1e-13 * np.abs(h).max()
 
@@ -151,13 +151,13 @@ def test_the_constant_laplacian_is_no_less_than_the_hessian_at_rest(poisson: flo
     for (a, b), k in zip(lattice.springs, lattice.stiffness, strict=True):
         laplacian[[a, b], [a, b]] += k
         laplacian[[a, b], [b, a]] -= k
-    h = hessian(Elasticity(COMM, lattice), lattice.nodes)
+    h = hessian(Elasticity(lattice), lattice.nodes)
     assert np.linalg.eigvalsh(np.kron(laplacian, np.eye(3)) - h).min() > -1e-12 * np.abs(h).max()
 
 
 def test_below_the_onset_the_volume_energy_goes_on_smoothly():
     lattice = solid(1, 1, 1, poisson=0.3)
-    elastic = Elasticity(COMM, lattice)
+    elastic = Elasticity(lattice)
     above, below = (lattice.nodes * [1, 1, ONSET + e] for e in (1e-9, -1e-9))
     np.testing.assert_allclose(gradient(elastic, above), gradient(elastic, below), rtol=1e-6, atol=1e-6 * YOUNG * H**2)
     np.testing.assert_allclose(hessian(elastic, above), hessian(elastic, below), atol=1e-6 * YOUNG * H)

@@ -7,7 +7,6 @@ import pytest
 import tomli_w
 import trimesh
 from block_scene import block_scene, play
-from lattices import COMM
 from test_neo_hookean import YOUNG, H, solid
 
 from msmpetsc.build import Model
@@ -40,7 +39,7 @@ def test_uniform_strain_has_the_textbooks_stress_in_cells_and_at_nodes(poisson: 
     stresses'."""
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
     mu, lame = YOUNG / 2 / (1 + poisson), YOUNG * poisson / (1 + poisson) / (1 - 2 * poisson)
-    elastic = Elasticity(COMM, lattice)
+    elastic = Elasticity(lattice)
     field = StressField(lattice, elastic.solid)
     for f in (np.eye(3), np.diag([1.3, 0.9, 0.9]), np.array([[1, 0.4, 0.1], [0, 1.1, 0], [0.2, 0, 0.8]])):
         j, q = np.linalg.det(f), lattice.nodes @ f.T
@@ -58,7 +57,7 @@ def test_uniform_strain_has_the_textbooks_stress_in_cells_and_at_nodes(poisson: 
 
 def test_the_mean_at_a_node_is_by_volume():
     lattice = solid(3, 2, 2, poisson=0.25, cut=True)
-    elastic = Elasticity(COMM, lattice)
+    elastic = Elasticity(lattice)
     found = StressField(lattice, elastic.solid)(lattice.nodes + 0.1 * H * RNG.standard_normal(lattice.nodes.shape))
     volume, cells = lattice.solid.volume, lattice.local_cells
     for node in (0, 17, len(lattice.nodes) - 1):
@@ -69,7 +68,7 @@ def test_the_mean_at_a_node_is_by_volume():
 
 def test_the_stress_of_a_collapsed_cell_is_finite():
     lattice = solid(2, 1, 1, poisson=0.25)
-    field = StressField(lattice, Elasticity(COMM, lattice).solid)
+    field = StressField(lattice, Elasticity(lattice).solid)
     for size in (0.0, -1.0):
         assert all(np.isfinite(rows).all() for rows in field(lattice.nodes * [1, 1, size]).values())
 

@@ -24,7 +24,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, compact, examine
-from msmpetsc.geometry.touched_cells import sampled_cells, touched_cells
+from msmpetsc.geometry.touched_cells import touched_cells
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
@@ -35,8 +35,9 @@ SIDE = 6  # cells of the small grid of the boundary tests
 # --- boundary cells ---
 
 
-def cells_of(corners: np.ndarray, mark=touched_cells, low=(0, 0, 0), high=(SIDE,) * 3) -> set[tuple[int, ...]]:
-    return set(map(tuple, mark(np.atleast_3d(corners).reshape(-1, 3, 3), np.array(low), np.array(high)).tolist()))
+def cells_of(corners: np.ndarray, low=(0, 0, 0), high=(SIDE,) * 3) -> set[tuple[int, ...]]:
+    cells = touched_cells(np.atleast_3d(corners).reshape(-1, 3, 3), np.array(low), np.array(high))
+    return set(map(tuple, cells.tolist()))
 
 
 UNIT = 64  # triangles of the oracle have corners at multiples of 1/64
@@ -70,23 +71,14 @@ def test_touched_cells_are_those_of_a_separating_axis_test(triangle):
     assert boxes_touched(triangle, 1) <= cells_of(triangle / UNIT) <= boxes_touched(triangle, 0)
 
 
-@pytest.mark.parametrize("mark", [touched_cells, sampled_cells])
-def test_cells_outside_the_limits_are_left_out(mark):
+def test_cells_outside_the_limits_are_left_out():
     rng = np.random.default_rng(3)
     triangles = rng.uniform(0, SIDE, (40, 1, 3)) + rng.uniform(-1, 1, (40, 3, 3)) * rng.choice([0.01, 2], (40, 1, 1))
-    everywhere = cells_of(triangles, mark, (-9,) * 3, (20,) * 3)
+    everywhere = cells_of(triangles, (-9,) * 3, (20,) * 3)
     low, high = (1, 2, 3), (4, 5, 5)
     within = {cell for cell in everywhere if all(a <= c < b for a, c, b in zip(low, cell, high, strict=True))}
-    assert cells_of(triangles, mark, low, high) == within != everywhere
-    assert cells_of(triangles, mark, low, low) == set()
-
-
-def test_the_papers_samples_miss_cells_that_a_sphere_grazes():
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    triangles = (np.asarray(ball.vertices) * 9.7 + 10)[ball.faces]
-    exact, sample = (cells_of(triangles, mark, high=(20,) * 3) for mark in (touched_cells, sampled_cells))
-    assert sample < exact
-    assert len(exact - sample) > 0.02 * len(exact)
+    assert cells_of(triangles, low, high) == within != everywhere
+    assert cells_of(triangles, low, low) == set()
 
 
 # --- interior cells ---
@@ -187,13 +179,13 @@ def test_without_its_lid_the_winding_number_fills_the_box():
 def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Cages]]:
     """A folder with the meshes that the worker fills, and their cells on one rank."""
     folder, cages = tmp_path_factory.mktemp("filled"), {}
-    for name, cell_size, method in FILLED:
+    for name, cell_size in FILLED:
         mesh = SHAPES["one cell" if name == "one cell" else "torus upright"][0].copy()
         if name == "open":
             mesh.update_faces(np.arange(len(mesh.faces)) > 20)
         body = body_of(mesh)
         np.savez(folder / f"{name}.npz", points=body.surface.points, triangles=body.surface.triangles)
-        cages[name] = fill([body], cell_size, method)
+        cages[name] = fill([body], cell_size)
     return folder, cages
 
 
@@ -206,7 +198,7 @@ def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_
         with np.load(folder / f"{name}.cells.npz") as cells:
             assert np.array_equal(cells["ijk"], cages.ijk) and np.array_equal(cells["kind"], cages.kind), name
             assert np.array_equal(cells["share"], cages.share), name
-    assert len(serial["one cell"].kind) == 1 and len(serial["sampled"].kind) < len(serial["closed"].kind)
+    assert len(serial["one cell"].kind) == 1
 
 
 def test_too_many_cells_are_refused():

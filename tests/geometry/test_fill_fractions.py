@@ -37,7 +37,7 @@ def test_shares_have_the_bodys_volume_and_its_centre(name: str, offset: float):
     """Both exactly: the corners' functions sum to 1, and to the position when each is taken times its corner's."""
     mesh, h = BODIES[name], 0.17
     columns, cells, origin = columns_of(mesh, h, offset)
-    share = columns.corner_shares(cells)
+    share, _ = columns.inside(cells)
     assert share.min() > -1e-12 and share.max() < 1 + 1e-12 and columns.leak < 1e-12
     assert share.mean(axis=(1, 2, 3)).sum() * h**3 == pytest.approx(mesh.volume, rel=1e-13)
     corners = cells[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T
@@ -49,7 +49,7 @@ def test_a_plane_through_a_cell_gives_its_corners_what_lies_near_them():
     """Below z: 2 z - z^2 at the lower corners, z^2 at the upper ones, the integrals of 2 (1 - z) and 2 z."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], [3, 2, 1.3]])
     columns, _, _ = columns_of(box, 1.0)
-    share = columns.corner_shares(np.array([[1, 1, 1], [1, 1, 0]]))
+    share, _ = columns.inside(np.array([[1, 1, 1], [1, 1, 0]]))
     np.testing.assert_allclose(share[0], np.broadcast_to([2 * 0.3 - 0.3**2, 0.3**2], (2, 2, 2)), atol=1e-14)
     np.testing.assert_allclose(share[1], 1, atol=1e-14)
 
@@ -57,7 +57,7 @@ def test_a_plane_through_a_cell_gives_its_corners_what_lies_near_them():
 def test_corners_of_an_oblique_cell_are_those_of_many_samples():
     mesh, h = BODIES["tilted box"], 0.2
     columns, cells, origin = columns_of(mesh, h)
-    share = columns.corner_shares(cells)
+    share, _ = columns.inside(cells)
     cut = np.flatnonzero(np.ptp(share.reshape(-1, 8), axis=1) > 0.3)[:5]
     assert len(cut) == 5
     points = np.random.default_rng(0).random((40_000, 3))

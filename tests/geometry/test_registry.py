@@ -17,7 +17,7 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import fetch as command
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.geometry.registry import MODELS, Download, NamedMesh, Packaged, fetch, load, locate
+from msmpetsc.geometry.registry import MODELS, NamedMesh, fetch, load, locate
 
 
 def sha256(content: bytes) -> str:
@@ -63,18 +63,17 @@ def toy(site, tmp_path, monkeypatch):
         copy_sha256=sha256(COPY),
         licence="free",
         credit="nobody",
-        downloads=(Download(f"{address}/box.stl", sha256(ORIGINAL)),),
+        downloads={f"{address}/box.stl": sha256(ORIGINAL)},
         steps=("merge",),
     )
-    scan = Packaged("toypackage/data/box.stl", sha256(ORIGINAL))
     monkeypatch.setitem(MODELS, "toybox", model)
-    monkeypatch.setitem(MODELS, "toyscan", replace(model, downloads=(), packaged=scan))
+    monkeypatch.setitem(MODELS, "toyscan", replace(model, downloads={}, packaged="toypackage/data/box.ply"))
     return tmp_path
 
 
 def install(folder: Path, content: bytes) -> Path:
     """A package that must not be imported, with a file in it."""
-    path = folder / "packages/toypackage/data/box.stl"
+    path = folder / "packages/toypackage/data/box.ply"
     path.parent.mkdir(parents=True)
     path.write_bytes(content)
     (folder / "packages/toypackage/__init__.py").write_text("raise SystemExit('imported')")
@@ -86,7 +85,7 @@ def test_the_copy_goes_before_what_was_fetched_or_lies_in_a_package(toy):
         locate("toybox", toy)
     with pytest.raises(InputError, match=r"'toyscan' is not here: it comes with a package, pip .* toypackage$"):
         fetch("toyscan")
-    packaged = install(toy, ORIGINAL)
+    packaged = install(toy, COPY)
     assert locate("toyscan", toy) == packaged and "toypackage" not in sys.modules
     fetched = fetch("toybox")
     assert fetched.read_bytes() == ORIGINAL and fetched.is_relative_to(toy / "cache")
@@ -96,7 +95,7 @@ def test_the_copy_goes_before_what_was_fetched_or_lies_in_a_package(toy):
 
 
 def test_a_name_gives_the_same_surface_wherever_it_is_found(toy):
-    install(toy, ORIGINAL)
+    install(toy, COPY)
     packaged = load("toyscan", toy)
     fetch("toybox")
     fetched = load("toybox", toy)
@@ -113,7 +112,7 @@ def test_a_name_gives_the_same_surface_wherever_it_is_found(toy):
 
 
 def test_another_file_under_the_name_is_refused(toy):
-    install(toy, COPY)  # another version of the package: as if it were not there
+    install(toy, ORIGINAL)  # another version of the package: as if it were not there
     with pytest.raises(InputError, match="comes with a package"):
         locate("toyscan", toy)
     fetch("toybox").write_bytes(COPY)
@@ -127,9 +126,9 @@ def test_another_file_under_the_name_is_refused(toy):
 def test_a_model_of_several_files_is_here_only_with_all_of_them(toy, site, monkeypatch):
     folder, address = site
     (folder / "box.bin").write_bytes(b"more")
-    more = Download(f"{address}/box.bin", sha256(b"more"))
+    more = {f"{address}/box.bin": sha256(b"more")}
     model = MODELS["toybox"]
-    monkeypatch.setitem(MODELS, "toybox", replace(model, downloads=(*model.downloads, more)))
+    monkeypatch.setitem(MODELS, "toybox", replace(model, downloads=model.downloads | more))
     path = fetch("toybox")
     assert path.name == "box.stl" and path.with_name("box.bin").read_bytes() == b"more"
     path.with_name("box.bin").unlink()
@@ -149,8 +148,8 @@ def test_a_failed_connection_is_one_line(toy, site, monkeypatch, capfd):
     (folder / "box.stl").unlink()
     with pytest.raises(InputError, match=r"cannot fetch .*HTTP status 404"):
         fetch("toybox")
-    closed = Download("http://127.0.0.1:9/box.stl", sha256(ORIGINAL))  # nothing answers there
-    monkeypatch.setitem(MODELS, "toybox", replace(MODELS["toybox"], downloads=(closed,)))
+    closed = {"http://127.0.0.1:9/box.stl": sha256(ORIGINAL)}  # nothing answers there
+    monkeypatch.setitem(MODELS, "toybox", replace(MODELS["toybox"], downloads=closed))
     assert "ConnectionError" in input_error(lambda: fetch("toybox"))
     assert capfd.readouterr() == ("", "")
 

@@ -173,7 +173,7 @@ class Case:
     def __init__(self, comm: MPI.Comm, lattice: Lattice, q: np.ndarray, time_step: float, contact: bool = False):
         self.comm, self.lattice, self.q, self.time_step = comm, lattice, q, time_step
         self.unknowns = Unknowns(comm, lattice)
-        self.elasticity = Elasticity(comm, lattice)
+        self.elasticity = Elasticity(lattice)
         self.multigrid = Multigrid(self.unknowns, self.elasticity, time_step, "")
         self.blocks = contact_blocks(lattice) if contact else np.empty((0, 9))
         self.multigrid.update(q, self.blocks)

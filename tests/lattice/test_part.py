@@ -55,7 +55,7 @@ def test_each_cell_resists_as_its_own_material(tmp_path: Path):
     law = {"material": {"young_modulus": YOUNG, "density": DENSITY, "law": "stiffening"}}
     soft = of_parts(tmp_path, **law).lattice
     lattice = of_parts(tmp_path, {"region": FAR, "young_modulus": 5 * YOUNG}, **law).lattice
-    energies = [Elasticity(MPI.COMM_SELF, one).energy(one.nodes * [1, 1, -1]) for one in (soft, lattice)]
+    energies = [Elasticity(one).energy(one.nodes * [1, 1, -1]) for one in (soft, lattice)]
     assert energies[1] == pytest.approx((1 + 5) / 2 * energies[0], rel=1e-12)
 
 
@@ -83,7 +83,7 @@ def test_painted_cells_are_a_part(tmp_path: Path):
 def forces(model: Model, displacement: np.ndarray) -> np.ndarray:
     """Of the springs, (n, 3) [N]."""
     force = np.zeros_like(displacement)
-    Elasticity(MPI.COMM_SELF, model.lattice).add_gradient(model.lattice.nodes + displacement, force)
+    Elasticity(model.lattice).add_gradient(model.lattice.nodes + displacement, force)
     return force
 
 
@@ -101,7 +101,7 @@ def test_halves_one_behind_the_other_are_springs_in_series(tmp_path: Path, ratio
     assert along[x == 0].sum() == pytest.approx(-stress * area, rel=1e-5)
     for inner in (1, 2, 3):
         assert np.abs(along[x == inner * CELL]).max() < 1e-5 * abs(stress) * CELL**2
-    energy = Elasticity(MPI.COMM_SELF, model.lattice).energy(model.lattice.nodes + moved)
+    energy = Elasticity(model.lattice).energy(model.lattice.nodes + moved)
     assert energy == pytest.approx(stress * strain / 2 * area * 0.25 * (1 + 1 / ratio), rel=1e-5)
 
 

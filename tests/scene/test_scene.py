@@ -115,7 +115,7 @@ def test_the_example_means_what_it_says(tmp_path):
 def test_defaults(tmp_path):
     scene = load(tmp_path, SMALLEST)
     assert scene.title == "" and scene.mesh.prepare == () and scene.mesh.size is None
-    assert (scene.cages.method, scene.cages.embedding) == ("exact", "affine")
+    assert scene.cages.embedding == "affine"
     assert (scene.cages.smoothing, scene.cages.max_cells) == (1.0, 5_000_000)
     assert scene.gravity is None and scene.obstacle == scene.pin == scene.force == ()
     assert scene.solver.preset == "newton" and scene.solver.error is None

@@ -123,7 +123,7 @@ def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_p
 
 def greatest(lattice: Lattice, q: np.ndarray, projected: bool = False) -> float:
     """Of M^(-1) (Hessian of E) over the free nodes, by numpy."""
-    elasticity, free = Elasticity(COMM, lattice), np.flatnonzero(~lattice.pinned)
+    elasticity, free = Elasticity(lattice), np.flatnonzero(~lattice.pinned)
     H = np.empty((3 * len(free), 3 * len(free)))
     for column in range(len(H)):
         v, product = np.zeros_like(q), np.zeros_like(q)

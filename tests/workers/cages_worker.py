@@ -12,7 +12,7 @@ from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, examine
 
 comm = MPI.COMM_WORLD
-FILLED = [("closed", 0.11, "exact"), ("open", 0.11, "exact"), ("sampled", 0.11, "sample"), ("one cell", 2.5, "exact")]
+FILLED = [("closed", 0.11), ("open", 0.11), ("one cell", 2.5)]
 
 
 def enclosed(boundary: np.ndarray) -> np.ndarray:
@@ -45,9 +45,9 @@ def body_of(path: Path) -> BodySurface:
     return BodySurface(comm, surface if comm.rank == 0 else None, examine(surface), bounds)
 
 
-def fill_to_file(mesh: Path, cell_size: float, method: str) -> None:
+def fill_to_file(mesh: Path, cell_size: float) -> None:
     """Writes all cells in the order of the ranks beside the mesh."""
-    cages = fill([body_of(mesh)], cell_size, method)
+    cages = fill([body_of(mesh)], cell_size)
     assert comm.allreduce(len(cages.kind)) == cages.table.total
     parts = comm.gather((cages.table.first, cages.ijk, cages.kind, cages.share))
     if comm.rank == 0:
@@ -58,6 +58,6 @@ def fill_to_file(mesh: Path, cell_size: float, method: str) -> None:
 
 if __name__ == "__main__":
     check_random_grids([(7, 6, 8), (3, 9, 9), (16, 4, 5), (1, 5, 5)], seeds=6)
-    for name, cell_size, method in FILLED:
-        fill_to_file(Path(sys.argv[1], name + ".npz"), cell_size, method)
+    for name, cell_size in FILLED:
+        fill_to_file(Path(sys.argv[1], name + ".npz"), cell_size)
     print("passed", flush=True)

@@ -17,7 +17,7 @@ own = {
     "cells": len(lattice.cells),
     "nodes": lattice.owned,
     "ghosts": len(lattice.ghosts),
-    "inner": inner,
+    "springs": len(lattice.springs),
     "cut": len(lattice.springs) - inner,
     "neighbours": len(np.unique(lattice.table.owner_of_index(lattice.ghosts))),
 }

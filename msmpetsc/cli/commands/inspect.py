@@ -17,7 +17,6 @@ from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.lattice.lattice import lattice_bytes
 from msmpetsc.lattice.partition import Partition, partition_of
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.petsc.initialise import initialise
@@ -25,6 +24,7 @@ from msmpetsc.solve.petsc.initialise import initialise
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
 PROGRAM, FACTOR = 0.29e9, 2.1  # [byte] of a rank without arrays, and times those, as runs of newton show it
+BYTES = np.array([145, 41, 24])  # of a lattice's arrays for a cell, a node, ghosts too, and a spring
 BYTES_OF_POINT = 14 * 64 * 8  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
 GB = 1e9
 SPRINGS = "springs; of a rank, shared ones too"
@@ -104,9 +104,9 @@ def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) ->
     from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
 
     nodes, springs = partition.nodes + partition.ghosts, partition.springs
-    arrays = lattice_bytes(partition.cells, nodes, springs) + nodes * BYTES_OF_NODE
+    arrays = BYTES @ np.array([partition.cells, nodes, springs]) + nodes * BYTES_OF_NODE
     arrays += assembly_bytes(nodes, springs, partition.nonzeros)
     points = sum(len(surface.points) for surface in surfaces)
-    needed = np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / partition.ranks)
+    needed = np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / len(nodes))
     needed[0] = max(needed[0], mesh)
     return PROGRAM + needed

@@ -16,7 +16,7 @@ NEAR = 1e-4  # of the depth: over a shorter way a depth's slope gives more digit
 
 
 class DistanceSolid(Solid):
-    """A solid that is asked on the CPU, where a step often asks for the same positions again."""
+    """A solid given by distances, on the CPU; a step often needs the same positions again."""
 
     def __init__(self) -> None:
         self._last: tuple[Positions, Floats, Indices] | None = None
@@ -58,7 +58,7 @@ class DistanceSolid(Solid):
 
 
 class FunctionSolid(DistanceSolid):
-    """Where the signed distance that a function of the user's returns is below 0.
+    """The solid in which a signed distance function of the user's is negative.
 
     key : of its table in the scene, for messages
     """

@@ -106,7 +106,7 @@ class Movers(NamedTuple):
 
 
 def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: float) -> None:
-    """Apply Coulomb friction as a change of velocity to the nodes that are inside.
+    """Apply Coulomb friction to nodes inside an obstacle, as a change of velocity.
 
     v (n, 3) [m/s] along the face, as seen from an obstacle that moves at ``carried`` (3,) [m/s],
     falls by no more than the friction's impulse a mass, mu N dt / m, and not below nothing: so what

@@ -1,4 +1,4 @@
-"""From a scene's tables to obstacles."""
+"""Obstacles made from a scene's tables."""
 
 from pathlib import Path
 

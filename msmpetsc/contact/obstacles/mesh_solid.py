@@ -55,7 +55,7 @@ class MeshSolid(DistanceSolid):
         return depths, face
 
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        out = closest_point(self.points[self.triangles[face]], q) - q
+        out = closest_point(self.points[self.triangles[face]], q) - q  # type: ignore[no-untyped-call]  # trimesh's
         depth = np.linalg.norm(out, axis=1)
         on_surface = depth <= ROUNDED * np.abs(self._bounds).max()
         normals = out / np.maximum(depth, TINY)[:, None]
@@ -63,7 +63,8 @@ class MeshSolid(DistanceSolid):
 
     def _pseudonormals(self, on_surface: Positions, face: Indices) -> Rows:
         """Return directions (n, 3) outwards at points (n, 3) of triangles (n,)."""
-        weights = points_to_barycentric(self.points[self.triangles[face]], on_surface)
+        corners = self.points[self.triangles[face]]
+        weights = points_to_barycentric(corners, on_surface)  # type: ignore[no-untyped-call]  # trimesh's
         zero = weights < ON_AN_EDGE
         count, normals = zero.sum(axis=1), self._normals[face]
         edge, corner = count == 1, count > 1

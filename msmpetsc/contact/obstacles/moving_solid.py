@@ -1,4 +1,4 @@
-"""Solids that nodes stay out of, where they are at a time, and how far nodes are in them."""
+"""Moving obstacles, and how deep nodes lie in them."""
 
 from dataclasses import dataclass, replace
 
@@ -73,7 +73,7 @@ class Obstacle(Timed):
 def describe_overlap(
     comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, held: Mask, time: float
 ) -> str | None:
-    """Describe the free nodes that lie inside an obstacle as it stands at a time [s]; None if none does (collective).
+    """Describe the free nodes inside an obstacle at a time [s]; None if there are none (collective).
 
     A scene seldom means that, and what reflects leaves them inside.
 

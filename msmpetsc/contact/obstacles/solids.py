@@ -1,4 +1,4 @@
-"""What nodes stay out of: planes and boxes, balls, closed meshes, and what a function of the user's own describes.
+"""Solids that nodes stay out of: planes, boxes and balls.
 
 Each at its place at time 0; where an obstacle has moved, positions are as seen from it.
 """
@@ -55,9 +55,10 @@ class Solid(ABC):
 @numba.njit(cache=True, inline="always")
 def behind(q: Positions, i: int, points: Positions, normals: Rows, face: int) -> float:
     """Return how far the position q[i] (3,) lies behind a face [m]; negative in front of it."""
-    distance = -normals[face, 0] * (q[i, 0] - points[face, 0])
+    distance: float = -normals[face, 0] * (q[i, 0] - points[face, 0])
     distance -= normals[face, 1] * (q[i, 1] - points[face, 1])
-    return distance - normals[face, 2] * (q[i, 2] - points[face, 2])
+    distance -= normals[face, 2] * (q[i, 2] - points[face, 2])
+    return distance
 
 
 @numba.njit(cache=True, inline="always")

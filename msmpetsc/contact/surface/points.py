@@ -12,7 +12,6 @@ from scipy.sparse import coo_array, csr_array
 
 from msmpetsc.backend.arrays import Indices, Positions
 from msmpetsc.comm import Route
-from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -31,18 +30,18 @@ class SurfacePoints:
     rows   : (k,) the points that nodes of this rank carry, ascending; ``weights`` (k, owned) theirs
     """
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: Embedding):
-        counts = comm.allgather(embedding.points)
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
+        counts = comm.allgather(embedding.shape[0])
         self.comm, self.total = comm, sum(counts)
-        sizes = np.add.reduceat(np.abs(embedding.weights), embedding.indptr[:-1]) if embedding.points else np.zeros(1)
-        self.spread = comm.allreduce(float(sizes.max()), MPI.MAX)
+        sizes = abs(embedding).sum(axis=1)
+        self.spread = comm.allreduce(float(sizes.max(initial=0)), MPI.MAX)
         to_owner = Route(comm, lattice.table.owner_of_index(embedding.indices))
-        numbers = sum(counts[: comm.rank]) + np.arange(embedding.points)
+        numbers = sum(counts[: comm.rank]) + np.arange(embedding.shape[0])
         points = to_owner.send(np.repeat(numbers, np.diff(embedding.indptr)))
         nodes = to_owner.send(embedding.indices) - lattice.table.first
         self.rows, row = np.unique(points, return_inverse=True)
         shape = (len(self.rows), lattice.owned)
-        self.weights = coo_array((to_owner.send(embedding.weights), (row.ravel(), nodes)), shape=shape).tocsr()
+        self.weights = coo_array((to_owner.send(embedding.data), (row.ravel(), nodes)), shape=shape).tocsr()
         self.to_root = Route(comm, np.zeros(len(self.rows), np.int64))
         self.received = np.split(self.to_root.send(self.rows), np.cumsum(self.to_root.received)[:-1])
 

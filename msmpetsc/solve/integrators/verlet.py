@@ -64,7 +64,7 @@ class Verlet(Integrator):
     def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, _prefix: str):
         self.comm, self.lattice, self.environment = comm, environment.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
-        self.elasticity = Elasticity(comm, self.lattice)
+        self.elasticity = Elasticity(self.lattice)
         self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
         self.highest = HighestMode(comm, self.lattice, self.elasticity)
         owned = self.lattice.owned

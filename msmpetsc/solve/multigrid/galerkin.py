@@ -140,10 +140,11 @@ class GalerkinSum:
             add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
         add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]
+        weights = self.t2**0.5 * self.weights  # a Hessian is of second degree in them
         if solid:
-            add_coarse(*self.cells, solid.blocks, solid.state(q, True), self.t2, self.weights, self.places, values)
+            add_coarse(self.cells, solid.blocks, solid.state(q, True), weights, self.places, values)
         if viscosity := self.elasticity.viscosity:
-            add_coarse(*self.cells, viscosity.blocks, viscosity.state, self.t2, self.weights, self.places, values)
+            add_coarse(self.cells, viscosity.blocks, viscosity.state, weights, self.places, values)
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
@@ -192,7 +193,7 @@ def add_springs(
             s, kind = order[at], 28 * code[at, 0] + code[at, 1]
             m, n = springs[s, 0], springs[s, 1]
             x, y, z = q[m, 0] - q[n, 0], q[m, 1] - q[n, 1], q[m, 2] - q[n, 2]
-            c, ex, ey, ez = spring_block(x, y, z, rest[s], k[s], b, True)
+            c, ex, ey, ez = spring_block((x, y, z), rest[s], k[s], b, True)
             xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
             for entry in range(begin[kind], begin[kind + 1]):
                 f, place = t2 * factor[entry], places[i, pair[entry]]

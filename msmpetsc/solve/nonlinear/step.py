@@ -105,7 +105,7 @@ class Stepper:
         self.kinks, self.owned = FrictionKinks(), ExitStack()
         self.unknowns = Unknowns(self.comm, self.lattice, self.static)
         self.owned.callback(self.unknowns.destroy)
-        elasticity = Elasticity(self.comm, self.lattice)
+        elasticity = Elasticity(self.lattice)
         self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
         self.first_guess = FirstGuess(self.functional, self.preset.extrapolate)
         self.options = SolverOptions(self.preset, self.prefix, self.budget)

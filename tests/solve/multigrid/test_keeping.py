@@ -15,7 +15,7 @@ def kept(petsc_options):
     """A preconditioner with a hierarchy of the lattice at rest, and another one asked for at turned positions."""
     lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), LatticeMaterial(1000.0, young_modulus=2e5))
     unknowns = Unknowns(COMM, lattice)
-    one = LatticePreconditioner(unknowns, Elasticity(COMM, lattice), 0.02, "")
+    one = LatticePreconditioner(unknowns, Elasticity(lattice), 0.02, "")
     one.prepare(lattice.nodes, None)
     yield one, SHAPES["turned"](lattice.nodes)
     one.destroy()

@@ -100,18 +100,6 @@ PRESETS = {
         },
         inexact=True,
     ),
-    "chebyshev": Preset(
-        "Wang 2015: local/global iterations with Chebyshev's weights, no inner products: for many cores or a GPU",
-        {
-            "snes_type": "python",
-            "snes_python_type": "msmpetsc.solve.nonlinear.chebyshev.Chebyshev",
-            "snes_max_it": "1000",
-            **NO_STOP_BY_SIZE,
-            **JACOBI_CG,
-            "ksp_rtol": "1e-1",
-        },
-        inexact=True,
-    ),
     "newton": Preset(
         "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error",
         NEWTON,
@@ -159,7 +147,7 @@ PRESETS = {
 # a user who chooses another type does not want what only goes with ours
 BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_norm_type"}}
 # these solve with A or the Hessian themselves, without a plain iteration as their preconditioner
-SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls", "vinewtonssls"}
+SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
 
 
 in_use: Counter[str] = Counter()  # by how many solvers: the options in PETSc's database that are not the user's

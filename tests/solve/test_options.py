@@ -137,7 +137,7 @@ def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(tm
     assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV"))
 
 
-@pytest.mark.parametrize("preset", ["newton", "anderson", "chebyshev", "lbfgs"])
+@pytest.mark.parametrize("preset", ["newton", "anderson", "lbfgs"])
 def test_the_reason_says_which_rule_ended_the_step(preset: str):
     """A correction that is short enough, or |F| alone; or the budget."""
     from petsc4py import PETSc

@@ -12,10 +12,7 @@ from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
-from msmpetsc.solve.petsc.library import view_entries
 from msmpetsc.solve.petsc.memory import Memory
-
-SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)  # in a line, without entries
 
 
 class Block:
@@ -62,15 +59,7 @@ class ContactBlocks:
                 count_flops(18 * len(rows))
 
 
-class Viewable:
-    """A MATPYTHON context that can be written to a file: an empty one would be all that PETSc could make of it."""
-
-    def view(self, operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        if viewer.getType() != PETSc.Viewer.Type.ASCII or viewer.getFormat() not in SUMMARIES:
-            view_entries(operator, viewer)
-
-
-class ThreeColumns(Viewable):
+class ThreeColumns:
     """A (x) I_3 without forming it; ``contact`` is None where the scene has no penalty."""
 
     def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, contact: ContactBlocks | None = None):
@@ -90,7 +79,7 @@ class ThreeColumns(Viewable):
         self.product.destroy()
 
 
-class TrueHessian(Viewable):
+class TrueHessian:
     """M + t^2 (Hessian of E, and of contact) at the positions last linearised about, applied spring by spring.
 
     products : so far

@@ -12,7 +12,6 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask
-from msmpetsc.solve.linear.operators import Viewable
 
 
 class BlockRows(NamedTuple):
@@ -34,7 +33,7 @@ class BlockRows(NamedTuple):
         return cls(begin, columns[chosen].astype(np.int32), place[chosen], values)
 
 
-class CoarseOperator(Viewable):
+class CoarseOperator:
     """Applies the matrix of a coarse level. All methods are collective.
 
     matrix   : AIJ of block size 3, symmetric, with full blocks

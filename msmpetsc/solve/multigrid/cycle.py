@@ -9,7 +9,7 @@ precision, too (solve.multigrid.coarse_operator).
 """
 
 from collections.abc import Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,7 @@ from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
-from msmpetsc.solve.linear.operators import Viewable, python_matrix
+from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
 from msmpetsc.solve.multigrid.contact import ContactSmoother
@@ -35,7 +35,6 @@ from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-DIAGONAL = 3.0  # times that eigenvalue where only the diagonal of D is taken
 SAFETY = 1.1  # times it where no bound is known, as some iterations of CG know it
 ITERATIONS = 10  # of these
 BLOCK = 15  # operations of a product with a 3 x 3 block
@@ -71,8 +70,6 @@ class Multigrid:
             self.owned.close()
             raise
         self.coarse: list[CoarseOperator] = []  # until ``update``
-        smoother = PETSc.Options(prefix).getString("mg_levels_pc_type", "")
-        self.widened = DIAGONAL if smoother == PETSc.PC.Type.JACOBI else 1.0
         self.bounds = [0.0] * len(self.levels)
         self.pc = PETSc.PC().create(unknowns.comm)
         self.owned.callback(self.pc.destroy)
@@ -83,12 +80,9 @@ class Multigrid:
         apart = self.bodies.apart(comm, everywhere)
         ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
-        coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
-        if asked and asked < 2:
-            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has two levels or more")
+        coarse = grids(comm, ijk, unknowns.total, COARSEST, max(asked - 1, 1) if asked else None)
         if asked and asked != len(coarse) + 1:
-            most = f"{len(coarse) + 1} at most, for a coarser grid would not be much smaller"
-            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {most}")
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {len(coarse) + 1}")
         galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, apart)
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
@@ -120,7 +114,7 @@ class Multigrid:
             coarse.update()
         if is_new:
             self._create_cycle()
-        self.bounds[0] = self.widened * self._finest_bound()
+        self.bounds[0] = self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
             noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
             self.bounds[i] = SAFETY * greatest_eigenvalue(level.matrix, noise)
@@ -173,7 +167,9 @@ class Multigrid:
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation)
-            pc.setMGRestriction(top - i, self._restriction(level.interpolation))
+            restriction = PETSc.Mat().createTranspose(level.interpolation)  # a square P would be taken for it as it is
+            self.owned.callback(restriction.destroy)
+            pc.setMGRestriction(top - i, restriction)
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
@@ -182,22 +178,9 @@ class Multigrid:
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
 
-    def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
-        """P^T by itself: of a square P PETSc cannot tell by its shape whether it is to be transposed."""
-        fine, coarse = interpolation.getSizes()
-        restriction = PETSc.Mat().createPython((coarse, fine), Restriction(interpolation), comm=interpolation.comm)
-        restriction.setVecType(self.unknowns.memory.vec_type)
-        restriction.setUp()
-        self.owned.callback(restriction.destroy)
-        return restriction
-
     def _read_options(self) -> None:
-        """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG. The
-        finest level's blocks are the only pbjacobi of a matrix that is not assembled."""
-        levels = f"{self.prefix}mg_levels_"
-        is_blocks = PETSc.Options().getString(f"{levels}pc_type", "") == PETSc.PC.Type.PBJACOBI
-        finest = replaced_option(f"{levels}{len(self.levels)}_pc_type", PETSc.PC.Type.PYTHON)
-        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG), finest if is_blocks else nullcontext():
+        """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG."""
+        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):
             self.pc.setFromOptions()
             self.pc.setUp()
 
@@ -228,19 +211,7 @@ def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlock
     return greatest
 
 
-class Restriction:
-    """P^T whichever way it is applied (a context of MATPYTHON)."""
-
-    def __init__(self, interpolation: PETSc.Mat):
-        self.interpolation = interpolation
-
-    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.interpolation.multTranspose(x, y)
-
-    multTranspose = mult
-
-
-class ProjectedHessian(Viewable):
+class ProjectedHessian:
     """H = M + t^2 (projected Hessian of E, and of contact) at the positions that the hierarchy was built at.
 
     It is positive definite whatever these are (a context of MATPYTHON).
@@ -254,7 +225,7 @@ class ProjectedHessian(Viewable):
         self.v = np.zeros_like(lattice.nodes, dtype=np.float32)  # pinned nodes stay zero
         self.product = np.empty_like(self.v)
         self.elastic: Hessian | None = None  # until ``update``
-        self.products, self.q = 0, lattice.nodes
+        self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
         self.joined: SurfaceHessian | None = None
@@ -265,8 +236,9 @@ class ProjectedHessian(Viewable):
 
         joined : of the surface's contact with itself
         """
-        self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
-        unknowns, blocks = self.unknowns, self._bound()
+        self.elastic, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), contact
+        unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
+        self.elasticity.add_bound(q, blocks)
         invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
         self.join(joined)
 
@@ -274,19 +246,6 @@ class ProjectedHessian(Viewable):
         """Take another contact of the surface with itself."""
         self.joined = joined
         self.smoother = ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
-
-    def getDiagonal(self, _: PETSc.Mat, diagonal: PETSc.Vec) -> None:
-        """Write that of D, for -mg_levels_pc_type jacobi."""
-        unknowns, (blocks, contact) = self.unknowns, (self._bound(), self.contact)
-        acting = blocks[unknowns.free] + (contact[unknowns.free] if len(contact) else 0)
-        acting += self.joined.blocks[unknowns.free] if self.joined else 0
-        own = unknowns.ballast[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
-        unknowns.columns_to_write(diagonal)[:] = own
-
-    def _bound(self) -> Rows:
-        blocks = np.zeros((len(self.q), 9), like=self.q)
-        self.elasticity.add_bound(self.q, blocks)
-        return blocks
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""

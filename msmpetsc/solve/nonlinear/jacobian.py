@@ -18,7 +18,6 @@ from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,
     MULTIGRID,
     LatticePreconditioner,
-    Preconditioned,
     Preconditioner,
     StepPreconditioner,
 )
@@ -52,19 +51,14 @@ class Jacobian:
         if kind == MULTIGRID and not true_hessian:
             raise InputError(f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; of A there is gamg")
         context = self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)
-        self.operator = self._python_matrix(context)
+        self.operator = python_matrix(self.unknowns, context, self.comm)
+        self.owned.callback(self.operator.destroy)
         of_lattice = partial(LatticePreconditioner, self.unknowns, elasticity, functional.time_step, options.prefix)
         mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
         is_held = self.unknowns.total < self.unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
         self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio, self.unknowns.total)
-        self.pmat = self._python_matrix(Preconditioned(self.preconditioner))
-
-    def _python_matrix(self, context: object) -> PETSc.Mat:
-        matrix = python_matrix(self.unknowns, context, self.comm)
-        self.owned.callback(matrix.destroy)
-        return matrix
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
@@ -107,8 +101,6 @@ class Jacobian:
         changed = self.preconditioner.in_use.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()
-        if changed:
-            self.pmat.assemble()
 
 
 class FrictionKinks:

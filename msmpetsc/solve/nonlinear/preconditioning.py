@@ -202,16 +202,6 @@ def expected_iterations(ratio: float) -> float:
     return 0.5 * np.sqrt(2 * (1 + ratio)) * np.log(2 / USUAL)
 
 
-class Preconditioned:
-    """Context of the MATPYTHON (3m x 3m) that stands for what is preconditioned where PETSc wants a matrix of it."""
-
-    def __init__(self, preconditioner: "StepPreconditioner"):
-        self.preconditioner = preconditioner
-
-    def view(self, _: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        self.preconditioner.in_use.matrix.view(viewer)
-
-
 @dataclass(eq=False)
 class StepPreconditioner:
     """The one in use (a PCPYTHON context). All methods are collective.

@@ -136,7 +136,7 @@ class Stepper:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
         snes.setFunction(self._residual, self._keep(self.x.duplicate()))
-        snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.pmat)
+        snes.setJacobian(self._linearise, self.jacobian.operator)
         snes.setObjective(self._objective)
         if self.touches:
             snes.setLineSearchPreCheck(self._shorten)
@@ -168,7 +168,7 @@ class Stepper:
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
             self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
             self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
-            self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
+            self.ksp.setOperators(self.jacobian.operator)
             self.ksp.setUp()
 
     def step(self, problem: StepProblem, start: Rows | None = None) -> StepResult:

@@ -39,15 +39,6 @@ def dense_pointer(matrix: PETSc.Mat) -> int:
     return pointer
 
 
-def view_entries(operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-    """View an operator that is only known by its products with all its entries, of one product a
-    column (MatComputeOperator) (collective)."""
-    library, matrix = petsc_library(), ctypes.c_void_p()
-    _check(library.MatComputeOperator(ctypes.c_void_p(operator.handle), b"aij", ctypes.byref(matrix)))
-    _check(library.MatView(matrix, ctypes.c_void_p(viewer.handle)))
-    _check(library.MatDestroy(ctypes.byref(matrix)))
-
-
 def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
     """Say which entries ``set_values_coo`` will set, by global indices (n,); negative ones are left
     out, those named twice are added (MatSetPreallocationCOO) (collective)."""

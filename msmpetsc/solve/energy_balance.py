@@ -199,7 +199,8 @@ class EnergyBalance:
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: SupportsFloat) -> Floats:
-        return self.comm.allreduce(np.array([float(value) for value in values]))
+        sums: Floats = self.comm.allreduce(np.array([float(value) for value in values]))
+        return sums
 
     def _worst(self, vectors: Rows) -> str:
         owned = np.arange(self.lattice.owned)

@@ -291,7 +291,7 @@ class TimeLoop:
             raise
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.destroy()
 
     def destroy(self) -> None:
@@ -312,7 +312,8 @@ class SurfaceMotion:
 
     def __call__(self, position: Positions) -> Rows:
         """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
-        return self.weights @ self.to_owner.answer(position[self.asked])
+        surface: Rows = self.weights @ self.to_owner.answer(position[self.asked])
+        return surface
 
 
 class Forces:

@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest, like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -255,7 +255,8 @@ class Verlet(Integrator):
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
         stiffness = self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)
-        return self.comm.allreduce(greatest(stiffness[self.free] * self.per_mass[self.free]), MPI.MAX)
+        squared = greatest(stiffness[self.free] * self.per_mass[self.free])
+        return float(self.comm.allreduce(squared, MPI.MAX))
 
     def _count(self, squared: float) -> int:
         """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""
@@ -317,7 +318,7 @@ class HighestMode:
     def _normalise(self) -> float:
         """Make |x|_M = 1; returns what it was (collective)."""
         x = self.mode.values[: self.lattice.owned]
-        size = np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
+        size = float(np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x)))))
         if size > 0:
             x /= size
         self.mode.update()
@@ -344,7 +345,10 @@ def crushing_energy(lattice: Lattice) -> float:
 
 
 @kernel
-def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
+def kick(
+    first: int, count: int, step: int, rows: Indices, per_mass: Floats, load: Rows, gradient: Rows, duration: float,
+    v: Rows,
+) -> None:  # fmt: skip
     """v += duration M^(-1) (f_ext - grad E) at the rows of (l, 3) arrays."""
     for row in range(first, count, step):
         i = rows[row]
@@ -353,7 +357,7 @@ def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
 
 
 @kernel
-def drift(first, count, step, rows, v, duration, q):
+def drift(first: int, count: int, step: int, rows: Indices, v: Rows, duration: float, q: Positions) -> None:
     """q += duration v at the rows of (l, 3) arrays."""
     for row in range(first, count, step):
         i = rows[row]

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Positions, Rows, like, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
 from msmpetsc.errors import InputError
@@ -152,21 +152,23 @@ def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
 
 
 @kernel
-def _spread(first, count, step, columns, rows, nodes):
+def _spread(first: int, count: int, step: int, columns: Rows, rows: Indices, nodes: Rows) -> None:
     for i in range(first, count, step):
         for c in range(3):
             nodes[rows[i], c] = columns[c, i]
 
 
 @kernel
-def _collect(first, count, step, nodes, rows, columns):
+def _collect(first: int, count: int, step: int, nodes: Rows, rows: Indices, columns: Rows) -> None:
     for i in range(first, count, step):
         for c in range(3):
             columns[c, i] = nodes[rows[i], c]
 
 
 @kernel
-def _scaled_sum(first, count, step, mass, a, t2, b, rows, columns):
+def _scaled_sum(
+    first: int, count: int, step: int, mass: Floats, a: Array, t2: float, b: Array, rows: Indices, columns: Rows
+) -> None:
     for i in range(first, count, step):
         for c in range(3):
             columns[c, i] = mass[rows[i]] * a[rows[i], c] + t2 * b[rows[i], c]

@@ -70,16 +70,16 @@ class CoarseOperator:
         begin, _, values = self.matrix.getValuesCSR()
         self.sums[:] = np.add.reduceat(values.reshape(-1, 3), begin[:-1] // 3, axis=0).reshape(-1, 9)
         for part in (self.own, self.others):
-            take_blocks(self.length, *part, values)
+            take_blocks(self.length, part, values)
         self.operator.assemble()
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""
         self.x[:] = x.array_r.reshape(-1, 3)
-        multiply_upper(*self.own, self.sums, self.x, self.y)
+        multiply_upper(self.own, self.sums, self.x, self.y)
         if self.matrix.comm.size > 1:
             self.scatter.scatter(x, self.ghosts)
-            add_product(*self.others, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y)
+            add_product(self.others, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y)
         y.array_w[:] = self.y.ravel()
 
     def destroy(self, _: PETSc.Mat) -> None:
@@ -88,21 +88,22 @@ class CoarseOperator:
 
 
 @numba.njit(cache=True)
-def take_blocks(length: Indices, begin: Indices, _: Indices, place: Indices, values: Array, given: Floats) -> None:
-    """Write the blocks into ``values``, from the ``given`` numbers of an AIJ, whose rows have that length."""
-    for i in range(len(begin) - 1):
-        for k in range(begin[i], begin[i + 1]):
+def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
+    """Take the values of blocks from the ``given`` numbers of an AIJ, whose rows have that length."""
+    for i in range(len(blocks.begin) - 1):
+        for k in range(blocks.begin[i], blocks.begin[i + 1]):
             for r in range(3):
                 for c in range(3):
-                    values[k, 3 * r + c] = given[place[k] + r * length[i] + c]
+                    blocks.values[k, 3 * r + c] = given[blocks.place[k] + r * length[i] + c]
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
-def multiply_upper(begin: Indices, columns: Indices, _: Indices, h: Array, sums: Array, x: Array, y: Array) -> None:
+def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
     """y = H x of blocks whose column is greater than their row, the others being their transposes.
 
     sums : (n, 9) of all blocks of a row, by which a translation keeps its digits where H is stiff
     """
+    begin, columns, _, h = blocks
     y[:] = 0
     for i in range(len(begin) - 1):
         u, v, w = x[i, 0], x[i, 1], x[i, 2]
@@ -122,8 +123,9 @@ def multiply_upper(begin: Indices, columns: Indices, _: Indices, h: Array, sums:
 
 
 @numba.njit(cache=True)
-def add_product(begin: Indices, columns: Indices, _: Indices, h: Array, x: Array, ghosts: Array, y: Array) -> None:
+def add_product(blocks: BlockRows, x: Array, ghosts: Array, y: Array) -> None:
     """y += H (ghosts - x), x that of each block's row."""
+    begin, columns, _, h = blocks
     for i in range(len(begin) - 1):
         u, v, w = x[i, 0], x[i, 1], x[i, 2]
         for k in range(begin[i], begin[i + 1]):

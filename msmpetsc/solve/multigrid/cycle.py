@@ -17,7 +17,7 @@ from petsc4py import PETSc
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpstrf
 
-from msmpetsc.backend.arrays import Array, Floats, Positions, Rows, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
@@ -206,7 +206,7 @@ def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlock
     ksp.setComputeEigenvalues(True)
     ksp.setTolerances(max_it=ITERATIONS, rtol=np.finfo(float).eps)
     ksp.solve(b, x)
-    greatest = ksp.computeExtremeSingularValues()[0]
+    greatest = float(ksp.computeExtremeSingularValues()[0])
     for owned in (ksp, x, b):
         owned.destroy()
     return greatest
@@ -332,7 +332,7 @@ def root_of(matrix: Rows) -> Rows:
 
 
 @kernel
-def add_node_blocks(first, count, step, blocks, v, product):
+def add_node_blocks(first: int, count: int, step: int, blocks: Rows, v: Array, product: Array) -> None:
     for i in range(first, count, step):
         for r in range(3):
             for c in range(3):
@@ -340,7 +340,7 @@ def add_node_blocks(first, count, step, blocks, v, product):
 
 
 @kernel
-def apply_blocks(first, count, step, x, inverse, y):
+def apply_blocks(first: int, count: int, step: int, x: Rows, inverse: Array, y: Rows) -> None:
     for i in range(first, count, step):
         a, b, c = x[0, i], x[1, i], x[2, i]
         for r in range(3):
@@ -348,7 +348,10 @@ def apply_blocks(first, count, step, x, inverse, y):
 
 
 @kernel
-def invert_blocks(first, count, step, blocks, free, mass, contact, t2, inverse):
+def invert_blocks(
+    first: int, count: int, step: int, blocks: Rows, free: Indices, mass: Floats, contact: Rows, t2: float,
+    inverse: Array,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         node = free[i]
         m, d = mass[node], blocks[node]

@@ -7,7 +7,7 @@ being turned inside out, t^2 times its curvature times G G^T, G the slopes of it
 cell of a solid its Hessian, whose strains are taken of the coarse cell's corners (elasticity.neo_hookean).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -185,8 +185,10 @@ def _by_cell(
 
 @kernel
 def add_springs(
-    first, count, step, q, start, order, code, springs, rest, k, b, t2, begin, pair, factor, places, values
-):
+    first: int, count: int, step: int, q: Positions, start: Indices, order: Indices, code: Array, springs: Indices,
+    rest: Floats, k: Floats, b: float, t2: float, begin: Indices, pair: Indices, factor: Floats, places: Indices,
+    values: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
             s, kind = order[at], 28 * code[at, 0] + code[at, 1]
@@ -205,7 +207,10 @@ def add_springs(
 
 
 @kernel
-def add_nodes(first, count, step, start, order, code, mass, contact, t2, begin, pair, factor, places, values):
+def add_nodes(
+    first: int, count: int, step: int, start: Indices, order: Indices, code: Array, mass: Floats, contact: Rows,
+    t2: float, begin: Indices, pair: Indices, factor: Floats, places: Indices, values: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
             node, kind = order[at], code[at, 0]
@@ -225,7 +230,10 @@ def add_nodes(first, count, step, start, order, code, mass, contact, t2, begin, 
 
 
 @kernel
-def add_resistance(first, count, step, q, start, order, code, cells, resistance, least, t2, weights, places, values):
+def add_resistance(
+    first: int, count: int, step: int, q: Positions, start: Indices, order: Indices, code: Array, cells: Indices,
+    resistance: Floats, least: float, t2: float, weights: Rows, places: Indices, values: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
             cell = order[at]
@@ -238,7 +246,9 @@ def add_resistance(first, count, step, q, start, order, code, cells, resistance,
 
 
 @numba.njit(cache=True)
-def _add_corner(i, frame, code, curvature, n, weights, places, values):
+def _add_corner(
+    i: int, frame: int, code: Array, curvature: float, n: Any, weights: Rows, places: Indices, values: Rows
+) -> None:
     """Add curvature G G^T to the blocks of cell i."""
     pair = -1
     for a in range(8):
@@ -253,7 +263,7 @@ def _add_corner(i, frame, code, curvature, n, weights, places, values):
 
 
 @numba.njit(cache=True)
-def _slope(frame, code, weights, a, n):
+def _slope(frame: int, code: Array, weights: Rows, a: int, n: Any) -> tuple[float, float, float]:
     """Slope of a corner's volume as corner a of the coarse cell moves."""
     x, y, z = 0.0, 0.0, 0.0
     for role in range(4):

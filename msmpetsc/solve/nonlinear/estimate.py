@@ -106,7 +106,7 @@ class ErrorEstimate:
         self.hessian.linearise(q, self.functional.problem.contact)
         self.operator.assemble()
 
-    def _converged(self, ksp: PETSc.KSP, its: int, residual: float) -> int | None:
+    def _converged(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
         """Whether the solve has shown what an estimate needs (a convergence test of KSP)."""
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
@@ -154,7 +154,7 @@ class ErrorEstimate:
         """The least eigenvalue of P^(-1) H that is known, that of a solve by CG included; 0 where there is none."""
         if ksp.its < FEW:
             return self.least
-        least = ksp.computeExtremeSingularValues()[1]
+        least = float(ksp.computeExtremeSingularValues()[1])
         if not 0 < least <= GREATEST:
             return 0.0
         return least if ksp.its >= MANY or not self.least else min(least, self.least)

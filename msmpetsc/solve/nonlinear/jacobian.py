@@ -83,7 +83,8 @@ class Jacobian:
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         self.functional.elasticity.add_bound(lattice.nodes, blocks)
         stiffness = blocks[unknowns.free][:, [0, 4, 8]].sum(axis=1)
-        return unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
+        diagonal: Floats = unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
+        return diagonal
 
     def linearise(
         self, q: Positions, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False

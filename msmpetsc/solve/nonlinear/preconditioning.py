@@ -68,7 +68,7 @@ class Preconditioner:
             return False
         lattice = self.unknowns.lattice
         bound = (contact.bound(q) if contact else np.zeros(lattice.owned, like=q))[self.unknowns.free]
-        changed = lattice.table.comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
+        changed = bool(lattice.table.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR))
         if changed:
             self.added = bound
             self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
@@ -199,7 +199,7 @@ class LatticePreconditioner:
 
 def expected_iterations(ratio: float) -> float:
     """Iterations that Jacobi's takes where the greatest t^2 k / m of a node is ``ratio``."""
-    return 0.5 * np.sqrt(2 * (1 + ratio)) * np.log(2 / USUAL)
+    return float(0.5 * np.sqrt(2 * (1 + ratio)) * np.log(2 / USUAL))
 
 
 @dataclass(eq=False)

@@ -260,7 +260,7 @@ class Stepper:
         self.iterations += self.snes.its
         if self.snes.reason < 0 and Stop.agreed(self.comm):
             raise StepStopped("stopped by a signal")
-        return self.snes.its
+        return int(self.snes.its)
 
     def examine(self, outcome: Outcome) -> Verdict:
         """Whether x is a minimum, and how far from it (collective)."""
@@ -361,7 +361,7 @@ class Stepper:
             self.control.estimate.correction.copy(snes.getSolutionUpdate())
         self.ksp.setInitialGuessNonzero(known)
 
-    def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
+    def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> PETSc.SNES.ConvergedReason:
         """Whether SNES is done (its convergence test), by its iterate's error or by the budget."""
         reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:

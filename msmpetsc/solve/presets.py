@@ -226,11 +226,6 @@ class SolverOptions:
         """Whether an option is the preset's own, not the user's."""
         return self.prefix + name in self.names
 
-    def users_of(self, *beginnings: str) -> list[str]:
-        """Names of the user's own options that begin so."""
-        beginnings = tuple(self.prefix + beginning for beginning in beginnings)
-        return [name for name in PETSc.Options().getAll().keys() - self.names if name.startswith(beginnings)]
-
     def is_given(self, name: str) -> bool:
         """Whether an option stands in the database, the user's or the preset's."""
         return self.prefix + name in PETSc.Options().getAll()

@@ -13,11 +13,10 @@ from one_process import command_error, errors, input_error
 
 from msmpetsc.cli.arguments import option_names
 from msmpetsc.cli.command_table import COMMANDS
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import InputError
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.initialise import _check_files
-from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.presets import PRESETS, find_preset, shown_options
 from msmpetsc.solve.refused_options import refuse_early, refuse_unused
 
@@ -40,7 +39,7 @@ NO_USE = {
     "snes_mf": ("", "solver.preset"),
     "snes_type": ("newtontr", "newtonls"),
     "three_columns_pc_type": ("bjacobi", "-pc_"),
-    "ksp_error_if_not_converged": ("", "status 3"),
+    "mg_coarse_ksp_error_if_not_converged": ("", "status 3"),
     "ksp_monitor": ("binary:f.dat", "ascii:FILE"),
     "mat_view": ("binary:A.dat", "not written"),
     "ksp_view_pmat": ("binary:A.dat", "not written"),
@@ -117,14 +116,6 @@ def test_an_option_of_ours_with_one_dash_is_told_its_name():
     for name, option in set(options) - {("run", "--help"), ("inspect", "--help")}:
         assert f"did you mean '{option}'?" in command_error(name, option[1:], "3")
     assert "takes no PETSc options" in command_error("compare", "a.h5", "b.h5", "-ksp_type", "cg")
-
-
-def test_a_solver_that_is_to_fail_where_it_does_not_converge_fails_the_step():
-    """As of an inner solver: -mg_coarse_ksp_error_if_not_converged."""
-    from petsc4py import PETSc
-
-    with pytest.raises(StepFailed, match="did not converge"), petsc_errors("PETSc cannot"):
-        raise PETSc.Error(91)
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])

@@ -50,7 +50,6 @@ SWEEPS = 4
 SHARE = 1 / 8  # of what was saved, that a step may spend
 FAIR = 0.25  # of an equal share of all credit among all steps: a step may spend that in any case
 EXCESS = 2.0  # times what a step may spend: it is taken all the same, the next one is shorter
-EASE = 1.0  # of what a step twice as long may spend: what it would take, before it is tried
 CALM = 2  # steps that would have let the next be twice as long, before it is
 
 
@@ -167,7 +166,7 @@ class StepControl:
         """Enter a step that stands, and choose the level that comes next."""
         allowed = self.allowed(level, measure)
         longer, growth = self.level + 1, 2.0 ** ((self.order + 1) * (self.level + 1 - level))
-        is_calm = measure.error * growth <= EASE * self.allowed(longer, measure)
+        is_calm = measure.error * growth <= self.allowed(longer, measure)
         self.motion = max(self.motion, measure.motion)
         self.passed += self.motion * self.step * 2.0**level / self.duration
         self.spent, self.steps = self.spent + measure.error, self.steps + 1

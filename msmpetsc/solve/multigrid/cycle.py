@@ -38,7 +38,6 @@ COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish 
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
 SAFETY = 1.1  # times it where no bound is known, as some iterations of CG know it
 ITERATIONS = 10  # of these
-BLOCK = 15  # operations of a product with a 3 x 3 block
 
 
 @dataclass(frozen=True)
@@ -261,7 +260,7 @@ class ProjectedHessian:
             if self.joined:
                 self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
-            count_flops(self.elasticity.flops.product + (BLOCK + 3) * len(self.contact))
+            count_flops(self.elasticity.flops.product + 18 * len(self.contact))
 
 
 class DiagonalBlocks:
@@ -276,7 +275,7 @@ class DiagonalBlocks:
         apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, moved)
         if self.hessian.smoother:
             self.hessian.smoother.correct(moved)
-        count_flops(BLOCK * unknowns.size)
+        count_flops(15 * unknowns.size)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")

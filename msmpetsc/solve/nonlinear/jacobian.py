@@ -47,7 +47,7 @@ class Jacobian:
         self.hessian = TrueHessian(self.unknowns, elasticity, functional.time_step, self._contact_blocks())
         self.blocks = None if true_hessian else self._contact_blocks()  # that go with A
         chooses = self.preset.chooses and options.is_default("pc_type")
-        kind = MULTIGRID if chooses and options.users_of("mg_", "pc_mg_") else options.value("pc_type")
+        kind = options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
             raise InputError(f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; of A there is gamg")
         context = self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)

@@ -10,11 +10,10 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
-from msmpetsc.errors import InputError, StepFailed, did_you_mean
+from msmpetsc.errors import InputError, did_you_mean
 
 Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
 INSERT = int(PETSc.InsertMode.INSERT_VALUES)
-NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked for it
 
 
 @cache
@@ -84,8 +83,7 @@ def _check(error: int) -> None:
 def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
-    ImportError is that of an object of type python whose context is not there. A solver that did
-    not converge, where an option made that an error, becomes StepFailed.
+    ImportError is that of an object of type python whose context is not there.
 
     abandon : called after such an error
     """
@@ -98,8 +96,6 @@ def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Itera
         if cause is not None and not isinstance(cause, (PETSc.Error, ImportError)):
             raise cause  # noqa: B904 (the error itself, not another)
         abandon()
-        if getattr(error, "ierr", 0) == NOT_CONVERGED:
-            raise StepFailed(f"did not converge: {last_words(error)}", "linear solve") from None
         raise InputError(f"{what}: {last_words(cause or error)}") from None
 
 

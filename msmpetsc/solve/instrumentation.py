@@ -36,7 +36,7 @@ class Probes:
 
 
 class TrueErrors:
-    """True errors of a run's steps, against steps solved to rounding, and what the iterates of one had.
+    """True errors of a run's steps, and of the iterates of one, against steps solved to rounding.
 
     What it takes is not timed with the run.
 
@@ -76,7 +76,7 @@ class TrueErrors:
         return last
 
     def errors(self, stepper: Stepper, problem: StepProblem, positions: list[Positions]) -> Rows:
-        """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
+        """Return the errors (k, 2) of positions (l, 3) [m]; NaN where the reference fails (collective).
 
         Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
         """
@@ -119,7 +119,7 @@ class TrueErrors:
 
 
 def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
-    """|x - x*|_M and g(x) - g*."""
+    """Return |x - x*|_M and g(x) - g*."""
     reference.unknowns.from_nodes(x - exact, reference.x)
     distance = reference.functional.norm(reference.x)
     reference.unknowns.from_nodes(x, reference.x)

@@ -17,8 +17,10 @@ from msmpetsc.solve.petsc.words import options_of, words_of
 
 @dataclass(frozen=True)
 class Preset:
-    """about: when to use it. options: PETSc's, without the dash.
+    """A method as a set of PETSc options.
 
+    about        : when to use it
+    options      : PETSc's, without the dash
     projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
     extrapolate  : a step starts from the best of several guesses, not from y as published
     iterations   : a fixed number of them is the method as published; None: to the error target
@@ -159,7 +161,7 @@ def preset_names() -> list[str]:
 
 
 def find_preset(name: str) -> Preset:
-    """Raises InputError with the nearest name for an unknown one."""
+    """Return the preset of a name. Raises InputError with the nearest name for an unknown one."""
     if name in PRESETS:
         return PRESETS[name]
     if name not in ADDED.names():

@@ -59,7 +59,7 @@ def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) 
 
 
 def bdf2_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
-    """The same of BDF2."""
+    """Local error (n, 3) [m] of a step of BDF2 from q with velocity v to x with velocity w."""
     return 1.6 * (x - q - 0.5 * time_step * (v + w))
 
 
@@ -67,7 +67,7 @@ METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order
 
 
 class NeighbourMean:
-    """Means over a node and its neighbours by springs, ``SWEEPS`` times. All methods are collective."""
+    """Averages vectors over nodes and their neighbours by springs, ``SWEEPS`` times. Collective."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.comm, self.lattice = comm, lattice
@@ -205,7 +205,7 @@ class Ticks:
         return 1 << (level - self.lowest)
 
     def time(self, tick: int) -> float:
-        """[s]"""
+        """Time of a tick [s]."""
         return tick / 2.0**-self.lowest * self.step
 
     def fitting(self, tick: int, level: int) -> int:
@@ -263,7 +263,7 @@ class Adaptive(Integrator):
         log.info("steps of %.3g to %.3g s, for an error of %.2g of the motion", shortest, longest, self.control.asked)
 
     def _integrator(self, level: int) -> Integrator:
-        """That of a level; one that was not used last has forgotten all that a checkpoint would have to know."""
+        """Return the integrator of a level; it forgets what earlier steps showed where another was used last."""
         if level not in self.kept:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.kept[level] = self.make(time, self.solver)
@@ -282,7 +282,7 @@ class Adaptive(Integrator):
         return self.time_step * 2.0**level
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """What a frame at ``time`` shows, after as many steps as that takes. Raises StepFailed."""
+        """Take as many steps as lead to ``time``; what a frame shows at that time. Raises StepFailed."""
         frame = round(time / self.time_step)
         wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, Work())
         if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
@@ -295,7 +295,7 @@ class Adaptive(Integrator):
         return replace(total, time_error=self.control.estimate), state
 
     def _within(self, total: StepResult, state: State, share: float, time: float) -> StepResult:
-        """What a frame shows that comes by a share of the last step before its end."""
+        """Interpolate the result at a share of the last step before its end."""
         q, v = state.q, state.velocity(self.time_step)
         if share > 0 and state.history:
             q, v = between(*state.history, q, v, self._length(self.last), 1 - share)
@@ -305,7 +305,7 @@ class Adaptive(Integrator):
         return replace(total, position=q, previous=q - self.time_step * v)
 
     def _step(self, state: State) -> tuple[StepResult, State]:
-        """The next step that stands; others are taken again, shorter. Raises StepFailed."""
+        """Take the next step; one whose error is too large is taken again, shorter. Raises StepFailed."""
         restarts = self.ticks.is_event(self.tick)
         cost = Work()
         while True:

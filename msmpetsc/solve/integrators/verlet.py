@@ -97,7 +97,7 @@ class Verlet(Integrator):
         self.gained, self.halvings = 0.0, 0
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.
+        """Take the step that ends at ``time`` (collective). Raises StepFailed.
 
         Taken again with shorter substeps where its end shows that they were too long: a blow may
         stiffen a body, folds may heat it.
@@ -250,7 +250,7 @@ class Verlet(Integrator):
             self.highest.hold(self.fixed)
 
     def _pushed(self, start: float, time: float) -> float:
-        """The most omega^2 [1/s^2] that obstacles may add to the springs' until ``time`` (Weyl) (collective)."""
+        """Bound what obstacles may add to omega^2 [1/s^2] until ``time``, by Weyl (collective)."""
         fall = self.environment.load(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
@@ -297,7 +297,7 @@ class HighestMode:
         self.squared = 0.0
 
     def squared_at(self, q: Positions) -> float:
-        """omega^2 of the springs at q (l, 3) [m] (collective).
+        """Return omega^2 [1/s^2] of the springs at q (l, 3) [m] (collective).
 
         Without the negative curvature across pressed springs, which is no oscillation and has no bound.
         """
@@ -316,7 +316,7 @@ class HighestMode:
         return self.squared
 
     def _normalise(self) -> float:
-        """Make |x|_M = 1; returns what it was (collective)."""
+        """Scale the mode x to |x|_M = 1, and return what that was (collective)."""
         x = self.mode.values[: self.lattice.owned]
         size = float(np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x)))))
         if size > 0:
@@ -330,7 +330,7 @@ class HighestMode:
 
 
 def explicit_limit(comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity) -> float:
-    """2 / omega [s] at rest: explicit steps are stable below it (collective)."""
+    """Return the limit 2 / omega [s] at rest, below which explicit steps are stable (collective)."""
     highest = HighestMode(comm, lattice, elasticity)
     highest.hold(lattice.pinned[: lattice.owned])
     squared = highest.squared_at(lattice.nodes)

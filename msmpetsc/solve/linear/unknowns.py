@@ -1,4 +1,4 @@
-"""Which PETSc unknown is which coordinate of which node; and values of nodes whose ghosts follow their owners.
+"""Numbering of PETSc's unknowns by nodes and coordinates, and values of nodes whose ghosts follow their owners.
 
 Pinned nodes are no unknowns. A vector of unknowns holds, on each rank, the x of its free nodes,
 then their y, then their z: so its local array is an m x 3 dense block, which a scalar m x m matrix
@@ -107,7 +107,7 @@ class Unknowns:
 
 
 class Ghosted:
-    """values (l, 3): the owned nodes, then the ghosts, in the memory of two PETSc vectors."""
+    """Values (l, 3) of the owned nodes, then of the ghosts, in the memory of two PETSc vectors."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         refuse_unknowns(lattice.table.total)
@@ -130,7 +130,7 @@ class Ghosted:
 
 
 def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
-    """Rows (l, ...) of local nodes from those of the owned ones, both on the host (collective)."""
+    """Return rows (l, ...) of local nodes from those of the owned ones, both on the host (collective)."""
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     return np.concatenate([rows, to_owner.answer(rows[asked])])

@@ -121,7 +121,7 @@ class FrictionKinks:
         self.is_awaited = False
 
     def begin(self, contact: Contact | None) -> None:
-        """Begin a step of which nothing is known yet."""
+        """Begin a step, with secants for all nodes in contact."""
         self.contact, self.is_awaited = contact, False
         self.secants = contact.all_secant() if contact else None
 

@@ -92,7 +92,7 @@ class Preconditioner:
 
 
 class LatticePreconditioner:
-    """The cycle, and how its hierarchy serves. All methods are collective.
+    """Multigrid of the Hessian, with a hierarchy that is kept while it pays. All methods are collective.
 
     pc           : PETSc's PCMG of the projected Hessian
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
@@ -117,7 +117,7 @@ class LatticePreconditioner:
         self.joining: SurfaceHessian | None = None
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
-        """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
+        """Build a hierarchy at positions q (l, 3) [m] if a new one is due; whether it was."""
         is_asked = self.is_stale or self.joins
         surface = contact.surface.hessian(q, True) if is_asked and contact and contact.surface else None
         joining = surface if self.joins else None
@@ -143,7 +143,7 @@ class LatticePreconditioner:
             columns -= self.translations.of(self.unknowns.columns(f))
 
     def learn(self, its: int, rtol: float) -> None:
-        """A linear solve took so many iterations to a relative tolerance; none say nothing.
+        """Take note of the iterations that a linear solve took to a relative tolerance.
 
         A hierarchy is kept until what it has cost would have paid for a new one: at worst that is twice the least.
         """
@@ -196,7 +196,7 @@ def expected_iterations(ratio: float) -> float:
 
 @dataclass(eq=False)
 class StepPreconditioner:
-    """The one in use (a PCPYTHON context). All methods are collective.
+    """Preconditioner of a step's solves, of A or of the Hessian (a PCPYTHON context). Collective.
 
     make_of_matrix, make_multigrid : make them where they are needed
     chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
@@ -265,13 +265,12 @@ class StepPreconditioner:
 
     @property
     def to_balance(self) -> LatticePreconditioner | None:
-        """What moves bodies as wholes to where their forces balance, which linear solves would not;
-        None where nothing has to."""
+        """The multigrid that moves free bodies as wholes to where forces balance; None where there is none."""
         multigrid = self.multigrid if self.is_chosen else None
         return multigrid if multigrid and multigrid.translations else None
 
     def learn(self, its: int, rtol: float) -> None:
-        """A linear solve took so many iterations to a relative tolerance."""
+        """Take note of the iterations that a linear solve took to a relative tolerance."""
         if self.multigrid and self.is_chosen:
             self.multigrid.learn(its, rtol)
         elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / rtol):

@@ -53,7 +53,7 @@ def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
 
 @contextmanager
 def replaced_option(name: str, value: str) -> Iterator[None]:
-    """Have another value of an option that is set, or none, while the block is run."""
+    """Replace the value of an option while the block is run."""
     database, before = PETSc.Options(), PETSc.Options().getAll()
     database.setValue(name, value)
     yield

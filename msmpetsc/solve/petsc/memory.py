@@ -13,7 +13,7 @@ from msmpetsc.solve.petsc.library import dense_pointer
 
 
 class Memory:
-    """The CPU's.
+    """PETSc's vectors and matrices in the memory of the CPU.
 
     types : PETSc's names of vectors and matrices there
     """
@@ -42,7 +42,7 @@ class Memory:
 
 
 class CudaMemory(Memory):
-    """A GPU's.
+    """PETSc's vectors and matrices in the memory of a GPU.
 
     Pointers are given back at once, as petsc4py does for DLPack: PETSc then knows that the GPU has the last word, and
     what is written later is in the same stream as all of PETSc's work, the default one.

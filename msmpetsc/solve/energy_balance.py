@@ -175,8 +175,8 @@ class EnergyBalance:
     def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Floats:
         """Return the terms (5,) [J] of the right side of the balance (collective).
 
-        They are the energies, the push in them, the work of loads and of obstacles that drag, the work that the step
-        counted itself, and its swing.
+        They are the energies, the push in them, the work of loads and of obstacles that drag,
+        the work that the step counted itself, and its swing.
         """
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)

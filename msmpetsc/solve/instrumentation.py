@@ -1,4 +1,4 @@
-"""Measurements beside a run's frames: true errors, the iterates of one step, where the time went."""
+"""Measurements of a run: true errors, the iterates of one step, where the time went."""
 
 from dataclasses import dataclass
 from time import perf_counter
@@ -46,13 +46,14 @@ class TrueErrors:
     def __init__(self) -> None:
         self.stepper: Stepper | None = None  # whose steps the reference takes
         self.reference: Stepper | None = None
-        # of a step that is followed: KSP iterations and seconds since it began, positions (l, 3) [m]
+        # of a step that is followed: KSP iterations and seconds so far, positions (l, 3) [m]
         self.iterates: list[tuple[int, float, Positions]] = []
         self.trace: dict[str, Any] | None = None
 
     def follow(self, stepper: Stepper) -> None:
         """Trace the iterates of the step that begins now."""
-        begin, before = perf_counter(), stepper.work_so_far()
+        begin = perf_counter()
+        before = stepper.work_so_far()
 
         def observe(q: Positions) -> None:
             nonlocal begin
@@ -64,7 +65,9 @@ class TrueErrors:
 
     def measure(self, index: int, stepper: Stepper, result: StepResult) -> Floats:
         """Position and energy error (2,) of step ``index``, which a stepper took last (collective)."""
-        iterates, self.iterates, stepper.observer = self.iterates, [], None
+        iterates = self.iterates
+        self.iterates = []
+        stepper.observer = None
         assert result.problem is not None, "no step was taken"
         errors = self.errors(stepper, result.problem, [*(q for *_, q in iterates), result.position])
         if iterates:
@@ -76,7 +79,7 @@ class TrueErrors:
         return last
 
     def errors(self, stepper: Stepper, problem: StepProblem, positions: list[Positions]) -> Rows:
-        """Return the errors (k, 2) of positions (l, 3) [m]; NaN where the reference fails (collective).
+        """Return the errors (k, 2) of positions (l, 3) [m], NaN if the reference fails (collective).
 
         Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
         """

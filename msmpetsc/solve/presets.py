@@ -237,7 +237,7 @@ class SolverOptions:
         return str(PETSc.Options().getString(self.prefix + name, ""))
 
     def withdraw(self) -> None:
-        """Leave the database as the user has it: other presets follow, -options_left shows his own."""
+        """Leave the database as the user has it, for other presets and -options_left."""
         in_use.subtract(self.names)
         for name in self.names:
             if not in_use[name]:

@@ -39,7 +39,7 @@ NO_USE = {  # what PETSc would take, but not do here, or crash by; a name and it
 
 
 def refuse_early(comm: MPI.Comm) -> None:
-    """Raise InputError for options of the user that cannot be of use, whatever the scene (collective)."""
+    """Raise InputError for options that are of no use in any scene (collective)."""
     lines = []
     for name, value in PETSc.Options().getAll().items():
         given = f"{OF_STEPPERS.sub('', name)} {value or ''}"

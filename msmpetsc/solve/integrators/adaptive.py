@@ -263,7 +263,7 @@ class Adaptive(Integrator):
         log.info("steps of %.3g to %.3g s, for an error of %.2g of the motion", shortest, longest, self.control.asked)
 
     def _integrator(self, level: int) -> Integrator:
-        """Return the integrator of a level; it forgets what earlier steps showed where another was used last."""
+        """Return a level's integrator, which forgets earlier steps if another was used last."""
         if level not in self.kept:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.kept[level] = self.make(time, self.solver)
@@ -282,7 +282,7 @@ class Adaptive(Integrator):
         return self.time_step * 2.0**level
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """Take as many steps as lead to ``time``; what a frame shows at that time. Raises StepFailed."""
+        """Take the steps up to ``time``; what a frame shows then. Raises StepFailed."""
         frame = round(time / self.time_step)
         wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, Work())
         if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
@@ -305,7 +305,7 @@ class Adaptive(Integrator):
         return replace(total, position=q, previous=q - self.time_step * v)
 
     def _step(self, state: State) -> tuple[StepResult, State]:
-        """Take the next step; one whose error is too large is taken again, shorter. Raises StepFailed."""
+        """Take the next step, again and shorter if its error is too large. Raises StepFailed."""
         restarts = self.ticks.is_event(self.tick)
         cost = Work()
         while True:

@@ -138,7 +138,7 @@ class ImplicitEuler(Integrator):
         return duration / (1 + self.damping * duration)
 
     def set_up(self) -> None:
-        """Build the preconditioner. Raises InputError for one that PETSc or the matrix lacks (collective)."""
+        """Build the preconditioner (collective). Raises InputError for one that is missing."""
         self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:

@@ -196,7 +196,7 @@ class Verlet(Integrator):
             contact.add_gradient(self.q, self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
-        """Change v by the forces at ``time``; obstacles move as in the substep from begin to end."""
+        """Change v by the forces at ``time``; obstacles move as in the substep to its end."""
         self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
         load, before = self.environment.load(time), None if beyond is None else self.v.copy()
@@ -330,7 +330,7 @@ class HighestMode:
 
 
 def explicit_limit(comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity) -> float:
-    """Return the limit 2 / omega [s] at rest, below which explicit steps are stable (collective)."""
+    """Return the limit 2 / omega [s] of stable explicit steps at rest (collective)."""
     highest = HighestMode(comm, lattice, elasticity)
     highest.hold(lattice.pinned[: lattice.owned])
     squared = highest.squared_at(lattice.nodes)

@@ -1,4 +1,4 @@
-"""Numbering of PETSc's unknowns by nodes and coordinates, and values of nodes whose ghosts follow their owners.
+"""Numbering of PETSc's unknowns by nodes and coordinates, and values of nodes with ghosts.
 
 Pinned nodes are no unknowns. A vector of unknowns holds, on each rank, the x of its free nodes,
 then their y, then their z: so its local array is an m x 3 dense block, which a scalar m x m matrix
@@ -14,8 +14,8 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.solve.petsc.device import memory_of
 from msmpetsc.solve.petsc.events import GHOSTS
-from msmpetsc.solve.petsc.memory import memory_of
 
 LARGEST = int(np.iinfo(PETSc.IntType).max)  # of PETSc's integers: 32 bits, unless it was configured otherwise
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
@@ -130,7 +130,7 @@ class Ghosted:
 
 
 def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
-    """Return rows (l, ...) of local nodes from those of the owned ones, both on the host (collective)."""
+    """Return rows (l, ...) of local nodes from those of the owned ones, on the host (collective)."""
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     return np.concatenate([rows, to_owner.answer(rows[asked])])

@@ -29,7 +29,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import RAISED, CoarseOperator, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
-from msmpetsc.solve.petsc import memory
+from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.events import FINE, count_flops
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
@@ -41,7 +41,7 @@ ITERATIONS = 10  # of these
 
 @dataclass(frozen=True)
 class Level:
-    """A coarse level: its grid, P from it to the next finer one, and its matrix (AIJ, block size 3)."""
+    """Coarse level: its grid, P from it to the next finer one, its matrix (AIJ, block size 3)."""
 
     grid: CoarseGrid
     interpolation: PETSc.Mat
@@ -105,7 +105,7 @@ class Multigrid:
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
         is_new = self.pc.getType() is None
-        if is_new and self.unknowns.memory is not memory.CUDA:
+        if is_new and self.unknowns.memory is not device.CUDA:
             self.coarse = [CoarseOperator(level.matrix) for level in self.levels[:-1]]
             for coarse in self.coarse:
                 self.owned.callback(coarse.operator.destroy)
@@ -155,7 +155,7 @@ class Multigrid:
         given = PETSc.Options().getAll()
         if matrix.comm.size > 1 and "matptap_via" not in given:
             yield "matptap_via", "allatonce"  # the default adds what other ranks send as it comes in: no two runs alike
-        if self.unknowns.memory is memory.CUDA and "matptap_backend_cpu" not in given:
+        if self.unknowns.memory is device.CUDA and "matptap_backend_cpu" not in given:
             yield "matptap_backend_cpu", "true"  # on an H100 PETSc 3.26's own product of two sparse matrices was 0
 
     def _create_cycle(self) -> None:

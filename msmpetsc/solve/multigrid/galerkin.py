@@ -1,4 +1,4 @@
-"""Matrices of coarse levels: the first, P^T H P, is summed spring by spring; all are applied in single precision.
+"""Matrices of coarse levels: the first summed spring by spring, all applied in single precision.
 
 Each spring lies within one coarse cell of 2 x 2 x 2 cells. With w_a the weights (8,) of a cell's corners at the end a,
 zero where that is held, a spring of block B adds (w_a - w_b)(w_a - w_b)^T (x) t^2 B to the matrix (24 x 24) of its

@@ -11,8 +11,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.errors import InputError
-from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
-from msmpetsc.solve.linear.system import assemble
+from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, assemble, python_matrix
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,

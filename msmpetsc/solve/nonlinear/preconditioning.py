@@ -1,4 +1,4 @@
-"""Which preconditioner a step's linear solves have: one of A, or multigrid of the Hessian on the lattice.
+"""Preconditioners of a step's linear solves: of A, or multigrid of the Hessian on the lattice.
 
 With Jacobi's, CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations, kappa = 2 (1 + t^2 k / m) where nothing is held,
 k the springs at a node together; multigrid takes about four whatever that is, each as dear as several. So short steps
@@ -23,8 +23,8 @@ from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.multigrid.free_bodies import Translations
+from msmpetsc.solve.petsc.device import HOST
 from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
-from msmpetsc.solve.petsc.memory import HOST
 
 MULTIGRID = PETSc.PC.Type.MG
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
@@ -92,7 +92,7 @@ class Preconditioner:
 
 
 class LatticePreconditioner:
-    """Multigrid of the Hessian, with a hierarchy that is kept while it pays. All methods are collective.
+    """Multigrid of the Hessian, with a hierarchy that is kept while it pays. Collective.
 
     pc           : PETSc's PCMG of the projected Hessian
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
@@ -166,7 +166,7 @@ class LatticePreconditioner:
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """The Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) without contact."""
+        """Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) if there are none."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
         for nodes, added in contact.hessian(q, False) if contact else ():

@@ -276,7 +276,7 @@ class Stepper:
     def _leave(self, verdict: Verdict, outcome: Outcome) -> Outcome | None:
         """Move x from where it is no minimum to where g is lower; what is then known (collective). Raises StepFailed.
 
-        None where g has no digits left to tell the two points apart: the step is as good as the verdict says.
+        None where g has no digits left to tell the two apart: the step is as good as the verdict says.
         """
         doubted = self.control.doubt(replace(outcome, error=verdict.error), self.minimum.go_on(self.x, verdict))
         if doubted and doubted.doubts > DOUBTS:

@@ -100,7 +100,7 @@ def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Itera
 
 
 def last_words(error: BaseException) -> str:
-    """Message of a PETSc error without the calls it came through; of an unknown type the nearest."""
+    """Message of a PETSc error, without its calls; for an unknown type with the nearest."""
     lines = str(error).splitlines()
     said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
     words = said[-1] if said else lines[0]

@@ -31,6 +31,7 @@ DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
 USUAL = 0.1  # ksp_rtol
 LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
+USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
 WORTH = 10.0  # iterations that a new hierarchy takes the time of
 MANY = 150  # iterations of a solve that contact is to blame for: from there on it joins nodes
 POINTS = 200  # in contact, that join nodes in the cycle: the stiffest
@@ -94,8 +95,9 @@ class Preconditioner:
 class LatticePreconditioner:
     """Multigrid of the Hessian, with a hierarchy that is kept while it pays. Collective.
 
-    pc           : PETSc's PCMG of the projected Hessian
+    matrix, pc   : the projected Hessian, and PETSc's PCMG of it
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
+    is_first : there is none yet
     pace     : iterations a digit of the first solve with it; None before that
     wasted   : iterations since then that were more than that
     is_stale : a new one is due
@@ -107,9 +109,10 @@ class LatticePreconditioner:
         self.unknowns = unknowns
         with GRIDS:
             self.multigrid = Multigrid(unknowns, elasticity, time_step, prefix)
-        self.pc = self.multigrid.pc
+        self.matrix, self.pc = self.multigrid.operator, self.multigrid.pc
         bodies = self.multigrid.bodies
         self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
+        self.is_first = True
         self.pace: float | None = None
         self.wasted = 0.0
         self.is_stale, self.is_free = True, False
@@ -127,11 +130,7 @@ class LatticePreconditioner:
             joined, held = joining.split(POINTS) if joining else (None, surface)
             if due:
                 blocks = self._blocks(q, contact)
-                with HIERARCHY:
-                    self.multigrid.update(q.copy(), blocks + held.blocks if held else blocks, joined)
-                self.pace = None
-                self.wasted = 0.0
-                self.is_stale = False
+                self._build(q.copy(), blocks + held.blocks if held else blocks, joined)
             else:
                 self.multigrid.join(joined)
         return due or is_other
@@ -155,6 +154,15 @@ class LatticePreconditioner:
         self.joins |= its > MANY
         self.wasted += max(its - self.pace * digits, 0.0)
         self.is_stale |= self.wasted > WORTH
+
+    def _build(self, q: Positions, contact: Rows, joined: SurfaceHessian | None) -> None:
+        with HIERARCHY:
+            self.multigrid.update(q, contact, joined)
+        self.pace = None
+        if self.is_first:
+            self.pace = USUAL_PACE
+        self.wasted = 0.0
+        self.is_first = self.is_stale = False
 
     def _is_free(self, q: Positions, contact: Contact | None) -> bool:
         """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
@@ -182,7 +190,7 @@ class LatticePreconditioner:
 
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""
-        self.is_stale = True
+        self.is_stale = self.is_first = True
         self.joins = False
 
     def destroy(self) -> None:

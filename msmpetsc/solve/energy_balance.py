@@ -82,13 +82,13 @@ class EnergyBalance:
 
     @property
     def energies(self) -> Energies:
-        """Of the last step's result, or of the moment shown last; not summed before they are asked for (collective)."""
+        """Energies of the moment shown last, summed when they are asked for (collective)."""
         if not isinstance(self._now, Energies):
             self._now = self._now()
         return self._now
 
     def show(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> None:
-        """Have the energies of a moment within a step, or at the end of one taken before."""
+        """Let ``energies`` be those of a moment within a step, or at its end."""
         self._now = partial(self._energies, q, v, time, sides)
 
     def _energies(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> Energies:
@@ -165,7 +165,7 @@ class EnergyBalance:
         return EnergyBudget(put_in, max(least, budget.gained + gained), steady, since_frame, bounced)
 
     def remedy(self, explicit: bool) -> str:
-        """Return what was seen to keep energy from coming from nowhere, in words."""
+        """Return a remedy, in words, for energy that comes from nowhere."""
         if self.environment.exchanges:
             return 'response = "reflect" in place of "exchange", which moves nodes against their springs'
         if explicit or self.credit:
@@ -173,8 +173,11 @@ class EnergyBalance:
         return "a smaller time.step or a smaller solver.error"
 
     def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Floats:
-        """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of
-        obstacles that drag, and that which the step counted itself; and its swing (collective)."""
+        """Return the terms (5,) [J] of the right side of the balance (collective).
+
+        They are the energies, the push in them, the work of loads and of obstacles that drag,
+        the work that the step counted itself, and its swing.
+        """
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
         prescribed = environment.prescribed(before.q, time)
@@ -199,7 +202,8 @@ class EnergyBalance:
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: SupportsFloat) -> Floats:
-        return self.comm.allreduce(np.array([float(value) for value in values]))
+        sums: Floats = self.comm.allreduce(np.array([float(value) for value in values]))
+        return sums
 
     def _worst(self, vectors: Rows) -> str:
         owned = np.arange(self.lattice.owned)

@@ -1,8 +1,8 @@
-"""Measurements beside a run's frames: true errors, the iterates of one step, where the time went."""
+"""Measurements of a run: true errors, the iterates of one step, where the time went."""
 
 from dataclasses import dataclass
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -35,16 +35,8 @@ class Probes:
         return index == self.trace or (self.true_error is not None and index % self.true_error == 0)
 
 
-class TracedIterate(NamedTuple):
-    """KSP iterations and seconds since its step began, positions (l, 3) [m]."""
-
-    ksp_its: int
-    seconds: float
-    position: Positions
-
-
 class TrueErrors:
-    """True errors of a run's steps, against steps solved to rounding, and what the iterates of one had.
+    """True errors of a run's steps, and of the iterates of one, against steps solved to rounding.
 
     What it takes is not timed with the run.
 
@@ -54,39 +46,40 @@ class TrueErrors:
     def __init__(self) -> None:
         self.stepper: Stepper | None = None  # whose steps the reference takes
         self.reference: Stepper | None = None
-        self.iterates: list[TracedIterate] = []
-        self.trace: dict | None = None
+        # of a step that is followed: KSP iterations and seconds so far, positions (l, 3) [m]
+        self.iterates: list[tuple[int, float, Positions]] = []
+        self.trace: dict[str, Any] | None = None
 
     def follow(self, stepper: Stepper) -> None:
         """Trace the iterates of the step that begins now."""
-        begin, before = perf_counter(), stepper.work_so_far()
+        begin = perf_counter()
+        before = stepper.work_so_far()
 
         def observe(q: Positions) -> None:
             nonlocal begin
             now = perf_counter()
-            self.iterates.append(TracedIterate((stepper.work_so_far() - before).ksp_its, now - begin, q))
+            self.iterates.append(((stepper.work_so_far() - before).ksp_its, now - begin, q))
             begin += perf_counter() - now  # not of the step
 
         stepper.observer = observe
 
     def measure(self, index: int, stepper: Stepper, result: StepResult) -> Floats:
         """Position and energy error (2,) of step ``index``, which a stepper took last (collective)."""
-        iterates, self.iterates, stepper.observer = self.iterates, [], None
+        iterates = self.iterates
+        self.iterates = []
+        stepper.observer = None
         assert result.problem is not None, "no step was taken"
-        errors = self.errors(stepper, result.problem, [*(each.position for each in iterates), result.position])
+        errors = self.errors(stepper, result.problem, [*(q for *_, q in iterates), result.position])
         if iterates:
-            self.trace = {
-                "frame": index,
-                "iteration": list(range(len(iterates))),
-                "ksp_its": [each.ksp_its for each in iterates],
-                "seconds": [each.seconds for each in iterates],
-                "position_error": errors[:-1, 0].tolist(),
-                "energy_error": errors[:-1, 1].tolist(),
-            }
-        return errors[-1]
+            names = ("ksp_its", "seconds", "position_error", "energy_error")
+            rows = [(*of, *error) for (*of, _), error in zip(iterates, errors.tolist(), strict=False)]
+            columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
+            self.trace = {"frame": index, "iteration": list(range(len(iterates))), **columns}
+        last: Floats = errors[-1]
+        return last
 
     def errors(self, stepper: Stepper, problem: StepProblem, positions: list[Positions]) -> Rows:
-        """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
+        """Return the errors (k, 2) of positions (l, 3) [m], NaN if the reference fails (collective).
 
         Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
         """
@@ -129,7 +122,7 @@ class TrueErrors:
 
 
 def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
-    """|x - x*|_M and g(x) - g*."""
+    """Return |x - x*|_M and g(x) - g*."""
     reference.unknowns.from_nodes(x - exact, reference.x)
     distance = reference.functional.norm(reference.x)
     reference.unknowns.from_nodes(x, reference.x)

@@ -17,8 +17,10 @@ from msmpetsc.solve.petsc.words import options_of, words_of
 
 @dataclass(frozen=True)
 class Preset:
-    """about: when to use it. options: PETSc's, without the dash.
+    """A method as a set of PETSc options.
 
+    about        : when to use it
+    options      : PETSc's, without the dash
     projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
     extrapolate  : a step starts from the best of several guesses, not from y as published
     iterations   : a fixed number of them is the method as published; None: to the error target
@@ -100,18 +102,6 @@ PRESETS = {
         },
         inexact=True,
     ),
-    "chebyshev": Preset(
-        "Wang 2015: local/global iterations with Chebyshev's weights, no inner products: for many cores or a GPU",
-        {
-            "snes_type": "python",
-            "snes_python_type": "msmpetsc.solve.nonlinear.chebyshev.Chebyshev",
-            "snes_max_it": "1000",
-            **NO_STOP_BY_SIZE,
-            **JACOBI_CG,
-            "ksp_rtol": "1e-1",
-        },
-        inexact=True,
-    ),
     "newton": Preset(
         "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error",
         NEWTON,
@@ -159,7 +149,7 @@ PRESETS = {
 # a user who chooses another type does not want what only goes with ours
 BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_norm_type"}}
 # these solve with A or the Hessian themselves, without a plain iteration as their preconditioner
-SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls", "vinewtonssls"}
+SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
 
 
 in_use: Counter[str] = Counter()  # by how many solvers: the options in PETSc's database that are not the user's
@@ -171,7 +161,7 @@ def preset_names() -> list[str]:
 
 
 def find_preset(name: str) -> Preset:
-    """Raises InputError with the nearest name for an unknown one."""
+    """Return the preset of a name. Raises InputError with the nearest name for an unknown one."""
     if name in PRESETS:
         return PRESETS[name]
     if name not in ADDED.names():
@@ -238,11 +228,6 @@ class SolverOptions:
         """Whether an option is the preset's own, not the user's."""
         return self.prefix + name in self.names
 
-    def users_of(self, *beginnings: str) -> list[str]:
-        """Names of the user's own options that begin so."""
-        beginnings = tuple(self.prefix + beginning for beginning in beginnings)
-        return [name for name in PETSc.Options().getAll().keys() - self.names if name.startswith(beginnings)]
-
     def is_given(self, name: str) -> bool:
         """Whether an option stands in the database, the user's or the preset's."""
         return self.prefix + name in PETSc.Options().getAll()
@@ -252,7 +237,7 @@ class SolverOptions:
         return str(PETSc.Options().getString(self.prefix + name, ""))
 
     def withdraw(self) -> None:
-        """Leave the database as the user has it: other presets follow, -options_left shows his own."""
+        """Leave the database as the user has it, for other presets and -options_left."""
         in_use.subtract(self.names)
         for name in self.names:
             if not in_use[name]:

@@ -109,7 +109,7 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Another integrator: implicit Euler's, or the scene's where it is static or Verlet's."""
+        """Make another integrator: implicit Euler's, or the scene's if that is static or Verlet's."""
         is_fallback = self.on_failure == "fallback"
         kept = ("static",) if is_fallback else ("static", "verlet")
         name = self.time.integrator if self.time.integrator in kept else "implicit-euler"

@@ -30,16 +30,16 @@ NO_USE = {  # what PETSc would take, but not do here, or crash by; a name and it
     r"snes_stol (?!0+\.?0*$).*": BY_ERROR,  # 0 is what presets set
     r"snes_type (newtontr(dc)?|aspin|nasm|patch)": "a step goes by its energy, on no DM of PETSc's; newtonls can",
     r"(snes_(mf|fd|lag|adapt|grid_sequence)\w*|ksp_reuse_preconditioner) .*": "solver.preset chooses the Jacobian",
-    r"(snes|ksp)_error_if_not_converged .*": "a step that does not converge ends the run, with exit status 3",
+    r"(.*_)?(snes|ksp)_error_if_not_converged .*": "a step that does not converge ends the run, with exit status 3",
     r"(three_columns|estimate)_.*": "the preconditioner of A, and of all that needs one, has the bare -pc_ options",
     r"ksp_view_diagonal_scale .*": "the operator is not scaled",
-    r"mat_view\w* .*": "-ksp_view_pmat shows what is preconditioned with, A or multigrid's Hessian",
+    r"(mat_view|ksp_view_p?mat)\w* .*": "matrices are applied, not written",
     r"(.*_)?ksp_monitor\w* (binary|hdf5|vtk|socket|string|saws)\b.*": "what it shows is text: ascii:FILE",
 }
 
 
 def refuse_early(comm: MPI.Comm) -> None:
-    """Raise InputError for options of the user that cannot be of use, whatever the scene (collective)."""
+    """Raise InputError for options that are of no use in any scene (collective)."""
     lines = []
     for name, value in PETSc.Options().getAll().items():
         given = f"{OF_STEPPERS.sub('', name)} {value or ''}"

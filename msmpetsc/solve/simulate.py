@@ -73,7 +73,7 @@ def refuse_bad_options(scene: Scene, probes: Probes) -> None:
 
 @dataclass
 class Effort:
-    """What the steps since the frame stored before took, and how far off those are whose true errors were measured."""
+    """Work and true errors of the steps since the frame stored before."""
 
     state: ClassVar[dict[str, Range]] = {"work": ANY, "true_error": ANY, "energy_error": ANY}
 
@@ -134,7 +134,7 @@ class TimeLoop:
 
     @property
     def _stepper(self) -> Stepper:
-        """That of a scene whose steps are solved."""
+        """Solver of the steps of a scene whose steps are solved."""
         assert isinstance(self.integrator, ImplicitEuler)
         return self.integrator.stepper
 
@@ -161,7 +161,7 @@ class TimeLoop:
             self.adaptive.sum_up()
 
     def _advance(self, index: int) -> Frame | None:
-        """The next step (collective), as a frame if stored. Raises StepFailed, naming the step."""
+        """Take the next step (collective); its frame if it is stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
         if index == self.probes.trace:
             self.true_errors.follow(self._stepper)
@@ -191,7 +191,7 @@ class TimeLoop:
         return frame
 
     def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State]:
-        """A failed step, taken another way (collective). Raises StepFailed, naming the step."""
+        """Take a failed step another way (collective). Raises StepFailed, naming the step."""
         try:
             if self.recovery.is_on:
                 raise failure
@@ -271,7 +271,7 @@ class TimeLoop:
 
     @property
     def rows(self) -> dict[str, int]:
-        """How many rows this rank has of fields that not all scenes ask for."""
+        """Numbers of this rank's rows of the fields that not all scenes ask for."""
         lattice, rows = self.model.lattice, dict(self.forces.rows)
         if self.probe:
             rows["probe"] = len(self.probe.corners)
@@ -290,7 +290,7 @@ class TimeLoop:
             raise
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.destroy()
 
     def destroy(self) -> None:
@@ -311,7 +311,8 @@ class SurfaceMotion:
 
     def __call__(self, position: Positions) -> Rows:
         """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
-        return self.weights @ self.to_owner.answer(position[self.asked])
+        surface: Rows = self.weights @ self.to_owner.answer(position[self.asked])
+        return surface
 
 
 class Forces:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Work:
-    """Work of one step, of of a frame's steps, or of any others; the sum of two is the work of both.
+    """Work of one step or of several; the sum of two is the work of both.
 
     step_error : the greatest estimated relative error of the steps, which does not add up
     """
@@ -25,7 +25,7 @@ class Work:
         return Work(error, *(getattr(self, name) + getattr(other, name) for name in COUNTED))
 
     def __sub__(self, before: "Work") -> "Work":
-        """What was done since, but for the error, which is of now."""
+        """Return the work since ``before``; the error is that of now."""
         return Work(self.step_error, *(getattr(self, name) - getattr(before, name) for name in COUNTED))
 
 

@@ -76,7 +76,7 @@ CASES = {
     },
     **{
         preset: {**FALL, **HELD, "solver": {"preset": preset, "error": 1e-9}}
-        for preset in ("anderson", "lbfgs", "chebyshev", "newton-multigrid", "newton-projected", "fast-msm")
+        for preset in ("anderson", "lbfgs", "newton-multigrid", "newton-projected", "fast-msm")
     },
     "paper": {**FALL, **HELD, "solver": {"preset": "paper"}},
 }  # fmt: skip

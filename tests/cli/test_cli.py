@@ -128,7 +128,6 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
         ("paper", "", ""),
         ("anderson", "-snes_type ngmres -snes_view", "SNES Object"),
         ("lbfgs", "-snes_view", "type is LBFGS"),
-        ("chebyshev", "", ""),
         ("anderson", "-snes_anderson_m 2 -snes_view", "Number of stored past updates: 2"),
         ("fast-msm", "-pc_type gamg -ksp_view", "type: gamg"),
     ],

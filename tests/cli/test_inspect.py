@@ -20,7 +20,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.linear.system import assemble, assembly_bytes
+from msmpetsc.solve.linear.operators import assemble, assembly_bytes
 from msmpetsc.solve.linear.unknowns import Ghosted, Unknowns
 
 WORKER = WORKERS / "shares_worker.py"

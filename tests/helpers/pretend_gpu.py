@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from petsc4py import PETSc
 
-from msmpetsc.solve.petsc import device, memory
+from msmpetsc.solve.petsc import device
 
 # what CuPy 13 has of NumPy's functions, of those that the steps call
 KNOWN = [
@@ -126,7 +126,7 @@ def dressed(value):
     return Array(np.asarray(value)) if isinstance(value, (np.ndarray, np.generic)) else value
 
 
-class Memory(memory.Memory):
+class Memory(device.Memory):
     """PETSc's, of the CPU, looked at through arrays of the GPU."""
 
     def read(self, vector: PETSc.Vec) -> Array:
@@ -178,7 +178,7 @@ def pretended(launch=launcher) -> Iterator[Counter]:
     with (
         patch.object(device, "sender", lambda comm: send),
         patch("msmpetsc.solve.simulate.sender", lambda comm: send),
-        patch.object(memory, "CUDA", Memory()),
+        patch.object(device, "CUDA", Memory()),
         module("msmpetsc.backend.launcher", launcher=launch),
     ):
         yield counted

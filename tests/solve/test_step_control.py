@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
+from msmpetsc.solve.integrators.adaptive import Measure, StepControl, Ticks
 
 STEP, STEPS, LEVELS = 0.01, 400, (-10, 6)
 

@@ -100,7 +100,7 @@ def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) ->
     surfaces : that are stored
     mesh     : bytes that reading and preparing them took, on rank 0
     """
-    from msmpetsc.solve.linear.system import assembly_bytes
+    from msmpetsc.solve.linear.operators import assembly_bytes
     from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
 
     nodes, springs = partition.nodes + partition.ghosts, partition.springs

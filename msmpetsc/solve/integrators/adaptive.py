@@ -6,22 +6,31 @@ What a step adds to the error of the trajectory is its local error: from positio
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
 Of these, means over neighbours count, and the changes of velocity by impacts and by pushes of penalties, times a step
-(README: steps as long as the motion allows). step_control adds all up and chooses the next step.
+(README: steps as long as the motion allows). ``StepControl`` adds all up and chooses the next step.
+
+A run whose motion is of size U may end with its trajectory off by ``error`` U. Steps pay for that
+with their local errors, from a credit that grows as the motion does, and with time:
+
+    credit(t) = error / 2 (U(t) + 1/T integral_0^t U)
+
+A step may spend what it earns itself and a share of what was saved, and always a part of what each step could, were
+all as long as those so far. Steps are 2^level times as long as the scene's.
 
 Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and
 so does the history that BDF2 needs where the length changes. All methods are collective.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Positions, Rows, like, to_host
-from msmpetsc.checkpoint import Checkpoint, Range
+from msmpetsc.checkpoint import COUNT, LENGTH, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
@@ -30,7 +39,6 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.integrator import Integrator, State
-from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
 from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
@@ -39,6 +47,10 @@ LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
 KEPT = 4  # integrators of as many lengths, those used last
 JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it yet
 SWEEPS = 4
+SHARE = 1 / 8  # of what was saved, that a step may spend
+FAIR = 0.25  # of an equal share of all credit among all steps: a step may spend that in any case
+EXCESS = 2.0  # times what a step may spend: it is taken all the same, the next one is shorter
+CALM = 2  # steps that would have let the next be twice as long, before it is
 
 
 def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
@@ -47,7 +59,7 @@ def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) 
 
 
 def bdf2_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
-    """The same of BDF2."""
+    """Local error (n, 3) [m] of a step of BDF2 from q with velocity v to x with velocity w."""
     return 1.6 * (x - q - 0.5 * time_step * (v + w))
 
 
@@ -55,7 +67,7 @@ METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order
 
 
 class NeighbourMean:
-    """Means over a node and its neighbours by springs, ``SWEEPS`` times. All methods are collective."""
+    """Averages vectors over nodes and their neighbours by springs, ``SWEEPS`` times. Collective."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.comm, self.lattice = comm, lattice
@@ -94,6 +106,120 @@ def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: flo
     return q, v
 
 
+@dataclass(frozen=True)
+class Measure:
+    """What a step showed [m]: its local error, and the size of the motion so far, both root mean squares by mass."""
+
+    error: float
+    motion: float
+
+
+class StepControl:
+    """Chooses levels and keeps the account of one run. The same numbers on all ranks lead to the same choices.
+
+    order           : of the integrator
+    error           : asked of the trajectory, relative to the size of the motion
+    step, duration  : a step of level 0, and the whole run [s]
+    lowest, highest : levels
+    level           : wanted next
+    spent           : sum of local errors [m]
+    steps, time     : number of the steps that they are of, and their length [s]
+    """
+
+    def __init__(self, order: int, error: float, step: float, duration: float, levels: tuple[int, int]):
+        self.order, self.asked, self.step, self.duration = order, error, step, duration
+        self.lowest, self.highest = levels
+        self.level, self.calm = min(0, self.highest), 0
+        self.motion = self.passed = self.spent = 0.0  # [m], [m] mean over the duration, [m]
+        self.steps, self.time = 0, 0.0
+
+    @property
+    def estimate(self) -> float:
+        """Estimated error of the trajectory so far, relative to the size of the motion."""
+        return self.spent / self.motion if self.motion > 0 else 0.0
+
+    def allowed(self, level: int, measure: Measure) -> float:
+        """What a step of a level may spend [m]."""
+        motion, part = max(self.motion, measure.motion), self.step * 2.0**level / self.duration
+        saved = 0.5 * self.asked * (motion + self.passed) - self.spent
+        fair = self.asked * motion * self.time / self.duration / max(self.steps, 1)
+        return max(0.5 * self.asked * motion * part + SHARE * max(saved, 0.0), FAIR * fair)
+
+    def accepts(self, level: int, measure: Measure) -> bool:
+        """Whether a step of a level stands as it is; else the level for another try is set."""
+        allowed = self.allowed(level, measure)
+        if level == self.lowest or measure.error <= EXCESS * allowed:
+            return True
+        halvings = 1
+        excess = measure.error / max(allowed, sys.float_info.min)
+        if 1 < excess < math.inf:
+            halvings = max(1, round(math.log2(excess) / (self.order + 1)))
+        self.shorten(level, halvings)
+        return False
+
+    def shorten(self, level: int, by: int = 1) -> bool:
+        """Want a level lower than this one, whose step failed; whether there is any."""
+        self.level, self.calm = max(self.lowest, level - by), 0
+        return level > self.lowest
+
+    def pay(self, level: int, measure: Measure) -> None:
+        """Enter a step that stands, and choose the level that comes next."""
+        allowed = self.allowed(level, measure)
+        longer, growth = self.level + 1, 2.0 ** ((self.order + 1) * (self.level + 1 - level))
+        is_calm = measure.error * growth <= self.allowed(longer, measure)
+        self.motion = max(self.motion, measure.motion)
+        self.passed += self.motion * self.step * 2.0**level / self.duration
+        self.spent, self.steps = self.spent + measure.error, self.steps + 1
+        self.time += self.step * 2.0**level
+        if measure.error > allowed:
+            self.shorten(level)
+            return
+        self.calm = self.calm + 1 if is_calm else 0
+        if self.calm >= CALM and self.level < self.highest:
+            self.level, self.calm = longer, 0
+
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        lengths = dict.fromkeys(("time", "motion", "passed", "spent"), LENGTH)
+        return {"level": (self.lowest, self.highest), "calm": (0, CALM), "steps": COUNT, **lengths}
+
+
+class Ticks:
+    """Times of steps, counted in ticks: the shortest step. A step of a level starts at a multiple of its own length,
+    so that frames lie at ends of steps or within one; none goes beyond a known event, nor the end of the run.
+
+    events : times [s] at which something begins, ends or turns, as near as ``NEAREST`` levels below a step
+    """
+
+    NEAREST = 4
+
+    def __init__(self, step: float, steps: int, lowest: int, events: Sequence[float]):
+        self.step, self.lowest, self.ticks = step, lowest, steps << -lowest
+        unit = max(lowest, -self.NEAREST)
+        ends = {round(time / step * 2.0**-unit) << (unit - lowest) for time in events}
+        self.events = sorted(tick for tick in ends if 0 < tick < self.ticks)
+
+    def length(self, level: int) -> int:
+        """Ticks of a step."""
+        return 1 << (level - self.lowest)
+
+    def time(self, tick: int) -> float:
+        """Time of a tick [s]."""
+        return tick / 2.0**-self.lowest * self.step
+
+    def fitting(self, tick: int, level: int) -> int:
+        """The highest level, not above the one wanted, of a step that may start at a tick."""
+        limit = next((event for event in self.events if event > tick), self.ticks)
+        while level > self.lowest and (tick % self.length(level) or tick + self.length(level) > limit):
+            level -= 1
+        return level
+
+    def is_event(self, tick: int) -> bool:
+        """Whether something begins, ends or turns at a tick."""
+        return tick in self.events
+
+
 class Adaptive(Integrator):
     """Takes the scene's steps in steps of its own, shorter or longer ones.
 
@@ -102,7 +228,7 @@ class Adaptive(Integrator):
 
     make    : makes an integrator of steps of one length
     balance : examines the steps that stand
-    tick    : of the state's time (step_control.Ticks)
+    tick    : of the state's time (Ticks)
     last    : level of the step taken last
     """
 
@@ -137,7 +263,7 @@ class Adaptive(Integrator):
         log.info("steps of %.3g to %.3g s, for an error of %.2g of the motion", shortest, longest, self.control.asked)
 
     def _integrator(self, level: int) -> Integrator:
-        """That of a level; one that was not used last has forgotten all that a checkpoint would have to know."""
+        """Return a level's integrator, which forgets earlier steps if another was used last."""
         if level not in self.kept:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.kept[level] = self.make(time, self.solver)
@@ -156,7 +282,7 @@ class Adaptive(Integrator):
         return self.time_step * 2.0**level
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """What a frame at ``time`` shows, after as many steps as that takes. Raises StepFailed."""
+        """Take the steps up to ``time``; what a frame shows then. Raises StepFailed."""
         frame = round(time / self.time_step)
         wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, Work())
         if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
@@ -169,7 +295,7 @@ class Adaptive(Integrator):
         return replace(total, time_error=self.control.estimate), state
 
     def _within(self, total: StepResult, state: State, share: float, time: float) -> StepResult:
-        """What a frame shows that comes by a share of the last step before its end."""
+        """Interpolate the result at a share of the last step before its end."""
         q, v = state.q, state.velocity(self.time_step)
         if share > 0 and state.history:
             q, v = between(*state.history, q, v, self._length(self.last), 1 - share)
@@ -179,7 +305,7 @@ class Adaptive(Integrator):
         return replace(total, position=q, previous=q - self.time_step * v)
 
     def _step(self, state: State) -> tuple[StepResult, State]:
-        """The next step that stands; others are taken again, shorter. Raises StepFailed."""
+        """Take the next step, again and shorter if its error is too large. Raises StepFailed."""
         restarts = self.ticks.is_event(self.tick)
         cost = Work()
         while True:

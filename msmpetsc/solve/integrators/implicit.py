@@ -71,7 +71,7 @@ class ContactFaces:
             return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
 
     def problem(self) -> StepProblem:
-        """The step with the faces as they are known now."""
+        """Return the problem of the step with the faces as they are known now."""
         environment, time = self.environment, self.time
         contact = environment.contact(self.q, self.y, time, self.time_step, self.sides, self.q_before)
         return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
@@ -124,7 +124,7 @@ class ImplicitEuler(Integrator):
 
     @property
     def damped_tau(self) -> float:
-        """The tau of the problem that is solved, tau where nothing is damped [s]."""
+        """Tau of the damped problem [s]; that without damping where there is none."""
         return self.tau / float(np.sqrt(1 + self.damping * self.tau))
 
     def _rates(self, q: Positions, y: Positions, q_before: Positions | None) -> tuple[Positions, Positions] | None:
@@ -138,7 +138,7 @@ class ImplicitEuler(Integrator):
         return duration / (1 + self.damping * duration)
 
     def set_up(self) -> None:
-        """Raises InputError for a preconditioner that PETSc or the matrix lacks (collective)."""
+        """Build the preconditioner (collective). Raises InputError for one that is missing."""
         self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
@@ -157,7 +157,7 @@ class ImplicitEuler(Integrator):
     def _solve(
         self, state: State, y: Positions, time: float, time_step: float, q_before: Positions | None = None
     ) -> tuple[StepResult, Indices]:
-        """The x that belongs to y, as it will be at ``time``, and the contact faces that it has.
+        """Solve for the x that belongs to y at ``time``, and for its contact faces.
 
         q_before : (l, 3) [m] one step before the state, of a step that looks so far back
         """
@@ -183,7 +183,7 @@ class ImplicitEuler(Integrator):
         return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
 
     def _new_stepper(self, time: float) -> Stepper:
-        """The solver while the same nodes are fixed as at ``time``: these are no unknowns."""
+        """Make the solver for the nodes that are free at ``time``."""
         solver, lattice = self.solver, self.environment.lattice.pin(self.environment.fixed_at(time))
         return Stepper(
             self.comm,

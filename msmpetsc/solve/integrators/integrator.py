@@ -1,4 +1,4 @@
-"""What all integrators are, takers of the steps of one model; the state that a step starts from."""
+"""The interface of all integrators, and the state that a step starts from."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -50,11 +50,11 @@ class State:
     budget: EnergyBudget = NO_ENERGY  # of energy, as the steps so far have filled it
 
     def velocity(self, time_step: float) -> Rows:
-        """(l, 3) [m/s]"""
+        """Velocities (l, 3) [m/s]."""
         return (self.q - self.q_previous) / time_step
 
     def over(self, time_step: float, shorter: float) -> "State":
-        """The same state for steps of another length, which have no history yet."""
+        """Return the same state for steps of another length, without history."""
         return replace(self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None)
 
     def save(self, checkpoint: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
@@ -73,7 +73,7 @@ class State:
 
     @staticmethod
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
-        """The state that a checkpoint holds (collective)."""
+        """Return the state that a checkpoint holds (collective)."""
         names = ("q", "q_previous", *HISTORY) if checkpoint.number("history", 0, 0, 1) else ("q", "q_previous")
         rows = [with_ghosts(comm, lattice, checkpoint.row(name)) for name in names]
         q, q_previous, *last = (like(lattice.nodes, each) for each in rows)

@@ -1,4 +1,4 @@
-"""Statics: each step of the scene is a state of equilibrium under what acts at its end, without inertia.
+"""Statics: each step of the scene is an equilibrium under what acts at its end, without inertia.
 
 It is a minimum of  E(x) - x^T f_ext  and of what obstacles add, as an implicit step is without M: so the solver is
 that of a step, its F

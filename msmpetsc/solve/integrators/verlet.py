@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest, like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -97,7 +97,7 @@ class Verlet(Integrator):
         self.gained, self.halvings = 0.0, 0
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.
+        """Take the step that ends at ``time`` (collective). Raises StepFailed.
 
         Taken again with shorter substeps where its end shows that they were too long: a blow may
         stiffen a body, folds may heat it.
@@ -196,7 +196,7 @@ class Verlet(Integrator):
             contact.add_gradient(self.q, self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
-        """Change v by the forces at ``time``; obstacles move as in the substep from begin to end."""
+        """Change v by the forces at ``time``; obstacles move as in the substep to its end."""
         self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
         load, before = self.environment.load(time), None if beyond is None else self.v.copy()
@@ -250,12 +250,13 @@ class Verlet(Integrator):
             self.highest.hold(self.fixed)
 
     def _pushed(self, start: float, time: float) -> float:
-        """The most omega^2 [1/s^2] that obstacles may add to the springs' until ``time`` (Weyl) (collective)."""
+        """Bound what obstacles may add to omega^2 [1/s^2] until ``time``, by Weyl (collective)."""
         fall = self.environment.load(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
         stiffness = self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)
-        return self.comm.allreduce(greatest(stiffness[self.free] * self.per_mass[self.free]), MPI.MAX)
+        squared = greatest(stiffness[self.free] * self.per_mass[self.free])
+        return float(self.comm.allreduce(squared, MPI.MAX))
 
     def _count(self, squared: float) -> int:
         """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""
@@ -296,7 +297,7 @@ class HighestMode:
         self.squared = 0.0
 
     def squared_at(self, q: Positions) -> float:
-        """omega^2 of the springs at q (l, 3) [m] (collective).
+        """Return omega^2 [1/s^2] of the springs at q (l, 3) [m] (collective).
 
         Without the negative curvature across pressed springs, which is no oscillation and has no bound.
         """
@@ -315,9 +316,9 @@ class HighestMode:
         return self.squared
 
     def _normalise(self) -> float:
-        """Make |x|_M = 1; returns what it was (collective)."""
+        """Scale the mode x to |x|_M = 1, and return what that was (collective)."""
         x = self.mode.values[: self.lattice.owned]
-        size = np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
+        size = float(np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x)))))
         if size > 0:
             x /= size
         self.mode.update()
@@ -329,7 +330,7 @@ class HighestMode:
 
 
 def explicit_limit(comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity) -> float:
-    """2 / omega [s] at rest: explicit steps are stable below it (collective)."""
+    """Return the limit 2 / omega [s] of stable explicit steps at rest (collective)."""
     highest = HighestMode(comm, lattice, elasticity)
     highest.hold(lattice.pinned[: lattice.owned])
     squared = highest.squared_at(lattice.nodes)
@@ -344,7 +345,10 @@ def crushing_energy(lattice: Lattice) -> float:
 
 
 @kernel
-def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
+def kick(
+    first: int, count: int, step: int, rows: Indices, per_mass: Floats, load: Rows, gradient: Rows, duration: float,
+    v: Rows,
+) -> None:  # fmt: skip
     """v += duration M^(-1) (f_ext - grad E) at the rows of (l, 3) arrays."""
     for row in range(first, count, step):
         i = rows[row]
@@ -353,7 +357,7 @@ def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
 
 
 @kernel
-def drift(first, count, step, rows, v, duration, q):
+def drift(first: int, count: int, step: int, rows: Indices, v: Rows, duration: float, q: Positions) -> None:
     """q += duration v at the rows of (l, 3) arrays."""
     for row in range(first, count, step):
         i = rows[row]

@@ -1,4 +1,4 @@
-"""Which PETSc unknown is which coordinate of which node; and values of nodes whose ghosts follow their owners.
+"""Numbering of PETSc's unknowns by nodes and coordinates, and values of nodes with ghosts.
 
 Pinned nodes are no unknowns. A vector of unknowns holds, on each rank, the x of its free nodes,
 then their y, then their z: so its local array is an m x 3 dense block, which a scalar m x m matrix
@@ -9,13 +9,13 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Positions, Rows, like, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.solve.petsc.device import memory_of
 from msmpetsc.solve.petsc.events import GHOSTS
-from msmpetsc.solve.petsc.memory import memory_of
 
 LARGEST = int(np.iinfo(PETSc.IntType).max)  # of PETSc's integers: 32 bits, unless it was configured otherwise
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
@@ -107,7 +107,7 @@ class Unknowns:
 
 
 class Ghosted:
-    """values (l, 3): the owned nodes, then the ghosts, in the memory of two PETSc vectors."""
+    """Values (l, 3) of the owned nodes, then of the ghosts, in the memory of two PETSc vectors."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         refuse_unknowns(lattice.table.total)
@@ -130,7 +130,7 @@ class Ghosted:
 
 
 def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
-    """Rows (l, ...) of local nodes from those of the owned ones, both on the host (collective)."""
+    """Return rows (l, ...) of local nodes from those of the owned ones, on the host (collective)."""
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     return np.concatenate([rows, to_owner.answer(rows[asked])])
@@ -152,21 +152,23 @@ def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
 
 
 @kernel
-def _spread(first, count, step, columns, rows, nodes):
+def _spread(first: int, count: int, step: int, columns: Rows, rows: Indices, nodes: Rows) -> None:
     for i in range(first, count, step):
         for c in range(3):
             nodes[rows[i], c] = columns[c, i]
 
 
 @kernel
-def _collect(first, count, step, nodes, rows, columns):
+def _collect(first: int, count: int, step: int, nodes: Rows, rows: Indices, columns: Rows) -> None:
     for i in range(first, count, step):
         for c in range(3):
             columns[c, i] = nodes[rows[i], c]
 
 
 @kernel
-def _scaled_sum(first, count, step, mass, a, t2, b, rows, columns):
+def _scaled_sum(
+    first: int, count: int, step: int, mass: Floats, a: Array, t2: float, b: Array, rows: Indices, columns: Rows
+) -> None:
     for i in range(first, count, step):
         for c in range(3):
             columns[c, i] = mass[rows[i]] * a[rows[i], c] + t2 * b[rows[i], c]

@@ -5,45 +5,43 @@ The hierarchy is that of the projected Hessian H, which is positive definite at 
 one has a preconditioner that is, too. The finest level is applied spring by spring or cell by cell in single precision,
 and smoothed with a block diagonal D. The first coarse one is summed spring by spring or cell by cell
 (solve.multigrid.galerkin), those below are products P^T H P of PETSc's; all but the coarsest are applied in single
-precision, too (solve.multigrid.coarse_operator).
+precision, too.
 """
 
 from collections.abc import Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpstrf
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
-from msmpetsc.solve.linear.operators import Viewable, python_matrix
+from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
-from msmpetsc.solve.multigrid.contact import ContactSmoother
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
-from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
+from msmpetsc.solve.multigrid.galerkin import RAISED, CoarseOperator, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
-from msmpetsc.solve.petsc import memory
+from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.events import FINE, count_flops
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-DIAGONAL = 3.0  # times that eigenvalue where only the diagonal of D is taken
 SAFETY = 1.1  # times it where no bound is known, as some iterations of CG know it
 ITERATIONS = 10  # of these
-BLOCK = 15  # operations of a product with a 3 x 3 block
 
 
 @dataclass(frozen=True)
 class Level:
-    """A coarse level: its grid, P from it to the next finer one, and its matrix (AIJ, block size 3)."""
+    """Coarse level: its grid, P from it to the next finer one, its matrix (AIJ, block size 3)."""
 
     grid: CoarseGrid
     interpolation: PETSc.Mat
@@ -71,8 +69,6 @@ class Multigrid:
             self.owned.close()
             raise
         self.coarse: list[CoarseOperator] = []  # until ``update``
-        smoother = PETSc.Options(prefix).getString("mg_levels_pc_type", "")
-        self.widened = DIAGONAL if smoother == PETSc.PC.Type.JACOBI else 1.0
         self.bounds = [0.0] * len(self.levels)
         self.pc = PETSc.PC().create(unknowns.comm)
         self.owned.callback(self.pc.destroy)
@@ -83,12 +79,9 @@ class Multigrid:
         apart = self.bodies.apart(comm, everywhere)
         ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
-        coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
-        if asked and asked < 2:
-            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has two levels or more")
+        coarse = grids(comm, ijk, unknowns.total, COARSEST, max(asked - 1, 1) if asked else None)
         if asked and asked != len(coarse) + 1:
-            most = f"{len(coarse) + 1} at most, for a coarser grid would not be much smaller"
-            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {most}")
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {len(coarse) + 1}")
         galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, apart)
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
@@ -112,7 +105,7 @@ class Multigrid:
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
         is_new = self.pc.getType() is None
-        if is_new and self.unknowns.memory is not memory.CUDA:
+        if is_new and self.unknowns.memory is not device.CUDA:
             self.coarse = [CoarseOperator(level.matrix) for level in self.levels[:-1]]
             for coarse in self.coarse:
                 self.owned.callback(coarse.operator.destroy)
@@ -120,7 +113,7 @@ class Multigrid:
             coarse.update()
         if is_new:
             self._create_cycle()
-        self.bounds[0] = self.widened * self._finest_bound()
+        self.bounds[0] = self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
             noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
             self.bounds[i] = SAFETY * greatest_eigenvalue(level.matrix, noise)
@@ -162,7 +155,7 @@ class Multigrid:
         given = PETSc.Options().getAll()
         if matrix.comm.size > 1 and "matptap_via" not in given:
             yield "matptap_via", "allatonce"  # the default adds what other ranks send as it comes in: no two runs alike
-        if self.unknowns.memory is memory.CUDA and "matptap_backend_cpu" not in given:
+        if self.unknowns.memory is device.CUDA and "matptap_backend_cpu" not in given:
             yield "matptap_backend_cpu", "true"  # on an H100 PETSc 3.26's own product of two sparse matrices was 0
 
     def _create_cycle(self) -> None:
@@ -173,7 +166,9 @@ class Multigrid:
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation)
-            pc.setMGRestriction(top - i, self._restriction(level.interpolation))
+            restriction = PETSc.Mat().createTranspose(level.interpolation)  # a square P would be taken for it as it is
+            self.owned.callback(restriction.destroy)
+            pc.setMGRestriction(top - i, restriction)
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
@@ -182,22 +177,9 @@ class Multigrid:
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
 
-    def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
-        """P^T by itself: of a square P PETSc cannot tell by its shape whether it is to be transposed."""
-        fine, coarse = interpolation.getSizes()
-        restriction = PETSc.Mat().createPython((coarse, fine), Restriction(interpolation), comm=interpolation.comm)
-        restriction.setVecType(self.unknowns.memory.vec_type)
-        restriction.setUp()
-        self.owned.callback(restriction.destroy)
-        return restriction
-
     def _read_options(self) -> None:
-        """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG. The
-        finest level's blocks are the only pbjacobi of a matrix that is not assembled."""
-        levels = f"{self.prefix}mg_levels_"
-        is_blocks = PETSc.Options().getString(f"{levels}pc_type", "") == PETSc.PC.Type.PBJACOBI
-        finest = replaced_option(f"{levels}{len(self.levels)}_pc_type", PETSc.PC.Type.PYTHON)
-        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG), finest if is_blocks else nullcontext():
+        """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG."""
+        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):
             self.pc.setFromOptions()
             self.pc.setUp()
 
@@ -222,25 +204,13 @@ def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlock
     ksp.setComputeEigenvalues(True)
     ksp.setTolerances(max_it=ITERATIONS, rtol=np.finfo(float).eps)
     ksp.solve(b, x)
-    greatest = ksp.computeExtremeSingularValues()[0]
+    greatest = float(ksp.computeExtremeSingularValues()[0])
     for owned in (ksp, x, b):
         owned.destroy()
     return greatest
 
 
-class Restriction:
-    """P^T whichever way it is applied (a context of MATPYTHON)."""
-
-    def __init__(self, interpolation: PETSc.Mat):
-        self.interpolation = interpolation
-
-    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.interpolation.multTranspose(x, y)
-
-    multTranspose = mult
-
-
-class ProjectedHessian(Viewable):
+class ProjectedHessian:
     """H = M + t^2 (projected Hessian of E, and of contact) at the positions that the hierarchy was built at.
 
     It is positive definite whatever these are (a context of MATPYTHON).
@@ -254,7 +224,7 @@ class ProjectedHessian(Viewable):
         self.v = np.zeros_like(lattice.nodes, dtype=np.float32)  # pinned nodes stay zero
         self.product = np.empty_like(self.v)
         self.elastic: Hessian | None = None  # until ``update``
-        self.products, self.q = 0, lattice.nodes
+        self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
         self.joined: SurfaceHessian | None = None
@@ -265,8 +235,9 @@ class ProjectedHessian(Viewable):
 
         joined : of the surface's contact with itself
         """
-        self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
-        unknowns, blocks = self.unknowns, self._bound()
+        self.elastic, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), contact
+        unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
+        self.elasticity.add_bound(q, blocks)
         invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
         self.join(joined)
 
@@ -274,19 +245,6 @@ class ProjectedHessian(Viewable):
         """Take another contact of the surface with itself."""
         self.joined = joined
         self.smoother = ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
-
-    def getDiagonal(self, _: PETSc.Mat, diagonal: PETSc.Vec) -> None:
-        """Write that of D, for -mg_levels_pc_type jacobi."""
-        unknowns, (blocks, contact) = self.unknowns, (self._bound(), self.contact)
-        acting = blocks[unknowns.free] + (contact[unknowns.free] if len(contact) else 0)
-        acting += self.joined.blocks[unknowns.free] if self.joined else 0
-        own = unknowns.ballast[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
-        unknowns.columns_to_write(diagonal)[:] = own
-
-    def _bound(self) -> Rows:
-        blocks = np.zeros((len(self.q), 9), like=self.q)
-        self.elasticity.add_bound(self.q, blocks)
-        return blocks
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""
@@ -301,7 +259,7 @@ class ProjectedHessian(Viewable):
             if self.joined:
                 self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
-            count_flops(self.elasticity.flops.product + (BLOCK + 3) * len(self.contact))
+            count_flops(self.elasticity.flops.product + 18 * len(self.contact))
 
 
 class DiagonalBlocks:
@@ -316,14 +274,63 @@ class DiagonalBlocks:
         apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, moved)
         if self.hessian.smoother:
             self.hessian.smoother.correct(moved)
-        count_flops(BLOCK * unknowns.size)
+        count_flops(15 * unknowns.size)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")
 
 
+class ContactSmoother:
+    """Smoother of the finest level where contact of the surface with itself joins nodes, C = t^2 W^T H_c W.
+
+    A pair that presses is stiff along one direction of some forty unknowns. Diagonal blocks cannot tell
+    that direction from the others, so that CG has it to find. This inverts D + C, D the block diagonal
+    without that contact, by Woodbury's formula on the points in contact,
+
+        (D + C)^-1 = D^-1 - D^-1 W^T B (I + B^T G B)^-1 B^T W D^-1,    t^2 H_c = B B^T,    G = W D^-1 W^T.
+
+    With B from Cholesky's factorisation, pivoted, a direction 1e9 times as stiff as D keeps seven digits.
+    Where H - C is no more than b D, H is no more than b (D + C) for b >= 1, so that Chebyshev's bound
+    stays. Coarse levels have the diagonal blocks of C.
+
+    inverse : D^-1 (m, 9) of the free nodes [1/kg]
+    """
+
+    def __init__(self, unknowns: Unknowns, surface: SurfaceHessian, t2: float, inverse: Array):
+        self.comm, self.inverse = unknowns.comm, inverse
+        self.at, weights = surface.carried
+        self.weights = weights[:, unknowns.free]
+        size = surface.points.shape[0]
+        compliance, scaled = np.zeros((size, size)), self.weights.copy()
+        for r in range(3):
+            for c in range(3):
+                scaled.data = self.weights.data * inverse[self.weights.indices, 3 * r + c]
+                compliance[np.ix_(3 * self.at + r, 3 * self.at + c)] = (self.weights @ scaled.T).toarray()
+        compliance = self.comm.allreduce(compliance)
+        self.root = root_of(t2 * surface.points.toarray())
+        self.factor = cho_factor(np.eye(self.root.shape[1]) + self.root.T @ compliance @ self.root)
+
+    def correct(self, y: Rows) -> None:
+        """Turn y = D^-1 x (3, m) into (D + C)^-1 x."""
+        moved = np.zeros((len(self.root) // 3, 3))
+        moved[self.at] = self.weights @ y.T
+        if self.comm.size > 1:
+            moved = self.comm.allreduce(moved)
+        forces = self.root @ cho_solve(self.factor, self.root.T @ moved.ravel())
+        back = self.weights.T @ forces.reshape(-1, 3)[self.at]
+        y -= np.einsum("mrc,mc->rm", self.inverse.reshape(-1, 3, 3), back)
+
+
+def root_of(matrix: Rows) -> Rows:
+    """Return B (n, r) with B B^T a positive semidefinite matrix (n, n) of rank r, by pivoted Cholesky."""
+    lower, pivots, rank, _ = dpstrf(matrix, lower=1)
+    root = np.zeros((len(matrix), rank))
+    root[pivots - 1] = np.tril(lower)[:, :rank]
+    return root
+
+
 @kernel
-def add_node_blocks(first, count, step, blocks, v, product):
+def add_node_blocks(first: int, count: int, step: int, blocks: Rows, v: Array, product: Array) -> None:
     for i in range(first, count, step):
         for r in range(3):
             for c in range(3):
@@ -331,7 +338,7 @@ def add_node_blocks(first, count, step, blocks, v, product):
 
 
 @kernel
-def apply_blocks(first, count, step, x, inverse, y):
+def apply_blocks(first: int, count: int, step: int, x: Rows, inverse: Array, y: Rows) -> None:
     for i in range(first, count, step):
         a, b, c = x[0, i], x[1, i], x[2, i]
         for r in range(3):
@@ -339,7 +346,10 @@ def apply_blocks(first, count, step, x, inverse, y):
 
 
 @kernel
-def invert_blocks(first, count, step, blocks, free, mass, contact, t2, inverse):
+def invert_blocks(
+    first: int, count: int, step: int, blocks: Rows, free: Indices, mass: Floats, contact: Rows, t2: float,
+    inverse: Array,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         node = free[i]
         m, d = mass[node], blocks[node]

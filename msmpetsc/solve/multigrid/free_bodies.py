@@ -110,4 +110,5 @@ class Translations:
     def _sums(self, rows: Rows) -> Floats:
         """Sums (r, b) over each free body's nodes of rows (r, m)."""
         own = [to_host(np.bincount(self.body, row, self.count + 1)[: self.count]) for row in rows]
-        return self.unknowns.comm.allreduce(np.array(own).reshape(len(rows), self.count))
+        sums: Floats = self.unknowns.comm.allreduce(np.array(own).reshape(len(rows), self.count))
+        return sums

@@ -40,7 +40,8 @@ def grid_indices(unknowns: Unknowns) -> Indices:
         return np.empty((0, 3), np.int64)
     # the first node of its body that this rank owns: a spring joins ghosts with such a node
     first = np.maximum(lattice.first_of_body[lattice.body] - lattice.table.first, 0)
-    return decode_morton(keys[first]) + np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
+    steps: Indices = np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
+    return decode_morton(keys[first]) + steps
 
 
 def parents_of(ijk: Indices) -> tuple[Indices, Mask]:

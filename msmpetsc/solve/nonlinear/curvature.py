@@ -280,10 +280,12 @@ class LowestCurvature:
 
     def _unit(self, directions: Rows) -> Rows:
         """Directions scaled to unit length in the norm of M; those of no length stay so."""
-        return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
+        lengths: Rows = like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
+        return directions / lengths
 
     def _lengths(self, directions: Rows) -> Floats:
-        return np.sqrt(self.comm.allreduce(to_host(directions**2 @ self.functional.mass)))
+        squares: Floats = self.comm.allreduce(to_host(directions**2 @ self.functional.mass))
+        return np.sqrt(squares)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store the mode and what was searched: another long search at each checkpoint would cost a tenth of a run."""

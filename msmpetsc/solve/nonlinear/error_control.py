@@ -29,7 +29,6 @@ LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabola there
 NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
-ATOL = 1e-50  # of KSP: none
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
 NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 KINDS = {
@@ -140,7 +139,7 @@ class ErrorControl:
         if self._is_smooth(now):
             return self.tightest, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
         missing = now.bound / self.ratio
-        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), ATOL
+        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), 1e-50  # PETSc's: none
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """What is known where a step goes on from a point that is no minimum, or farther from one

@@ -22,7 +22,6 @@ from msmpetsc.solve.petsc.events import ESTIMATE
 
 CHECK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
-UNIFORMLY_CLOSE = 0.3  # with multigrid, which leaves out nothing that is smooth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
 LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: where g is convex the error is then at most three times what was found
 MOST = 512
@@ -106,7 +105,7 @@ class ErrorEstimate:
         self.hessian.linearise(q, self.functional.problem.contact)
         self.operator.assemble()
 
-    def _converged(self, ksp: PETSc.KSP, its: int, residual: float) -> int | None:
+    def _converged(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
         """Whether the solve has shown what an estimate needs (a convergence test of KSP)."""
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
@@ -154,7 +153,7 @@ class ErrorEstimate:
         """The least eigenvalue of P^(-1) H that is known, that of a solve by CG included; 0 where there is none."""
         if ksp.its < FEW:
             return self.least
-        least = ksp.computeExtremeSingularValues()[1]
+        least = float(ksp.computeExtremeSingularValues()[1])
         if not 0 < least <= GREATEST:
             return 0.0
         return least if ksp.its >= MANY or not self.least else min(least, self.least)
@@ -170,8 +169,7 @@ class ErrorEstimate:
         """Whether e is near in the norm of H, as far as CG can show."""
         least = ksp.computeExtremeSingularValues()[1]
         energy = ksp.getSolution().dot(self.right_side)
-        close = UNIFORMLY_CLOSE if self.preconditioner.is_uniform and self.lowest == 1.0 else CLOSE
-        if not (min(least, energy) > 0 and residual < close * np.sqrt(self.lowest * least * energy)):
+        if not (min(least, energy) > 0 and residual < CLOSE * np.sqrt(self.lowest * least * energy)):
             return False
         return self._left() < LEFT * self.lengths[ksp.its]
 

@@ -6,8 +6,6 @@ from msmpetsc.backend.arrays import Floats, Positions, Rows, like, to_host
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
-SHORTER = (0.5, 0.1, 0.0)  # shares of a guess's way, where anchors move on at once
-
 
 class FirstGuess:
     """Guesses for the steps of one lattice.
@@ -57,10 +55,8 @@ class FirstGuess:
         drift = self._drift(moved)
         if functional.problem.prescribed is None:
             return q + share * moved + (1 - share) * drift
-        for less in SHORTER:
-            guess = q + less * moved
-            if functional.free_share(q, self._held(guess)) == 1.0:
-                return guess
+        if functional.free_share(q, self._held(q)) == 1.0:  # anchors move on at once
+            return q
         raise StepFailed(
             'has anchors that lead the surface through itself; try safety.on_failure = "substep", or other paths',
             "contact",

@@ -112,7 +112,7 @@ class StepFunctional:
             if met and problem.contact.surface:
                 acting += problem.contact.surface.change(q, problem.q)
         inertia = 0.5 * self._inner(moved, moved)
-        return self.comm.allreduce(inertia + self.t2 * acting)
+        return float(self.comm.allreduce(inertia + self.t2 * acting))
 
     def change(self, q: Positions, base: Positions) -> tuple[float, float]:
         """g(q) - g(base) [kg m^2] and |q - base|^2 [m^2] of positions (l, 3); a difference that keeps its digits."""
@@ -182,7 +182,7 @@ class Rounding:
         stiffness, mass = self.comm.allreduce(np.array([3 * float(diagonal.sum()), float(functional.mass.sum())]))
         # Springs or cells whose forces are k eps off move nodes by no more than sqrt(sum t^2 k) eps in the norm of H
         # where that is positive definite, and in that of M no farther; the diagonal is no less than the sum.
-        self.moved, self.size = ROUNDINGS * np.sqrt(stiffness), np.sqrt(mass)
+        self.moved, self.size = float(ROUNDINGS * np.sqrt(stiffness)), float(np.sqrt(mass))
 
     def is_all_of(self, f: PETSc.Vec) -> bool:
         """Whether F is nothing but rounding, row by row, for soft parts have less of it than stiff ones."""
@@ -220,5 +220,5 @@ class Rounding:
         if is_rounding and HOPELESS * away < error * away <= NEGLIGIBLE * size:
             moved = error * away  # a body at rest
         if not away > moved / HOPELESS:
-            return moved / max(size, np.finfo(float).tiny)
+            return moved / max(size, sys.float_info.min)
         return max(error, moved / away)

@@ -11,14 +11,12 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.errors import InputError
-from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
-from msmpetsc.solve.linear.system import assemble
+from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, assemble, python_matrix
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,
     MULTIGRID,
     LatticePreconditioner,
-    Preconditioned,
     Preconditioner,
     StepPreconditioner,
 )
@@ -48,23 +46,18 @@ class Jacobian:
         self.hessian = TrueHessian(self.unknowns, elasticity, functional.time_step, self._contact_blocks())
         self.blocks = None if true_hessian else self._contact_blocks()  # that go with A
         chooses = self.preset.chooses and options.is_default("pc_type")
-        kind = MULTIGRID if chooses and options.users_of("mg_", "pc_mg_") else options.value("pc_type")
+        kind = options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
             raise InputError(f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; of A there is gamg")
         context = self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)
-        self.operator = self._python_matrix(context)
+        self.operator = python_matrix(self.unknowns, context, self.comm)
+        self.owned.callback(self.operator.destroy)
         of_lattice = partial(LatticePreconditioner, self.unknowns, elasticity, functional.time_step, options.prefix)
         mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
         is_held = self.unknowns.total < self.unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
         self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio, self.unknowns.total)
-        self.pmat = self._python_matrix(Preconditioned(self.preconditioner))
-
-    def _python_matrix(self, context: object) -> PETSc.Mat:
-        matrix = python_matrix(self.unknowns, context, self.comm)
-        self.owned.callback(matrix.destroy)
-        return matrix
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
@@ -89,7 +82,8 @@ class Jacobian:
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         self.functional.elasticity.add_bound(lattice.nodes, blocks)
         stiffness = blocks[unknowns.free][:, [0, 4, 8]].sum(axis=1)
-        return unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
+        diagonal: Floats = unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
+        return diagonal
 
     def linearise(
         self, q: Positions, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False
@@ -107,8 +101,6 @@ class Jacobian:
         changed = self.preconditioner.in_use.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()
-        if changed:
-            self.pmat.assemble()
 
 
 class FrictionKinks:
@@ -128,7 +120,7 @@ class FrictionKinks:
         self.is_awaited = False
 
     def begin(self, contact: Contact | None) -> None:
-        """Begin a step of which nothing is known yet."""
+        """Begin a step, with secants for all nodes in contact."""
         self.contact, self.is_awaited = contact, False
         self.secants = contact.all_secant() if contact else None
 

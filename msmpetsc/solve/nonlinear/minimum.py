@@ -107,8 +107,10 @@ class Minimum:
         return relative(functional.norm(self.first), functional.distance(nearer.q, correction))
 
     def go_on(self, x: PETSc.Vec, verdict: Verdict) -> bool:
-        """Move x to the point examined if g is lower there, and from there along a direction of negative curvature, the
-        way that g falls, as far as doubling the move lets it fall; whether it has moved."""
+        """Move x to the point examined if g is lower there; whether it has moved.
+
+        From there it goes on along a direction of negative curvature, as far as doubling the move lets g fall.
+        """
         functional = self.functional
         falls = functional.change(functional.positions(self.nearer), functional.positions(x))[0] < 0
         if falls:

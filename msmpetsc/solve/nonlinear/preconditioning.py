@@ -1,4 +1,4 @@
-"""Which preconditioner a step's linear solves have: one of A, or multigrid of the Hessian on the lattice.
+"""Preconditioners of a step's linear solves: of A, or multigrid of the Hessian on the lattice.
 
 With Jacobi's, CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations, kappa = 2 (1 + t^2 k / m) where nothing is held,
 k the springs at a node together; multigrid takes about four whatever that is, each as dear as several. So short steps
@@ -23,8 +23,8 @@ from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.multigrid.free_bodies import Translations
+from msmpetsc.solve.petsc.device import HOST
 from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
-from msmpetsc.solve.petsc.memory import HOST
 
 MULTIGRID = PETSc.PC.Type.MG
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
@@ -68,7 +68,7 @@ class Preconditioner:
             return False
         lattice = self.unknowns.lattice
         bound = (contact.bound(q) if contact else np.zeros(lattice.owned, like=q))[self.unknowns.free]
-        changed = lattice.table.comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
+        changed = bool(lattice.table.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR))
         if changed:
             self.added = bound
             self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
@@ -93,7 +93,7 @@ class Preconditioner:
 
 
 class LatticePreconditioner:
-    """The cycle, and how its hierarchy serves. All methods are collective.
+    """Multigrid of the Hessian, with a hierarchy that is kept while it pays. Collective.
 
     matrix, pc   : the projected Hessian, and PETSc's PCMG of it
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
@@ -120,7 +120,7 @@ class LatticePreconditioner:
         self.joining: SurfaceHessian | None = None
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
-        """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
+        """Build a hierarchy at positions q (l, 3) [m] if a new one is due; whether it was."""
         is_asked = self.is_stale or self.joins
         surface = contact.surface.hessian(q, True) if is_asked and contact and contact.surface else None
         joining = surface if self.joins else None
@@ -142,7 +142,7 @@ class LatticePreconditioner:
             columns -= self.translations.of(self.unknowns.columns(f))
 
     def learn(self, its: int, rtol: float) -> None:
-        """A linear solve took so many iterations to a relative tolerance; none say nothing.
+        """Take note of the iterations that a linear solve took to a relative tolerance.
 
         A hierarchy is kept until what it has cost would have paid for a new one: at worst that is twice the least.
         """
@@ -174,7 +174,7 @@ class LatticePreconditioner:
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """The Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) without contact."""
+        """Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) if there are none."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
         for nodes, added in contact.hessian(q, False) if contact else ():
@@ -199,22 +199,12 @@ class LatticePreconditioner:
 
 def expected_iterations(ratio: float) -> float:
     """Iterations that Jacobi's takes where the greatest t^2 k / m of a node is ``ratio``."""
-    return 0.5 * np.sqrt(2 * (1 + ratio)) * np.log(2 / USUAL)
-
-
-class Preconditioned:
-    """Context of the MATPYTHON (3m x 3m) that stands for what is preconditioned where PETSc wants a matrix of it."""
-
-    def __init__(self, preconditioner: "StepPreconditioner"):
-        self.preconditioner = preconditioner
-
-    def view(self, _: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        self.preconditioner.in_use.matrix.view(viewer)
+    return float(0.5 * np.sqrt(2 * (1 + ratio)) * np.log(2 / USUAL))
 
 
 @dataclass(eq=False)
 class StepPreconditioner:
-    """The one in use (a PCPYTHON context). All methods are collective.
+    """Preconditioner of a step's solves, of A or of the Hessian (a PCPYTHON context). Collective.
 
     make_of_matrix, make_multigrid : make them where they are needed
     chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
@@ -283,13 +273,12 @@ class StepPreconditioner:
 
     @property
     def to_balance(self) -> LatticePreconditioner | None:
-        """What moves bodies as wholes to where their forces balance, which linear solves would not;
-        None where nothing has to."""
+        """The multigrid that moves free bodies as wholes to where forces balance; None where there is none."""
         multigrid = self.multigrid if self.is_chosen else None
         return multigrid if multigrid and multigrid.translations else None
 
     def learn(self, its: int, rtol: float) -> None:
-        """A linear solve took so many iterations to a relative tolerance."""
+        """Take note of the iterations that a linear solve took to a relative tolerance."""
         if self.multigrid and self.is_chosen:
             self.multigrid.learn(its, rtol)
         elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / rtol):

@@ -125,7 +125,7 @@ class Stepper:
         return owned
 
     def _create_solvers(self) -> tuple[PETSc.SNES, PETSc.KSP]:
-        """SNES, and the KSP of its own or, where it has one, of the SNES that preconditions it."""
+        """Create SNES, and the KSP of its own or of the SNES that preconditions it."""
         snes, prefix = self._keep(PETSc.SNES().create(self.comm)), self.prefix
         snes.setOptionsPrefix(prefix)
         inner = self._keep(snes.getNPC()) if self.has_npc else snes
@@ -136,7 +136,7 @@ class Stepper:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
         snes.setFunction(self._residual, self._keep(self.x.duplicate()))
-        snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.pmat)
+        snes.setJacobian(self._linearise, self.jacobian.operator)
         snes.setObjective(self._objective)
         if self.touches:
             snes.setLineSearchPreCheck(self._shorten)
@@ -168,7 +168,7 @@ class Stepper:
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
             self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
             self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
-            self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
+            self.ksp.setOperators(self.jacobian.operator)
             self.ksp.setUp()
 
     def step(self, problem: StepProblem, start: Rows | None = None) -> StepResult:
@@ -260,7 +260,7 @@ class Stepper:
         self.iterations += self.snes.its
         if self.snes.reason < 0 and Stop.agreed(self.comm):
             raise StepStopped("stopped by a signal")
-        return self.snes.its
+        return int(self.snes.its)
 
     def examine(self, outcome: Outcome) -> Verdict:
         """Whether x is a minimum, and how far from it (collective)."""
@@ -274,8 +274,10 @@ class Stepper:
         return replace(verdict, is_minimum=bool(self.budget) or will_do)
 
     def _leave(self, verdict: Verdict, outcome: Outcome) -> Outcome | None:
-        """Move x to where g is lower than where it is no minimum; what is then known, None where g has no digits left
-        to tell the two points apart: the step is as good as the verdict says (collective). Raises StepFailed."""
+        """Move x from where it is no minimum to where g is lower; what is then known (collective). Raises StepFailed.
+
+        None where g has no digits left to tell the two apart: the step is as good as the verdict says.
+        """
         doubted = self.control.doubt(replace(outcome, error=verdict.error), self.minimum.go_on(self.x, verdict))
         if doubted and doubted.doubts > DOUBTS:
             worst = where_worst(self.functional, self.functional.evaluate(self.x, self.work))
@@ -333,7 +335,7 @@ class Stepper:
         return share < 1.0
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
-        """Called before each linear solve: the Jacobian there, and what that solve starts from."""
+        """Take the Jacobian at x, and the start of the linear solve (SNES calls it before each)."""
         with LOCAL:
             if snes.its > 0:
                 self.kinks.see(self.functional.positions(x), self.base)  # where no objective was asked for
@@ -353,7 +355,7 @@ class Stepper:
             z.axpy(1.0, snes.getFunction()[0])
 
     def _start_from_estimate(self, snes: PETSc.SNES, known: bool) -> None:
-        """CG goes on from what an estimate at this x, if any, has of the same correction."""
+        """Start CG from the correction that an estimate at this x found, if there is any."""
         if self.options.is_given("ksp_initial_guess_nonzero"):
             return
         known = known and self.ksp.getType() != PETSc.KSP.Type.PREONLY  # that starts from nothing
@@ -361,7 +363,7 @@ class Stepper:
             self.control.estimate.correction.copy(snes.getSolutionUpdate())
         self.ksp.setInitialGuessNonzero(known)
 
-    def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
+    def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> PETSc.SNES.ConvergedReason:
         """Whether SNES is done (its convergence test), by its iterate's error or by the budget."""
         reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:
@@ -391,7 +393,7 @@ class Stepper:
         return reasons.ITERATING
 
     def _iterate(self, snes: PETSc.SNES) -> Iterate:
-        """SNES's iterate, and F there."""
+        """Return SNES's iterate, and F there."""
         x = snes.getSolution()
         if self.has_npc:
             return self._evaluate(x)

@@ -8,12 +8,11 @@ from contextlib import ExitStack
 
 from petsc4py import PETSc
 
-MAIN = 0  # PETSc's own stage: before the set-up, and after the last frame
 SETUP, STEPS, OUTPUT = (PETSc.Log.Stage(name) for name in ("set-up", "steps", "output"))
 REFERENCE = PETSc.Log.Stage("reference")  # steps solved once more, which are no part of the run
 for unused in REFERENCE, PETSc.Log.Stage("PCMPI"):  # PETSc's own of -mpi_linear_solver_server
     unused.visible = False  # -log_view calls a stage that never begins Unknown
-OF_THE_RUN = (MAIN, SETUP.id, STEPS.id, OUTPUT.id)
+OF_THE_RUN = (0, SETUP.id, STEPS.id, OUTPUT.id)  # 0: PETSc's own, before the set-up and after the last frame
 
 GRADIENT = PETSc.Log.Event("msmpetsc gradient")
 ENERGY = PETSc.Log.Event("msmpetsc energy")  # differences of g

@@ -10,11 +10,10 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
-from msmpetsc.errors import InputError, StepFailed, did_you_mean
+from msmpetsc.errors import InputError, did_you_mean
 
 Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
 INSERT = int(PETSc.InsertMode.INSERT_VALUES)
-NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked for it
 
 
 @cache
@@ -39,15 +38,6 @@ def dense_pointer(matrix: PETSc.Mat) -> int:
     return pointer
 
 
-def view_entries(operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-    """View an operator that is only known by its products with all its entries, of one product a
-    column (MatComputeOperator) (collective)."""
-    library, matrix = petsc_library(), ctypes.c_void_p()
-    _check(library.MatComputeOperator(ctypes.c_void_p(operator.handle), b"aij", ctypes.byref(matrix)))
-    _check(library.MatView(matrix, ctypes.c_void_p(viewer.handle)))
-    _check(library.MatDestroy(ctypes.byref(matrix)))
-
-
 def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
     """Say which entries ``set_values_coo`` will set, by global indices (n,); negative ones are left
     out, those named twice are added (MatSetPreallocationCOO) (collective)."""
@@ -63,7 +53,7 @@ def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
 
 @contextmanager
 def replaced_option(name: str, value: str) -> Iterator[None]:
-    """Have another value of an option that is set, or none, while the block is run."""
+    """Replace the value of an option while the block is run."""
     database, before = PETSc.Options(), PETSc.Options().getAll()
     database.setValue(name, value)
     yield
@@ -93,8 +83,7 @@ def _check(error: int) -> None:
 def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
-    ImportError is that of an object of type python whose context is not there. A solver that did
-    not converge, where an option made that an error, becomes StepFailed.
+    ImportError is that of an object of type python whose context is not there.
 
     abandon : called after such an error
     """
@@ -107,13 +96,11 @@ def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Itera
         if cause is not None and not isinstance(cause, (PETSc.Error, ImportError)):
             raise cause  # noqa: B904 (the error itself, not another)
         abandon()
-        if getattr(error, "ierr", 0) == NOT_CONVERGED:
-            raise StepFailed(f"did not converge: {last_words(error)}", "linear solve") from None
         raise InputError(f"{what}: {last_words(cause or error)}") from None
 
 
 def last_words(error: BaseException) -> str:
-    """Message of a PETSc error without the calls it came through; of an unknown type the nearest."""
+    """Message of a PETSc error, without its calls; for an unknown type with the nearest."""
     lines = str(error).splitlines()
     said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
     words = said[-1] if said else lines[0]

@@ -21,8 +21,8 @@ OBEYED = {  # those that go together, and what they show
     "-pc_mg_type full -mg_levels_ksp_type richardson": "",
 }
 REFUSED = {
-    "-pc_mg_levels 1": "two levels or more",
-    "-pc_mg_levels 9": "at most",
+    "-pc_mg_levels 1": "nearest for this lattice is 2",
+    "-pc_mg_levels 9": "nearest for this lattice is",
     "-pc_mg_galerkin both": "PETSc cannot set up the solver",
     "--preset anderson -pc_type mg": "newton's presets",
     "-mg_levels_ksp_typ cg": "no part of this run",

@@ -12,7 +12,7 @@ from pinch import pinch_scene
 
 from msmpetsc.contact.surface.points import Carried
 from msmpetsc.contact.surface.term import SurfaceHessian
-from msmpetsc.solve.multigrid.contact import ContactSmoother
+from msmpetsc.solve.multigrid.cycle import ContactSmoother
 from msmpetsc.solve.nonlinear import preconditioning
 
 POINTS, NODES, T2 = 7, 12, 1e-3

@@ -53,7 +53,7 @@ OF_RUNS = tuple(name for name in EXTRAS["run"] if name not in (*EXTRAS["render"]
 DRAWN = [
     "render {} -o x.png",
     "render {} -o x.gif --frames 0:4:2",
-    "render {} -o x.html --colour contact",
+    "render {} -o x.html --colour speed",
     "render ball.ply -o mesh.png",
 ]
 

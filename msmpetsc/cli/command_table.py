@@ -126,7 +126,7 @@ RENDER = (
     argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)"),
     argument(
         "--colour", metavar="FIELD",
-        help="colour by displacement, speed, strain, stress, contact, part or error, with a legend",
+        help="colour by displacement, speed, strain, stress, part or error, with a legend",
     ),
     argument(
         "--reference", metavar="OUT.h5", type=checked_file,

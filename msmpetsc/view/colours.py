@@ -11,7 +11,6 @@ from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.results.comparison import common_times, refuse_different_meshes
 from msmpetsc.results.reader import Result
 from msmpetsc.view.drawable import Drawable
-from msmpetsc.view.gaps import SurfaceGaps, gaps_to_obstacles
 
 BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"
@@ -53,7 +52,6 @@ def of_classes(numbers: np.ndarray) -> np.ndarray:
 # Fields on the surface
 
 
-NEAR = 0.01  # of the longest side of a body: gaps up to this are told apart
 PREFIXES = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}  # of pascals alone: a body is some 2000 m long
 
@@ -67,7 +65,6 @@ class Colouring:
     values  : number of a frame -> (v,)
     high    : end of the scale, which begins at 0
     classes : names, where the field is a number of a class; those without a name are not in the legend
-    below   : what is shown is so much less the values, from 0 to that; None: the values themselves
     """
 
     title: str
@@ -75,7 +72,6 @@ class Colouring:
     values: Callable[[int], np.ndarray]
     high: float = 1.0
     classes: tuple[str, ...] = ()
-    below: float | None = None
 
     def shares(self, index: int) -> np.ndarray:
         """Return the values (v,) of a frame as shares of the scale's end."""
@@ -90,13 +86,9 @@ class Colouring:
         """Both ends of the scale, in the unit that the title names: ("0", "displacement [mm]", "12.5")."""
         if self.unit == "%":
             return "0", f"{self.title} [%]", f"{100 * self.high:.3g}"
-        largest = self.below or self.high
         prefixes = LARGE | PREFIXES if self.unit == "Pa" else PREFIXES
-        size = next((size for size in prefixes if largest >= size), 1.0)
-        title = f"{self.title} [{prefixes[size]}{self.unit}]"
-        if self.below is None:
-            return "0", title, f"{self.high / size:.3g}"
-        return f"{self.below / size:.3g} or more", title, "0"
+        size = next((size for size in prefixes if self.high >= size), 1.0)
+        return "0", f"{self.title} [{prefixes[size]}{self.unit}]", f"{self.high / size:.3g}"
 
 
 def colouring_of(subject: Drawable, name: str, reference: Result | None = None) -> Colouring:
@@ -186,25 +178,6 @@ def _part(subject: Drawable, _: Result | None) -> Colouring:
     return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts)))
 
 
-def _contact(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the gap to obstacles, and where the scene has self-contact to parts of the surface, as far as near."""
-    scene, rest = subject.scene, subject.rest
-    if scene is None or not (scene.obstacle or scene.self_contact):
-        raise InputError(f"--colour contact: the scene of {subject.name} has neither obstacles nor self-contact")
-    reach = NEAR * float(np.ptp(rest.bounds, axis=1).max())
-    surface = SurfaceGaps(rest.points, subject.triangles, rest.body_of_point, reach) if scene.self_contact else None
-    touched = [word for word, there in (("obstacles", scene.obstacle), ("the surface itself", surface)) if there]
-
-    def values(index: int) -> np.ndarray:
-        points = subject.surface(index)
-        gaps = gaps_to_obstacles(scene.obstacle, subject.solids, points, float(subject.times[index]))
-        if surface is not None:
-            gaps = np.minimum(gaps, surface.distances(points))
-        return reach - np.clip(gaps, 0, reach)
-
-    return Colouring(f"gap to {' and '.join(touched)}", "m", values, below=reach)
-
-
 def plain_colouring(subject: Drawable) -> Colouring | None:
     """Return colours of bodies that no field colours: each its own; None of one alone."""
     number = subject.rest.body_of_point % len(CLASSES)
@@ -218,7 +191,6 @@ COLOURINGS: dict[str, Callable[[Drawable, Result | None], Colouring]] = {
     "stress": _stress,
     "error": _error,
     "part": _part,
-    "contact": _contact,
 }
 
 
@@ -235,6 +207,4 @@ def opened_reference(path: Path | None, run: Result) -> Iterator[Result | None]:
 
 def scaled(colouring: Colouring, frames: Iterable[int]) -> Colouring:
     """Return the colouring with a scale that ends at the greatest value of these frames."""
-    return replace(
-        colouring, high=colouring.below or max(float(colouring.values(index).max(initial=0)) for index in frames)
-    )
+    return replace(colouring, high=max(float(colouring.values(index).max(initial=0)) for index in frames))

@@ -29,12 +29,12 @@ from msmpetsc.view.colours import Colouring
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import FARTHEST, Drawable
 from msmpetsc.view.film import usual_speed
-from msmpetsc.view.gaps import TINY, unit_vectors
 from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, drawn
 from msmpetsc.view.overlays import Overlays
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
+TINY = 1e-300
 PARTS = files("msmpetsc.view")
 SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", "page_begin.js")
 
@@ -199,7 +199,8 @@ def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
 def solid_facts(surface: Surface) -> dict[str, list]:
     """Return an obstacle's surface as the script draws it: each triangle's corners, and its normal at each."""
     corners = surface.points[surface.triangles]
-    normals = unit_vectors(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), TINY)[:, None]
     digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=TINY))))
     return {
         "corners": np.round(corners, digits).ravel().tolist(),

@@ -126,11 +126,6 @@ class Cut:
     cells: dict[int, np.ndarray]
     springs: np.ndarray
 
-    @property
-    def used(self) -> np.ndarray:
-        """Numbers of the nodes of cells and springs, each once."""
-        return np.unique(np.concatenate([part.ravel() for part in (*self.cells.values(), self.springs)]))
-
 
 def cut_open(subject: Drawable, camera: Camera, shown: tuple[str, ...]) -> Cut:
     """Return the half of the lattice behind the middle of the body at rest. Raises InputError where there is none."""

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.progress_bar import counted
@@ -27,16 +26,16 @@ from msmpetsc.view import colours
 from msmpetsc.view.annotations import entries_of
 from msmpetsc.view.colours import Colouring
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
-from msmpetsc.view.drawable import FARTHEST, Drawable
+from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.film import usual_speed
-from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, drawn
+from msmpetsc.view.mesh import HELD, drawn
 from msmpetsc.view.overlays import Overlays
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
 TINY = 1e-300
 PARTS = files("msmpetsc.view")
-SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", "page_begin.js")
+SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js", "page_begin.js")
 
 
 def write_page(
@@ -66,50 +65,16 @@ def write_page(
 
 
 def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, bytes]:
-    """Return positions, colours and triangles, and the lattice's nodes, cells and springs as far as they are shown, as
-    deflated bytes for the script to read. Raises InputError where they cannot be drawn."""
-    subject, cut = composition.subject, composition.cut(composition.style.shown)
+    """Return positions, colours and triangles as deflated bytes for the script to read."""
+    subject = composition.subject
+    bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     streams = {
         "positions": deflated(residuals(quantised(subject.surface, frames, composition.box))),
-        "triangles": packed_numbers(subject.triangles, len(subject.rest.points)),
+        "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
     }
     if composition.colouring is not None:
         streams["colours"] = deflated(changes(levels(composition.colouring, frames)))
-    if cut is not None:
-        used, cells = cut.used, np.concatenate([np.empty((0, 8), int), *cut.cells.values()])
-        box = lattice_box(subject, cut, frames)
-        streams |= {
-            "nodes": deflated(residuals(quantised(lambda index: subject.nodes(index)[used], frames, box))),
-            "cells": packed_numbers(np.searchsorted(used, cells), len(used)),
-            "springs": packed_numbers(np.searchsorted(used, cut.springs), len(used)),
-        }
     return streams
-
-
-def lattice_box(subject: Drawable, cut: Cut, frames: Iterable[int]) -> np.ndarray:
-    """Return the box (2, 3) around what is shown of a lattice [m]. Raises InputError where it cannot be drawn."""
-    ends = [(nodes.min(axis=0), nodes.max(axis=0)) for nodes in (subject.nodes(index)[cut.used] for index in frames)]
-    box = np.array([np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)])
-    if not (np.abs(box) < FARTHEST).all():
-        raise InputError(f"--show: {subject.name} has nodes that cannot be drawn")
-    return box
-
-
-def lattice_facts(subject: Drawable, cut: Cut, frames: Iterable[int]) -> dict[str, Any]:
-    """Return what the script must know of a lattice beside its streams."""
-    return {
-        "box": lattice_box(subject, cut, frames).tolist(),
-        "nodes": len(cut.used),
-        "kinds": [{"cells": len(part), "colour": KINDS[kind][0]} for kind, part in cut.cells.items()],
-        "springColour": colours.SPRING,
-        "shrunk": SHRUNK,
-        "opacity": THROUGH,
-    }
-
-
-def packed_numbers(numbers: np.ndarray, count: int) -> bytes:
-    """Return numbers of so many things, deflated: of 16 bits where these do."""
-    return zlib.compress(numbers.astype("<u2" if count <= LEVELS else "<u4").tobytes(), 6)
 
 
 def quantised(points: Callable[[int], np.ndarray], frames: Iterable[int], box: np.ndarray) -> Iterator[np.ndarray]:
@@ -156,7 +121,7 @@ def deflated(parts: Iterable[bytes]) -> bytes:
 
 def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, Any]:
     """Return what the script must know beside the streams, in types of JSON."""
-    subject, frames, cut = composition.subject, [still.index for still in stills], stills[0].cut
+    subject, frames = composition.subject, [still.index for still in stills]
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
@@ -170,7 +135,6 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
         "overlays": distinct([still.overlays for still in stills]),
         "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
         "axes": composition.style.axes,
-        "lattice": lattice_facts(subject, cut, frames) if cut else None,
     }
 
 

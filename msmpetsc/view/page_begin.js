@@ -2,15 +2,14 @@
 
 let extent;
 async function begin() {
-  triangles = await numbersOf("triangles", points);
+  const packed = (await inflated("triangles")).buffer;
+  triangles = new (points > 65535 ? Uint32Array : Uint16Array)(packed);
   fixing = await inflated("fixed");
-  all = predicted(await inflated("positions"), points);
+  all = predicted(await inflated("positions"));
   numbers = data.streams.colours ? summed(await inflated("colours")) : null;
   extent = firstExtent();
-  if (data.lattice) await unpackLattice();
   start();
   makeLegend();
-  makeSwitches();
   makePlayer();
   readAddress();
   draw();

@@ -17,11 +17,11 @@ void main() {
   gl_Position = camera * vec4(low + size * position, 1.0);
 }`, `#version 300 es
 precision mediump float;
-in vec3 facing; in vec3 paint; in float held; uniform float opacity; uniform vec3 fixedColour; out vec4 pixel;
+in vec3 facing; in vec3 paint; in float held; uniform vec3 fixedColour; out vec4 pixel;
 ${LIGHT}
 void main() {
   vec3 colour = held > 0.99 ? fixedColour : paint; // a face is held whose corners all are
-  pixel = vec4(colour * light(normalize(facing)), 1.0) * opacity;
+  pixel = vec4(colour * light(normalize(facing)), 1.0);
 }`];
 const FLAT = [`#version 300 es
 in vec3 position; uniform mat4 camera; uniform vec3 low; uniform vec3 size; uniform vec4 plane; uniform float lift;
@@ -48,7 +48,7 @@ function program(sources) {
   gl.linkProgram(made);
   const attributes = {}, uniforms = {};
   for (const name of ["position", "normal", "number", "fixing"]) attributes[name] = gl.getAttribLocation(made, name);
-  for (const name of ["camera", "turning", "low", "size", "scale", "fixedColour", "plane", "lift", "paint", "opacity"])
+  for (const name of ["camera", "turning", "low", "size", "scale", "fixedColour", "plane", "lift", "paint"])
     uniforms[name] = gl.getUniformLocation(made, name);
   return { made, attributes, uniforms };
 }
@@ -80,7 +80,6 @@ function start() {
   for (const what of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, what, gl.NEAREST);
   filled("triangles", triangles, gl.ELEMENT_ARRAY_BUFFER);
   filled("numbers", new Uint8Array(points));
-  if (data.lattice) startLattice();
 }
 
 function normals(at) { // of the points, from the triangles around each, weighed by their areas
@@ -107,7 +106,6 @@ function loadFrame() {
   filled("normals", normals(at));
   filled("fixing", fixing.subarray(points * data.fixed[counted], points * (data.fixed[counted] + 1)));
   if (numbers) filled("numbers", numbers.subarray(points * counted, points * (counted + 1)));
-  if (data.lattice) loadLattice(counted);
 }
 
 function axesOfEye() {
@@ -192,18 +190,14 @@ function drawGround(camera, ground, eye) { // a disk within its corners, ring ov
 const turningOf = ({ across, upward, toEye }) => [0, 1, 2].flatMap((k) => [across[k], upward[k], toEye[k]]);
 
 function drawBody(camera, eye) {
-  const through = shown.size > 0; // what of the lattice is shown is seen through it
   use(lit, camera, box[0], size);
   gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
-  gl.uniform1f(lit.uniforms.opacity, through ? data.lattice.opacity : 1);
   attribute(lit, "position", "positions", 3, gl.UNSIGNED_SHORT, true);
   attribute(lit, "normal", "normals", 3, gl.FLOAT, false);
   attribute(lit, "number", "numbers", 1, gl.UNSIGNED_BYTE, false);
   attribute(lit, "fixing", "fixing", 1, gl.UNSIGNED_BYTE, true);
   gl.uniform3fv(lit.uniforms.fixedColour, colour("#46566b"));
-  if (through) { gl.enable(gl.BLEND); gl.depthMask(false); }
   bodyElements();
-  if (through) { gl.depthMask(true); gl.disable(gl.BLEND); }
 }
 
 const FACES = [0, 1, 3, 0, 3, 2, 4, 5, 7, 4, 7, 6, 0, 1, 5, 0, 5, 4, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 3, 7, 1, 7, 5];
@@ -234,7 +228,6 @@ function drawMesh(camera, eye, { number, by }) { // a mesh, in the colour of obs
   const { corners, normals } = data.solids[number];
   use(lit, camera, by, [1, 1, 1]);
   gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
-  gl.uniform1f(lit.uniforms.opacity, 1);
   gl.uniform3fv(lit.uniforms.fixedColour, colour("#a3b6c4"));
   gl.vertexAttrib1f(lit.attributes.number, 0);
   gl.vertexAttrib1f(lit.attributes.fixing, 1);
@@ -288,8 +281,7 @@ function draw() {
   const state = data.overlays.states[data.overlays.numbers[view.frame]];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
   for (const mesh of state.meshes) drawMesh(matrix, eye, mesh);
-  if (shown.size) drawLattice(matrix, eye);
-  drawBody(matrix, eye); // after what is seen through it
+  drawBody(matrix, eye);
   drawAxes(matrix, rows, shift);
   for (const corners of state.glass) drawGlass(matrix, corners);
   for (const ball of state.balls) drawBall(matrix, ball, eye);

@@ -56,11 +56,8 @@ class Moments:
         return data | {"pinned": pinned} | self._constant("n", "nodes") | stress
 
     def data_of_cells(self, frame: int) -> dict[str, np.ndarray]:
-        """Return what is known of the lattice's cells: strain, (c, 6) [-], and all that the file has of each."""
-        if self.mesh == "surface":
-            return {}
-        strain = green_strain(self.rest, self.cells, self.points(frame))
-        return {"strain": strain} | self._constant("c", "cells") | self._stress("c", frame)
+        """Return all that the file has of each of the lattice's cells."""
+        return {} if self.mesh == "surface" else self._constant("c", "cells") | self._stress("c", frame)
 
     def _stress(self, letter: str, frame: int) -> dict[str, np.ndarray]:
         arrays = self.run.frames
@@ -69,23 +66,6 @@ class Moments:
     def _constant(self, letter: str, points: str) -> dict[str, np.ndarray]:
         arrays = self.run.lattice
         return {name: arrays[name][:] for name in arrays if name != points and LATTICE[name].shape == (letter,)}
-
-
-def green_strain(rest: np.ndarray, cells: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return Green's strain (F^T F - I) / 2 at the cells' centres, (c, 6) [-]: xx, yy, zz, xy, yz, xz, as VTK has it.
-
-    rest, points : (n, 3) [m]; cells (c, 8), all cubes of one size and alike at rest
-    """
-    if not len(cells):
-        return np.empty((0, 6))
-    corners = rest[cells[0]]
-    sides = np.ptp(corners, axis=0)
-    gradients = np.sign(corners - corners.mean(axis=0)) / (4 * sides)  # (8, 3) of the trilinear functions [1/m]
-    F = np.zeros((len(cells), 3, 3))
-    for corner, gradient in enumerate(gradients):
-        F += points[cells[:, corner], :, None] * gradient
-    strain = 0.5 * (F.transpose(0, 2, 1) @ F - np.eye(3))
-    return strain[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
 
 
 def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from msmpetsc.errors import one_line
 from msmpetsc.export.moments import Moments, normals
@@ -49,11 +49,10 @@ class UsdBody:
     """The mesh of one body, to which frames are added."""
 
     def __init__(self, stage: Any, root: Any, moments: Moments, of_point: np.ndarray, number: int):
-        """Define what stays as it is: triangles, colour and points at rest."""
+        """Define what stays as it is: triangles and colour."""
         self._rows = np.flatnonzero(of_point == number)
         own = moments.cells[of_point[moments.cells[:, 0]] == number]
         self._triangles = np.searchsorted(self._rows, own)
-        self._rest = moments.rest[self._rows]
         name = "body" if of_point.max() == 0 else f"body_{number}"
         self._mesh = UsdGeom.Mesh.Define(stage, root.AppendChild(name))
         self._mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)  # or it would be rounded off
@@ -61,18 +60,14 @@ class UsdBody:
         self._mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(self._triangles.ravel().astype(np.int32)))
         self._mesh.CreateDisplayColorAttr([Gf.Vec3f(*CLAY)])
         self._mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        kind = Sdf.ValueTypeNames.FloatArray
-        self._displacement = UsdGeom.PrimvarsAPI(self._mesh).CreatePrimvar("displacement", kind, UsdGeom.Tokens.vertex)
 
     def add(self, points: np.ndarray, code: float) -> None:
         """Add the sample of a time code, of the points (v, 3) [m] of all bodies."""
         own = points[self._rows]
-        length = np.linalg.norm(own - self._rest, axis=1).astype(np.float32)
         corners = np.array([own.min(axis=0), own.max(axis=0)])
         self._mesh.CreatePointsAttr().Set(_vectors(own), code)
         self._mesh.CreateNormalsAttr().Set(_vectors(normals(own, self._triangles)), code)
         self._mesh.CreateExtentAttr().Set(_vectors(corners), code)
-        self._displacement.Set(Vt.FloatArray.FromNumpy(length), code)
 
 
 def up_axis(scene: dict[str, Any]) -> str:

@@ -11,7 +11,6 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,17 +90,6 @@ class Result:
             return f"<closed {self.path}>"
         counts = f"{len(self.frames.time)} frames of {len(self.lattice.nodes)} nodes"
         return f"<{self.path}: {counts}, {self.attributes.get('command', 'no command')}>"
-
-    def _repr_html_(self) -> str:
-        """Return the result as a notebook shows it: what it is of, and its arrays."""
-        title = self.scene.get("title") if "scene" in self.attributes else None
-        lines = [f"<b>{escape(str(title))}</b>"] if title else []
-        lines.append(f"<code>{escape(repr(self))}</code>")
-        if self.file and len(self.frames.time):
-            lines.append(f"t = {self.frames.time[0]:g} s to {self.frames.time[-1]:g} s")
-        arrays = [repr(group) for group in (self.frames, self.lattice, self.surface) if group] if self.file else []
-        listed = "\n".join(arrays)
-        return "<br>".join(lines) + (f"<details><summary>arrays</summary><pre>{escape(listed)}</pre></details>")
 
     def __contains__(self, name: str) -> bool:
         return name in self._datasets

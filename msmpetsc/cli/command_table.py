@@ -115,7 +115,7 @@ def ranks(about: str) -> Argument:
 
 
 RENDER = (
-    argument("subject", metavar="OUT.h5|SCENE.toml|MESH", type=checked_file, help="what is drawn"),
+    argument("subject", metavar="OUT.h5|SCENE.toml", type=checked_file, help="what is drawn"),
     argument(
         "-o", "--output", metavar="FILE", type=checked_file,
         help="*.png, *.mp4, *.gif, *.webp or *.html; default: beside what is drawn, ending in .png",
@@ -234,7 +234,7 @@ COMMANDS = {
         "Exit status 0: they agree; 1: they differ; 2: they cannot be compared.",
     ),
     "render": Command(
-        "draw a result as a picture, a film or a page; or a scene or a mesh before anything is run",
+        "draw a result as a picture, a film or a page; or a scene before anything is run",
         (
             "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5",
             "msmpetsc render out/my.h5 -o out/my.mp4 --speed 0.1",
@@ -243,7 +243,7 @@ COMMANDS = {
         ),
         RENDER,
         description="Draw some moments of a result side by side (*.png), a film (*.mp4, *.gif, *.webp), or a page for "
-        "a browser in which the body turns and its frames play (*.html). A scene or a mesh is drawn as it lies.",
+        "a browser in which the body turns and its frames play (*.html). A scene is drawn as it lies.",
     ),
     "export": Command(
         "write frames of a result in another format",

@@ -73,7 +73,7 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
     if any(still.cut and len(still.cut.springs) for still in stills):
         entries.append(Entry("line", "spring", SPRING))
-    if composition.fixed and scene is not None:
+    if composition.fixed:
         held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
     if any(still.overlays.arrows for still in stills):

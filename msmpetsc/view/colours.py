@@ -98,8 +98,6 @@ def colouring_of(subject: Drawable, name: str, reference: Result | None = None) 
         raise InputError(f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}")
     if (name == "error") != (reference is not None):
         raise InputError("--colour error goes with --reference OUT.h5, the result that it is counted from")
-    if subject.embedding is None:
-        raise InputError(f"--colour: {subject.name} is a mesh alone, without fields")
     return COLOURINGS[name](subject, reference)
 
 
@@ -144,7 +142,7 @@ def _stress(subject: Drawable, _: Result | None) -> Colouring:
     """Colour by von Mises' stress, the mean of the cells around a node carried by the embedding."""
     von_mises = subject.von_mises
     if von_mises is None:
-        if subject.scene is not None and subject.scene.material.poisson is None:
+        if subject.scene.material.poisson is None:
             raise InputError(f"--colour stress: {subject.name} is of springs, whose law has no stress")
         raise InputError(f"--colour stress: {subject.name} has no stress: run its scene with output.stress = true")
     return Colouring("von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)))
@@ -168,7 +166,7 @@ def _error(subject: Drawable, reference: Result | None) -> Colouring:
 
 def _part(subject: Drawable, _: Result | None) -> Colouring:
     """Colour by the last of the scene's parts that the nearest cell belongs to."""
-    rest, parts = subject.rest, list(subject.scene.tables("part")) if subject.scene else []
+    rest, parts = subject.rest, list(subject.scene.tables("part"))
     if not parts:
         raise InputError(f"--colour part: the scene of {subject.name} has no part")
     number = np.zeros(len(rest.cells))

@@ -1,4 +1,4 @@
-"""What is drawn: a body at its times, of a result, of a scene that was not run yet, or of a mesh alone."""
+"""What is drawn: a body at its times, of a result, or of a scene that was not run yet."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -86,13 +86,12 @@ class Drawable:
     """A body and the scene that says what stands beside it.
 
     name      : of its file, for messages
-    scene     : None for a mesh alone
     pinned    : (n,) which nodes are
     triangles : (f, 3) of the surface points
     times     : (T,) of its frames [s]
     nodes     : number of a frame -> node positions (n, 3) [m]
     surface   : number of a frame -> surface points (v, 3) [m]
-    embedding : W (v, n); None where the surface points are the nodes
+    embedding : W (v, n)
     array     : name of a dataset of a result, "lattice/springs" -> its numbers
     solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
     von_mises : number of a frame -> stress at the nodes (n,) [Pa]; None where none was stored
@@ -100,14 +99,14 @@ class Drawable:
     """
 
     name: str
-    scene: SceneFile | None
+    scene: SceneFile
     rest: BodiesAtRest
     pinned: np.ndarray
     triangles: np.ndarray
     times: np.ndarray
     nodes: Callable[[int], np.ndarray]
     surface: Callable[[int], np.ndarray]
-    embedding: csr_array | None
+    embedding: csr_array
     array: Callable[[str], np.ndarray]
     solids: Mapping[int, Surface]
     carry: csr_array | None = None
@@ -116,22 +115,22 @@ class Drawable:
     @property
     def title(self) -> str:
         """Title of the scene, or the file's name."""
-        return (self.scene and self.scene.title) or Path(self.name).stem
+        return self.scene.title or Path(self.name).stem
 
     @property
     def gravity(self) -> tuple[float, ...] | None:
         """The scene's acceleration (3,) [m/s^2], which says what is up."""
-        return self.scene.gravity.acceleration if self.scene and self.scene.gravity else None
+        return self.scene.gravity.acceleration if self.scene.gravity else None
 
     @property
     def eye(self) -> tuple[float, ...] | None:
         """Direction (3,) of the scene's picture, from the body to the eye."""
-        return self.scene.picture.eye if self.scene else None
+        return self.scene.picture.eye
 
     def fixed(self, index: int) -> np.ndarray:
         """Return how far each surface point is pinned or led at a frame, (v,) in [0, 1]."""
         fixed = self.pinned.copy()
-        for anchor in self.scene.tables("anchor") if self.scene else ():
+        for anchor in self.scene.tables("anchor"):
             if within(float(self.times[index]), 0.0, anchor.table.stop):
                 fixed |= self.rest.find(anchor)
         return self.on_surface(fixed.astype(float), 1.0)
@@ -140,7 +139,7 @@ class Drawable:
         """Return what numbers (n,) of the nodes are at the surface points, (v,) in [0, most]."""
         if not numbers.any():
             return np.zeros(len(self.rest.points))
-        return np.clip(numbers if self.embedding is None else self.embedding @ numbers, 0, most)
+        return np.clip(self.embedding @ numbers, 0, most)
 
 
 def drawable_of_result(run: Result) -> Drawable:
@@ -197,24 +196,6 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
         embedding=W,
         array=arrays.__getitem__,
         solids=model.solids,
-    )
-
-
-def drawable_of_surface(path: Path, surface: Surface) -> Drawable:
-    """Return a mesh as it lies in its file, in the file's own unit: the nodes are its points."""
-    points, no_cells, body = surface.points, np.empty((0, 8), int), np.zeros(len(surface.points), int)
-    return Drawable(
-        name=str(path),
-        scene=None,
-        rest=BodiesAtRest(points, no_cells, points, body, body),
-        pinned=np.zeros(len(points), bool),
-        triangles=surface.triangles,
-        times=np.zeros(1),
-        nodes=lambda _: points,
-        surface=lambda _: points,
-        embedding=None,
-        array={"lattice/cell_kind": no_cells[:, 0], "lattice/springs": no_cells[:, :2]}.__getitem__,
-        solids={},
     )
 
 

@@ -12,7 +12,6 @@ import pyvista as pv
 from scipy.sparse import csr_array, eye_array, vstack
 from trimesh.triangles import points_to_barycentric
 
-from msmpetsc.errors import InputError
 from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
@@ -31,8 +30,8 @@ def drawn(subject: Drawable) -> Drawable:
 def _refined(subject: Drawable) -> Drawable:
     """Return the subject with no edge of its surface longer than a cell, new points carried by the cells."""
     rest, W = subject.rest, subject.embedding
-    cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max()) if len(rest.cells) else 0.0
-    if W is None or cell == 0:
+    cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
+    if cell == 0:
         return subject
     a, b, c = rest.points[subject.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
@@ -92,7 +91,7 @@ def _split(subject: Drawable) -> Drawable:
         rest=rest,
         triangles=triangles,
         surface=lambda index: subject.surface(index)[origin],
-        embedding=None if W is None else W[origin],
+        embedding=W[origin],
         carry=(csr_array(eye_array(len(subject.rest.points))) if subject.carry is None else subject.carry)[origin],
     )
 
@@ -128,9 +127,7 @@ class Cut:
 
 
 def cut_open(subject: Drawable, camera: Camera, shown: tuple[str, ...]) -> Cut:
-    """Return the half of the lattice behind the middle of the body at rest. Raises InputError where there is none."""
-    if not len(subject.rest.cells):
-        raise InputError(f"--show: {subject.name} is a mesh without cells")
+    """Return the half of the lattice behind the middle of the body at rest."""
     cells, depth = subject.rest.cells, subject.rest.nodes @ camera.to_eye
     middle = (depth.min() + depth.max()) / 2
     parts: dict[int, np.ndarray] = {}

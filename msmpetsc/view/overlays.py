@@ -78,8 +78,6 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
     bodies : (b, 3) surface points of all pictures [m], which say how much of an obstacle is worth showing
     """
     scene, time, solids = subject.scene, float(subject.times[index]), subject.solids
-    if scene is None:
-        return Overlays()
     shown = Overlays(arrows=_arrows(scene, time, subject.rest, subject.nodes(index)))
     for number, obstacle in enumerate(scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):

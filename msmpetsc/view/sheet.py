@@ -1,4 +1,4 @@
-"""A contact sheet: some moments of a result in rows of one picture; or one of a scene or a mesh.
+"""A contact sheet: some moments of a result in rows of one picture; or one of a scene.
 
 All panels are seen by one camera without perspective, drawn one by one and pasted: so scale and height can be compared
 between them. Beside each body stand the obstacles and forces of its own time.
@@ -14,7 +14,6 @@ from PIL import Image
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage
-from msmpetsc.scene.schema import SceneFile
 from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
 from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style, composition_of
@@ -91,7 +90,6 @@ def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int |
     """Return the frames to draw, each with its reason or ""."""
     if frames:
         return dict.fromkeys(frames_of(subject.name, frames, len(subject.times)), "")
-    assert isinstance(subject.scene, SceneFile)
     if count is not None or not subject.scene.picture.times:
         return choose_moments(run, count or COUNT)
     nearest = {0, *(int(np.argmin(abs(subject.times - wanted))) for wanted in subject.scene.picture.times)}

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ball_result import BARE, HEIGHTS
+from surface_alone import drawable_of
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import toml_of
@@ -23,7 +23,7 @@ from msmpetsc.view.colours import (
     rgb,
     scaled,
 )
-from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_result, drawable_of_surface
+from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_result
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     moved = np.array([[0.0, 0, 0], [1.1, 0, 0], [1.9, 0, 0]])
     subject = replace(
-        drawable_of_surface("x.ply", Surface(points, np.array([[0, 1, 2]]))),
+        drawable_of(points, np.array([[0, 1, 2]])),
         nodes=lambda _: moved,
         array={"lattice/springs": np.array([[0, 1], [1, 2]]), "lattice/rest_length": np.ones(2)}.__getitem__,
     )

@@ -1,4 +1,4 @@
-"""``msmpetsc render``: pictures, films and pages of a result, or of a scene or a mesh before anything is run."""
+"""``msmpetsc render``: pictures, films and pages of a result, or of a scene before anything is run."""
 
 import argparse
 import re
@@ -9,20 +9,19 @@ import numpy as np
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES, RESULT_NAMES, SCENE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.geometry.readers import read_surface
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style
-from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result, drawable_of_surface
+from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result
 from msmpetsc.view.film import playback_of, write_film
 from msmpetsc.view.mesh import SHOWN
 from msmpetsc.view.page import write_page
 from msmpetsc.view.sheet import Moment, contact_sheet, draw_moments
 
 SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
-STILL = (760, 900)  # [px]: a panel of a scene or a mesh
+STILL = (760, 900)  # [px]: a panel of a scene
 ONLY = {  # options by the endings of what they are for
     "count": PICTURE_NAMES,
     "size": (*PICTURE_NAMES, *MOVIE_NAMES),
@@ -82,30 +81,25 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
 
 
 def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
-    """Draw a scene or a mesh as it lies before anything is run."""
+    """Draw a scene as it lies before anything is run."""
+    refuse_other_format("render", args.subject, (*RESULT_NAMES, *SCENE_NAMES))
     for option in ("frames", "count", "speed", "reference"):
         if getattr(args, option) is not None:
             raise InputError(f"--{option} is for results, and {args.subject} is none")
     if path.suffix.lower() in MOVIE_NAMES:
         raise InputError(f"{args.subject} has no motion to film: *.html turns it around")
-    subject, about = drawable_of_file(args.subject, args.set)
+    subject, about = drawable_of_scene(args.subject, args.set)
     if path.suffix.lower() not in PICTURE_NAMES:
         write_page(subject, path, [0], style)
         return
     moments = [Moment(0, (subject.title, about[0]), style.shown)]
-    if len(subject.rest.cells) and not style.shown:
+    if not style.shown:
         moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
     draw_moments(subject, path, moments, replace(style, size=style.size or STILL, axes=True))
 
 
-def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
-    """Return what a scene or a mesh shows, with size and cells in words. Raises InputError."""
-    if path.suffix.lower() not in SCENE_NAMES:
-        if changes:
-            raise InputError(f"--set changes a scene, and {path} is a mesh")
-        surface = read_surface(path)
-        counts = f"{len(surface.points)} points, {len(surface.triangles)} triangles"
-        return drawable_of_surface(path, surface), (f"{_sides(surface.points)} m, {counts}", "")
+def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
+    """Return what a scene shows, with size and cells in words. Raises InputError."""
     from mpi4py import MPI
 
     from msmpetsc.build import build_model  # compiled kernels, which drawing a result needs not
@@ -115,12 +109,8 @@ def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[st
     subject = drawable_of_model(path, scene, model)
     lattice = model.lattice
     cells = f"{len(lattice.cells)} cells of {lattice.cell_size:.4g} m, {lattice.owned} nodes"
-    return subject, (f"{_sides(subject.rest.points)} m", cells)
-
-
-def _sides(points: np.ndarray) -> str:
-    """Return "0.3 x 0.2325 x 0.2974" of the box around points (v, 3)."""
-    return " x ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
+    sides = " x ".join(f"{length:.4g}" for length in np.ptp(subject.rest.points, axis=0))
+    return subject, (f"{sides} m", cells)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError
 from msmpetsc.export.moments import Mesh, Moments, normals
 from msmpetsc.results.disk import whole_file
@@ -41,7 +42,7 @@ class Chunk:
         self.parts: list[bytes] = []
         self.size = 0
 
-    def add(self, rows: np.ndarray, use: int | None = None, bounds: bool = False) -> int:
+    def add(self, rows: Array, use: int | None = None, bounds: bool = False) -> int:
         """Add numbers (n,) or vectors (n, 3), float32 or uint32; return the accessor's number.
 
         bounds : whether to say the least and greatest values, as points, targets and times must
@@ -59,7 +60,7 @@ class Chunk:
         self.size += rows.nbytes
         return len(self.accessors) - 1
 
-    def add_shape(self, points: np.ndarray, normals: np.ndarray) -> dict[str, int]:
+    def add_shape(self, points: Array, normals: Array) -> dict[str, int]:
         """Add points and normals, (v, 3) float32 each; return their accessors."""
         return {"POSITION": self.add(points, POINTS, bounds=True), "NORMAL": self.add(normals, POINTS)}
 
@@ -107,7 +108,7 @@ def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]]
     }
 
 
-def _animation(chunk: Chunk, times: np.ndarray, targets: int) -> dict[str, Any]:
+def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
     """Return what lets each target have its frame's time (t,) [s] alone, in straight lines from one to the next."""
     since = (times - times[0]).astype(np.float32)
     weights = np.eye(targets + 1, targets, -1, np.float32).ravel()

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.errors import InputError
 from msmpetsc.fields import FRAME_FIELDS, LATTICE, STRESS
 from msmpetsc.results.reader import Result
@@ -30,11 +31,11 @@ class Moments:
         names = ("surface/points", "surface/triangles") if mesh == "surface" else ("lattice/nodes", "lattice/cells")
         self.rest, self.cells = run[names[0]][:], run.indices(names[1])
 
-    def points(self, frame: int) -> np.ndarray:
+    def points(self, frame: int) -> Array:
         """Return the points of a frame, (n, 3) [m]."""
         return self.run.frames.position[frame] if self.mesh == "lattice" else self.run.surface_at(frame)
 
-    def data_of_points(self, frame: int) -> dict[str, np.ndarray]:
+    def data_of_points(self, frame: int) -> dict[str, Array]:
         """Return what is known at the points: of the lattice masses, which are pinned; its stress, if it was stored.
 
         displacement : from rest, (n, 3) [m]
@@ -55,24 +56,24 @@ class Moments:
             pinned[self.run.lattice.pinned[:]] = 1
         return data | {"pinned": pinned} | self._constant("n", "nodes") | stress
 
-    def data_of_cells(self, frame: int) -> dict[str, np.ndarray]:
+    def data_of_cells(self, frame: int) -> dict[str, Array]:
         """Return all that the file has of each of the lattice's cells."""
         return {} if self.mesh == "surface" else self._constant("c", "cells") | self._stress("c", frame)
 
-    def _stress(self, letter: str, frame: int) -> dict[str, np.ndarray]:
+    def _stress(self, letter: str, frame: int) -> dict[str, Array]:
         arrays = self.run.frames
         return {name: arrays[name][frame] for name in STRESS if name in arrays and letter in FRAME_FIELDS[name].shape}
 
-    def _constant(self, letter: str, points: str) -> dict[str, np.ndarray]:
+    def _constant(self, letter: str, points: str) -> dict[str, Array]:
         arrays = self.run.lattice
         return {name: arrays[name][:] for name in arrays if name != points and LATTICE[name].shape == (letter,)}
 
 
-def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def normals(points: Array, triangles: Indices) -> Array:
     """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
     corners = points[triangles].astype(float)
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     sums = [np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T]
     vectors = np.stack(sums, axis=1)
     vectors[~vectors.any(axis=1)] = (0, 0, 1)  # a point of no triangle, or of folded ones: any direction is as good
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    return np.divide(vectors, np.linalg.norm(vectors, axis=1, keepdims=True), dtype=np.float32)

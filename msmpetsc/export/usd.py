@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
+from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import one_line
 from msmpetsc.export.moments import Moments, normals
 
@@ -48,7 +49,7 @@ def write_usd(moments: Moments, path: Path) -> None:
 class UsdBody:
     """The mesh of one body, to which frames are added."""
 
-    def __init__(self, stage: Any, root: Any, moments: Moments, of_point: np.ndarray, number: int):
+    def __init__(self, stage: Any, root: Any, moments: Moments, of_point: Indices, number: int):
         """Define what stays as it is: triangles and colour."""
         self._rows = np.flatnonzero(of_point == number)
         own = moments.cells[of_point[moments.cells[:, 0]] == number]
@@ -61,7 +62,7 @@ class UsdBody:
         self._mesh.CreateDisplayColorAttr([Gf.Vec3f(*CLAY)])
         self._mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
 
-    def add(self, points: np.ndarray, code: float) -> None:
+    def add(self, points: Array, code: float) -> None:
         """Add the sample of a time code, of the points (v, 3) [m] of all bodies."""
         own = points[self._rows]
         corners = np.array([own.min(axis=0), own.max(axis=0)])
@@ -73,15 +74,15 @@ class UsdBody:
 def up_axis(scene: dict[str, Any]) -> str:
     """Return the axis that is upward: against gravity where USD knows that one, else z."""
     acceleration = np.array(scene.get("gravity", {}).get("acceleration", (0, 0, 0)), float)
-    return UP.get(int(np.argmax(abs(acceleration))), UsdGeom.Tokens.z) if acceleration.any() else UsdGeom.Tokens.z
+    return str(UP.get(int(np.argmax(abs(acceleration))), UsdGeom.Tokens.z))
 
 
-def frames_a_second(times: np.ndarray) -> float:
+def frames_a_second(times: Floats) -> float:
     """Return how many frames there are in a second of times (t,) [s], so that a frame is one time
     code if all are spaced alike."""
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return float(f"{1 / spacing:.9g}")
 
 
-def _vectors(rows: np.ndarray) -> Any:
+def _vectors(rows: Array) -> Any:
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rows, np.float32))

@@ -92,7 +92,7 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
     owned : nodes of this rank; the ranks' follow each other
     """
     with opened_on_root(comm, path) as run:
-        newest = comm.bcast(on_root(comm, lambda: _newest(run)))
+        newest: tuple[int, Checkpoint, list[str]] | None = comm.bcast(on_root(comm, lambda: _newest(run)))
         if newest is None:
             return None
         slot, empty, names = newest

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
@@ -22,7 +23,7 @@ def typeface(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size)
 
 
-def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> np.ndarray:
+def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
     """Return a caption's two lines (height, width, 3), in the middle; letters: their size, 1 in a sheet."""
     picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
@@ -83,7 +84,7 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     return entries
 
 
-def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> np.ndarray:
+def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> Array:
     """Return the entries side by side, in as many lines as they need: (height, width, 3), no lines for none.
 
     letters : their size, 1 in a sheet

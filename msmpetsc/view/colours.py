@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats, Rows
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.results.comparison import common_times, refuse_different_meshes
 from msmpetsc.results.reader import Result
@@ -32,21 +33,21 @@ CLASSES = (
 )  # a body's parts, over and over
 
 
-def rgb(colour: str) -> np.ndarray:
+def rgb(colour: str) -> Floats:
     """Return red, green and blue (3,) of "#8fabc6", 0 to 255."""
     return np.array([int(colour[digit : digit + 2], 16) for digit in (1, 3, 5)], float)
 
 
-def on_scale(shares: np.ndarray) -> np.ndarray:
+def on_scale(shares: Floats) -> Rows:
     """Return the colours (n, 3), 0 to 255, of shares (n,) of the scale's end; what is beyond it has that of the end."""
     stops = np.array([rgb(colour) for colour in SCALE])
     at = np.linspace(0, 1, len(stops))
     return np.stack([np.interp(np.nan_to_num(shares), at, channel) for channel in stops.T], axis=1)
 
 
-def of_classes(numbers: np.ndarray) -> np.ndarray:
+def of_classes(numbers: Array) -> Rows:
     """Return the colours (n, 3), 0 to 255, of the numbers (n,) of classes."""
-    return np.array([rgb(colour) for colour in CLASSES])[numbers.astype(int) % len(CLASSES)]
+    return np.take([rgb(colour) for colour in CLASSES], numbers.astype(int) % len(CLASSES), axis=0)
 
 
 # Fields on the surface
@@ -69,15 +70,15 @@ class Colouring:
 
     title: str
     unit: str
-    values: Callable[[int], np.ndarray]
+    values: Callable[[int], Floats]
     high: float = 1.0
     classes: tuple[str, ...] = ()
 
-    def shares(self, index: int) -> np.ndarray:
+    def shares(self, index: int) -> Floats:
         """Return the values (v,) of a frame as shares of the scale's end."""
         return self.values(index) / (self.high or 1.0)
 
-    def rgb(self, index: int) -> np.ndarray:
+    def rgb(self, index: int) -> Rows:
         """Return the colours (v, 3) of a frame, 0 to 255."""
         return of_classes(self.values(index)) if self.classes else on_scale(self.shares(index))
 
@@ -103,23 +104,20 @@ def colouring_of(subject: Drawable, name: str, reference: Result | None = None) 
 
 def _displacement(subject: Drawable, _: Result | None) -> Colouring:
     """Colour by the distance from the point's place at rest."""
-
-    def values(index: int) -> np.ndarray:
-        return np.linalg.norm(subject.surface(index) - subject.rest.points, axis=1)
-
-    return Colouring("displacement", "m", values)
+    rest = subject.rest.points
+    return Colouring("displacement", "m", lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1))
 
 
 def _speed(subject: Drawable, _: Result | None) -> Colouring:
     """Colour by the way between the frames before and after, over the time between them."""
     last = len(subject.times) - 1
 
-    def values(index: int) -> np.ndarray:
+    def values(index: int) -> Floats:
         before, after = max(index - 1, 0), min(index + 1, last)
         if before == after:
             return np.zeros(len(subject.rest.points))
-        way = subject.surface(after) - subject.surface(before)
-        return np.linalg.norm(way, axis=1) / (subject.times[after] - subject.times[before])
+        velocity = (subject.surface(after) - subject.surface(before)) / (subject.times[after] - subject.times[before])
+        return np.asarray(np.linalg.norm(velocity, axis=1))
 
     return Colouring("speed", "m/s", values)
 
@@ -129,7 +127,7 @@ def _strain(subject: Drawable, _: Result | None) -> Colouring:
     springs, rest_length = subject.array("lattice/springs"), subject.array("lattice/rest_length")
     count = np.maximum(1, np.bincount(springs.ravel(), minlength=len(subject.rest.nodes)))
 
-    def values(index: int) -> np.ndarray:
+    def values(index: int) -> Floats:
         nodes = subject.nodes(index)
         length = np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1)
         squares = np.repeat((length / rest_length - 1) ** 2, 2)
@@ -154,12 +152,12 @@ def _error(subject: Drawable, reference: Result | None) -> Colouring:
     times = reference.frames.time[:]
     match = dict(common_times(subject.times, times))
 
-    def values(index: int) -> np.ndarray:
+    def values(index: int) -> Floats:
         if index not in match:
             raise InputError(f"{reference.path} has no frame of {subject.times[index]:.6g} s, as frame {index}")
         true = reference.frames.surface[match[index]]
         apart = np.linalg.norm(subject.surface(index)[: len(true)] - true, axis=1)  # of the file's points, the first
-        return apart if subject.carry is None else subject.carry @ apart
+        return np.asarray(apart if subject.carry is None else subject.carry @ apart)
 
     return Colouring("distance from the reference", "m", values)
 
@@ -178,7 +176,7 @@ def _part(subject: Drawable, _: Result | None) -> Colouring:
 
 def plain_colouring(subject: Drawable) -> Colouring | None:
     """Return colours of bodies that no field colours: each its own; None of one alone."""
-    number = subject.rest.body_of_point % len(CLASSES)
+    number = (subject.rest.body_of_point % len(CLASSES)).astype(float)
     return Colouring("body", "", lambda _: number, 1.0, ("",) * len(CLASSES)) if number.any() else None
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.errors import InputError
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
@@ -59,13 +60,13 @@ class Composition:
 
     subject: Drawable
     style: Style
-    extremes: np.ndarray
+    extremes: Positions
     camera: Camera
     colouring: Colouring | None
     fixed: bool
 
     @property
-    def box(self) -> np.ndarray:
+    def box(self) -> Positions:
         """Corners (2, 3) of the box around all frames [m]."""
         return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
@@ -85,7 +86,7 @@ class Composition:
             made.append(Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
         return made
 
-    def room(self, stills: Sequence[Still]) -> tuple[np.ndarray, np.ndarray, float]:
+    def room(self, stills: Sequence[Still]) -> tuple[Floats, Floats, float]:
         """Return lower left (2,) and upper right (2,) of all stills in the picture's plane, with a margin, and how
         deep they reach [m]. Of a ground it is what lies below the bodies, their shadows."""
         margin = (LABELS if self.style.axes else MARGIN) * np.ptp(self.box, axis=0).max()

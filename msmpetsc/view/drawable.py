@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
 from msmpetsc.constraints.loads import within
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside_bodies
@@ -32,19 +33,19 @@ class BodiesAtRest:
     body_of_node, body_of_point : numbers (n,), (v,) of their bodies
     """
 
-    nodes: np.ndarray
-    cells: np.ndarray
-    points: np.ndarray
-    body_of_node: np.ndarray
-    body_of_point: np.ndarray
+    nodes: Positions
+    cells: Indices
+    points: Positions
+    body_of_node: Indices
+    body_of_point: Indices
 
     @property
-    def bounds(self) -> np.ndarray:
+    def bounds(self) -> Positions:
         """Corners (b, 2, 3) of the bounding box of each body's surface [m]."""
         of_bodies = (self.points[self.body_of_point == number] for number in range(self.body_of_point.max() + 1))
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
-    def find(self, table: OfBody) -> np.ndarray:
+    def find(self, table: OfBody) -> Mask:
         """Tell which nodes (n,) a table's region means; none if it is painted in a file."""
         region = table.table.region
         if region.painted is not None:
@@ -53,18 +54,18 @@ class BodiesAtRest:
         return inside_bodies(region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body)
 
     @property
-    def middles(self) -> np.ndarray:
+    def middles(self) -> Positions:
         """Centres (c, 3) of the cells [m]."""
-        return self.nodes[self.cells].mean(axis=1)
+        return np.asarray(self.nodes[self.cells].mean(axis=1))
 
-    def find_cells(self, table: OfBody) -> np.ndarray:
+    def find_cells(self, table: OfBody) -> Mask:
         """Tell which cells (c,) the region of a table means, by their centres; none if it is painted in a file."""
         region = table.table.region
         if region.painted is not None:
             return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
         return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
 
-    def _painted_cells(self, table: OfBody) -> np.ndarray:
+    def _painted_cells(self, table: OfBody) -> Indices:
         """Return the numbers of the cells of the table's body around its painted points."""
         painted, number = table.table.region.painted, table.body or 0
         if not isinstance(painted, tuple):  # listed in a file, which the result does not hold
@@ -72,7 +73,7 @@ class BodiesAtRest:
         points = self.points[self.body_of_point == number][list(painted)]
         return self.cells_around(points, np.full(len(points), number))
 
-    def cells_around(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
+    def cells_around(self, points: Positions, body: Indices) -> Indices:
         """Return the numbers (k,) of the cells of bodies (k,) that points (k, 3) lie in."""
         of_cell, around = self.body_of_node[self.cells[:, 0]], np.empty(len(points), int)
         for number in np.unique(body):
@@ -101,16 +102,16 @@ class Drawable:
     name: str
     scene: SceneFile
     rest: BodiesAtRest
-    pinned: np.ndarray
-    triangles: np.ndarray
-    times: np.ndarray
-    nodes: Callable[[int], np.ndarray]
-    surface: Callable[[int], np.ndarray]
+    pinned: Mask
+    triangles: Indices
+    times: Floats
+    nodes: Callable[[int], Positions]
+    surface: Callable[[int], Positions]
     embedding: csr_array
-    array: Callable[[str], np.ndarray]
+    array: Callable[[str], Array]
     solids: Mapping[int, Surface]
     carry: csr_array | None = None
-    von_mises: Callable[[int], np.ndarray] | None = None
+    von_mises: Callable[[int], Floats] | None = None
 
     @property
     def title(self) -> str:
@@ -127,7 +128,7 @@ class Drawable:
         """Direction (3,) of the scene's picture, from the body to the eye."""
         return self.scene.picture.eye
 
-    def fixed(self, index: int) -> np.ndarray:
+    def fixed(self, index: int) -> Floats:
         """Return how far each surface point is pinned or led at a frame, (v,) in [0, 1]."""
         fixed = self.pinned.copy()
         for anchor in self.scene.tables("anchor"):
@@ -135,11 +136,11 @@ class Drawable:
                 fixed |= self.rest.find(anchor)
         return self.on_surface(fixed.astype(float), 1.0)
 
-    def on_surface(self, numbers: np.ndarray, most: float = np.inf) -> np.ndarray:
+    def on_surface(self, numbers: Floats, most: float = np.inf) -> Floats:
         """Return what numbers (n,) of the nodes are at the surface points, (v,) in [0, most]."""
         if not numbers.any():
             return np.zeros(len(self.rest.points))
-        return np.clip(self.embedding @ numbers, 0, most)
+        return np.asarray(np.clip(self.embedding @ numbers, 0, most))
 
 
 def drawable_of_result(run: Result) -> Drawable:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import whole_file
@@ -37,7 +38,7 @@ class Playback:
     speed   : simulated seconds a second; 0 where they are not in order of time
     """
 
-    numbers: np.ndarray
+    numbers: Indices
     fps: float
     speed: float
 
@@ -62,7 +63,7 @@ def usual_speed(span: float) -> float:
     return float(factors[np.argmax(span / factors <= most)])
 
 
-def playback_of(times: np.ndarray, fps: float | None = None, speed: float | None = None) -> Playback:
+def playback_of(times: Floats, fps: float | None = None, speed: float | None = None) -> Playback:
     """Return the playback of frames at these times (k,) [s].
 
     So that it lasts 3 to 8 s unless fps or speed says otherwise. With fps alone every frame is one picture; with both,
@@ -105,7 +106,7 @@ def write_film(
     write_pictures(path, _pictures(composition, stills, size), size, playback.fps)
 
 
-def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[np.ndarray]:
+def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[Array]:
     """Yield the picture (height, width, 3) of each still; of equal ones in a row the first is drawn only."""
     width, height = size
     letters = min(1.0, max(height / USUAL, SMALLEST))
@@ -124,7 +125,7 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
             yield picture
 
 
-def write_pictures(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
+def write_pictures(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
     """Write pictures (height, width, 3) as a film, named when it is whole. Raises InputError."""
     with whole_file(path) as part:
         if path.suffix.lower() == ".mp4":
@@ -133,7 +134,7 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, 
             _write_images(part, pictures, fps)
 
 
-def _write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
+def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
     """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError for a film that is not whole.
 
     That is asked of the film itself, for imageio-ffmpeg does not ask how ffmpeg ended.
@@ -155,7 +156,7 @@ def _write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, in
         raise OSError("ffmpeg did not write all of it: the disk may be full")
 
 
-def _write_images(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
+def _write_images(path: Path, pictures: Iterable[Array], fps: float) -> None:
     """Write a GIF or an animated WebP, for ever over; Pillow takes the pictures together."""
     images = [Image.fromarray(picture) for picture in pictures]
     options: dict[str, Any] = dict(quality=80, method=4)

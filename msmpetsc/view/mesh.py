@@ -12,6 +12,7 @@ import pyvista as pv
 from scipy.sparse import csr_array, eye_array, vstack
 from trimesh.triangles import points_to_barycentric
 
+from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
@@ -50,10 +51,16 @@ def _refined(subject: Drawable) -> Drawable:
     )
 
 
-def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray, csr_array]:
+def surface_of(points: Array, triangles: Array) -> pv.PolyData:
+    """Return a surface as VTK has it."""
+    surface: pv.PolyData = pv.PolyData.from_regular_faces(points, triangles)
+    return surface
+
+
+def subdivided(points: Positions, triangles: Indices, longest: float) -> tuple[Positions, Indices, csr_array]:
     """Return a surface whose edges longer than `longest` [m] are divided: points (p, 3), of which the first are those
     given, triangles (f, 3), and the matrix (p, v) that carries numbers at the given points to these."""
-    surface = pv.PolyData.from_regular_faces(points, triangles)
+    surface = surface_of(points, triangles)
     surface.cell_data["triangle"] = np.arange(len(triangles))
     fine = surface.subdivide_adaptive(max_edge_len=longest)
     around = np.zeros(fine.n_points, int)
@@ -61,14 +68,14 @@ def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> tup
     around[fine.regular_faces[largest_last]] = fine.cell_data["triangle"][largest_last, None]
     corners = triangles[around[len(points) :]]
     with np.errstate(all="ignore"):  # a triangle without an area has no such weights
-        weights = points_to_barycentric(points[corners], fine.points[len(points) :])
+        weights = points_to_barycentric(points[corners], fine.points[len(points) :])  # type: ignore[no-untyped-call]
     weights[~np.isfinite(weights).all(axis=1)] = 1 / 3
     shape = (len(corners), len(points))
     new = csr_array((weights.ravel(), corners.ravel(), 3 * np.arange(len(corners) + 1)), shape)
     return fine.points, fine.regular_faces, csr_array(vstack([eye_array(len(points)), new]))
 
 
-def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_array:
+def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array:
     """Return the matrix (p, n) that carries points (p, 3) of bodies (p,) by the corners of the cells around them."""
     corners = rest.cells[rest.cells_around(points, body)]
     low, high = rest.nodes[corners[:, 0]], rest.nodes[corners[:, 6]]
@@ -96,12 +103,12 @@ def _split(subject: Drawable) -> Drawable:
     )
 
 
-def split_at_edges(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indices]:
     """Return the points that drawn points are copies of, (d,), the first v themselves, and triangles (f, 3) of them.
 
     Two corners of triangles at one point stay one drawn point where no sharp edge parts them.
     """
-    surface = pv.PolyData.from_regular_faces(points, triangles)
+    surface = surface_of(points, triangles)
     options: dict[str, Any] = dict(consistent_normals=False, non_manifold_traversal=False, cell_normals=False)
     split = surface.compute_normals(split_vertices=True, feature_angle=SHARP, **options)
     return split["pyvistaOriginalPointIds"], split.regular_faces
@@ -122,15 +129,15 @@ class Cut:
     springs : (s, 2), both ends of which lie behind
     """
 
-    cells: dict[int, np.ndarray]
-    springs: np.ndarray
+    cells: dict[int, Indices]
+    springs: Indices
 
 
 def cut_open(subject: Drawable, camera: Camera, shown: tuple[str, ...]) -> Cut:
     """Return the half of the lattice behind the middle of the body at rest."""
     cells, depth = subject.rest.cells, subject.rest.nodes @ camera.to_eye
     middle = (depth.min() + depth.max()) / 2
-    parts: dict[int, np.ndarray] = {}
+    parts: dict[int, Indices] = {}
     if "cells" in shown:
         behind, kind = depth[cells].mean(axis=1) <= middle, subject.array("lattice/cell_kind")
         parts = {number: cells[behind & (kind == number)] for number in KINDS}

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.constraints.loads import Motion, total_of, within
 from msmpetsc.geometry.surface import bounds_of
 from msmpetsc.scene.schema import SceneFile
@@ -22,10 +23,10 @@ THICKNESS = 0.02  # of a plate of glass, of the bodies' longest extent
 class Ground:
     """A plane that the body stands on or lies against: corners (4, 3) around the disk drawn, unit normal (3,)."""
 
-    corners: np.ndarray
-    normal: np.ndarray
+    corners: Positions
+    normal: Floats
 
-    def below(self, points: np.ndarray) -> np.ndarray:
+    def below(self, points: Positions) -> Positions:
         """Return the points of the plane that points (n, 3) are above."""
         return points - np.outer((points - self.corners[0]) @ self.normal, self.normal)
 
@@ -34,9 +35,9 @@ class Ground:
 class Ball:
     """A sphere: center (3,), radius [m], and corners (8, 3) of the part of its bounding box that is worth showing."""
 
-    center: np.ndarray
+    center: Floats
     radius: float
-    seen: np.ndarray
+    seen: Positions
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class MeshObstacle:
     """A mesh: number of its obstacle, how far it moved (3,) [m], corners (8, 3) as of a Ball."""
 
     number: int
-    by: np.ndarray
-    seen: np.ndarray
+    by: Floats
+    seen: Positions
 
 
 @dataclass(frozen=True)
@@ -60,19 +61,19 @@ class Overlays:
     """
 
     grounds: list[Ground] = field(default_factory=list)
-    glass: list[np.ndarray] = field(default_factory=list)
-    arrows: list[np.ndarray] = field(default_factory=list)
+    glass: list[Positions] = field(default_factory=list)
+    arrows: list[Positions] = field(default_factory=list)
     balls: list[Ball] = field(default_factory=list)
     meshes: list[MeshObstacle] = field(default_factory=list)
 
     @property
-    def obstacles(self) -> np.ndarray:
+    def obstacles(self) -> Positions:
         """Corners (n, 3) of boxes and plates, and of what of a ball or a mesh is to be seen [m]."""
         seen = [*(ball.seen for ball in self.balls), *(mesh.seen for mesh in self.meshes)]
         return np.concatenate([np.empty((0, 3)), *self.glass, *seen])
 
 
-def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camera) -> Overlays:
+def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera) -> Overlays:
     """Return what stands beside the body at a frame.
 
     bodies : (b, 3) surface points of all pictures [m], which say how much of an obstacle is worth showing
@@ -99,7 +100,7 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
     return shown
 
 
-def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, camera: Camera) -> None:
+def _add_plane(shown: Overlays, point: Floats, normal: Floats, bodies: Positions, camera: Camera) -> None:
     """Add a plane as ground, or as a plate of glass where it hides the body; far from it, none."""
     if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
         return
@@ -116,23 +117,23 @@ def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: n
         shown.glass.append(np.concatenate([front, front - THICKNESS * _reach(bodies) * normal]))
 
 
-def _reach(bodies: np.ndarray) -> float:
-    return np.ptp(bodies, axis=0).max()
+def _reach(bodies: Positions) -> float:
+    return float(np.ptp(bodies, axis=0).max())
 
 
-def _sides(normal: np.ndarray) -> np.ndarray:
+def _sides(normal: Floats) -> Rows:
     """Return two unit vectors (2, 3) of a plane, the first along an axis of the scene if it can."""
     across = min(np.eye(3), key=lambda axis: abs(axis @ normal))
     first = unit(across - (across @ normal) * normal)
     return np.array([first, np.cross(normal, first)])
 
 
-def corners_of(box: np.ndarray) -> np.ndarray:
+def corners_of(box: Positions) -> Positions:
     """Return the corners (2^d, d) of a box (2, d), the last axis first: those in space have the numbers 4i + 2j + k."""
     return np.array([[box[end, axis] for axis, end in enumerate(ends)] for ends in np.ndindex((2,) * box.shape[1])])
 
 
-def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
+def _box(box: Positions, bodies: Positions) -> list[Positions]:
     """Return the corners (8, 3) of a box (2, 3), cut where it is much longer than the bodies; none if far away."""
     low, high = bodies.min(axis=0), bodies.max(axis=0)
     extent = high - low
@@ -145,7 +146,7 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
     return [corners_of(box)]
 
 
-def _arrows(scene: SceneFile, time: float, rest: BodiesAtRest, position: np.ndarray) -> list[np.ndarray]:
+def _arrows(scene: SceneFile, time: float, rest: BodiesAtRest, position: Positions) -> list[Positions]:
     length = ARROW * np.ptp(rest.bounds, axis=1).max()
     arrows = []
     for table in scene.tables("force"):

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.comm import log
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
@@ -77,14 +78,14 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
     return streams
 
 
-def quantised(points: Callable[[int], np.ndarray], frames: Iterable[int], box: np.ndarray) -> Iterator[np.ndarray]:
+def quantised(points: Callable[[int], Positions], frames: Iterable[int], box: Positions) -> Iterator[Indices]:
     """Yield the points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
     scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
     for index in counted(list(frames), "frames packed"):
         yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
 
 
-def residuals(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
+def residuals(frames: Iterable[Indices]) -> Iterator[bytes]:
     """Yield each frame less its prediction 2 p - q from the frames p, q before: all low bytes, then all high ones.
 
     A residual r is stored as 2 r, or -2 r - 1 where it is negative, so that small ones have no high byte.
@@ -98,14 +99,14 @@ def residuals(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
         p, q = frame, p
 
 
-def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[np.ndarray]:
+def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[Array]:
     """Yield the colours (v,) of each frame as whole numbers of 8 bits: shares of the scale, or classes."""
     for index in frames:
         shown = colouring.values(index) if colouring.classes else 255 * colouring.shares(index)
         yield np.clip(np.round(np.nan_to_num(shown)), 0, 255).astype(np.uint8)
 
 
-def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
+def changes(frames: Iterable[Array]) -> Iterator[bytes]:
     """Yield what each frame of numbers (v,) of 8 bits changes of the one before it."""
     before = None
     for frame in frames:
@@ -150,17 +151,18 @@ def scale_colours(colouring: Colouring | None) -> list[list[int]]:
         table = np.tile(colours.rgb(colours.BODY), (256, 1))
     else:
         table = colours.of_classes(numbers) if colouring.classes else colours.on_scale(numbers / 255)
-    return np.round(table).astype(int).tolist()
+    rounded: list[list[int]] = np.round(table).astype(int).tolist()
+    return rounded
 
 
-def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
+def distinct(overlays: Sequence[Overlays]) -> dict[str, list[Any]]:
     """Return what stands beside the body, each different state once, and the number of its state for each frame."""
     states: dict[str, int] = {}
     numbers = [states.setdefault(json.dumps(plain(shown)), len(states)) for shown in overlays]
     return {"states": [json.loads(state) for state in states], "numbers": numbers}
 
 
-def solid_facts(surface: Surface) -> dict[str, list]:
+def solid_facts(surface: Surface) -> dict[str, list[float]]:
     """Return an obstacle's surface as the script draws it: each triangle's corners, and its normal at each."""
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

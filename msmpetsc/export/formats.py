@@ -1,4 +1,4 @@
-"""The formats that a result is exported to, in one table, and the export itself.
+"""The formats of exported results in one table, and the export itself.
 
 glTF is written by a small writer of our own: libraries that read glTF write neither morph targets nor their animation.
 The surface moves by morph targets, one a frame, as Blender and browsers play it. The file is a JSON chunk and one
@@ -30,7 +30,7 @@ CLAY = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "meta
 
 
 class Chunk:
-    """The binary chunk, to which numbers of four bytes are added one after another.
+    """The binary chunk of a glTF file, to which numbers of four bytes are added.
 
     accessors, views : as the JSON chunk lists them
     parts, size      : its bytes so far, and how many
@@ -66,7 +66,7 @@ class Chunk:
 
 
 def write_glb(moments: Moments, path: Path) -> None:
-    """Write the frames. Raises InputError where the file would be longer than its format allows."""
+    """Write frames as glTF. Raises InputError where the file would be longer than its format allows."""
     first, *others = moments.frames
     base = moments.points(first).astype(np.float32)
     upright = normals(base, moments.cells)
@@ -92,7 +92,7 @@ def write_glb(moments: Moments, path: Path) -> None:
 
 
 def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]], name: str) -> dict[str, Any]:
-    """Return the JSON chunk's scene: one node, one mesh."""
+    """Return the scene of glTF's JSON chunk: one node with one mesh."""
     primitive: dict[str, Any] = {"attributes": shape, "indices": indices, "material": 0}
     mesh: dict[str, Any] = {"primitives": [primitive], "name": name}
     if targets:
@@ -109,7 +109,7 @@ def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]]
 
 
 def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
-    """Return what lets each target have its frame's time (t,) [s] alone, in straight lines from one to the next."""
+    """Return the animation that blends linearly between morph targets at the frames' times (t,) [s]."""
     since = (times - times[0]).astype(np.float32)
     weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
     sampler = {"input": chunk.add(since, bounds=True), "output": chunk.add(weights), "interpolation": "LINEAR"}
@@ -118,14 +118,14 @@ def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
 
 
 def write_usd(moments: Moments, path: Path) -> None:
-    """Write the frames as USD, by a library that only this format needs."""
+    """Write frames as USD, by a library that only this format needs."""
     from msmpetsc.export import usd
 
     usd.write_usd(moments, path)
 
 
 def write_one_frame(moments: Moments, path: Path) -> None:
-    """Write the one frame by meshio, with its data where the format has them."""
+    """Write a single frame by meshio, with data if the format holds them."""
     import meshio
 
     (frame,) = moments.frames
@@ -151,7 +151,7 @@ MESHES: dict[str, tuple[Mesh, ...]] = {".vtu": ("lattice", "surface")}  # of whi
 
 
 def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Frames | None = None) -> Path:
-    """Write frames of a result in the format that the path's ending names, and return the path.
+    """Write frames of a result in the format of the path's ending, and return the path.
 
     mesh   : "surface" or "lattice"; what the format holds, and the result has, if None
     frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
@@ -171,7 +171,7 @@ def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frame
 
 
 def _mesh(run: Result, path: Path, mesh: Mesh | None) -> Mesh:
-    """Return which mesh is meant. Raises InputError for one that the format does not hold."""
+    """Return the mesh to export. Raises InputError if the format does not hold it."""
     meshes = MESHES.get(path.suffix.lower(), ("surface",))
     if mesh is None:
         has_surface = "surface/points" in run
@@ -182,7 +182,7 @@ def _mesh(run: Result, path: Path, mesh: Mesh | None) -> Mesh:
 
 
 def _frames(run: Result, path: Path, moves: bool, frames: Frames | None) -> list[int]:
-    """Return the numbers of the frames meant. Raises InputError for frames that the result does not have."""
+    """Return the numbers of the frames to export. Raises InputError for frames that the result lacks."""
     count = len(run.frames.time)
     if not count:
         raise InputError(f"{run.path} has no finished frame")

@@ -1,4 +1,4 @@
-"""The chosen frames of a result as any format has them, one frame in memory at a time."""
+"""The exported frames of a result, independent of the format, one frame in memory at a time."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -23,7 +23,7 @@ class Moments:
     """
 
     def __init__(self, run: Result, mesh: Mesh, frames: Sequence[int]):
-        """Raises InputError for a result without the surface asked for, or a damaged one."""
+        """Choose frames. Raises InputError for a result without the surface asked for, or a damaged one."""
         self.run, self.mesh, self.frames = run, mesh, list(frames)
         if mesh == "surface" and "surface/points" not in run:
             raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
@@ -36,7 +36,7 @@ class Moments:
         return self.run.frames.position[frame] if self.mesh == "lattice" else self.run.surface_at(frame)
 
     def data_of_points(self, frame: int) -> dict[str, Array]:
-        """Return what is known at the points: of the lattice masses, which are pinned; its stress, if it was stored.
+        """Return the data at the points: displacement, velocity, stored stress; of the lattice mass and pins.
 
         displacement : from rest, (n, 3) [m]
         velocity     : the mean since the frame before, (n, 3) [m/s]; 0 at the first
@@ -57,7 +57,7 @@ class Moments:
         return data | {"pinned": pinned} | self._constant("n", "nodes") | stress
 
     def data_of_cells(self, frame: int) -> dict[str, Array]:
-        """Return all that the file has of each of the lattice's cells."""
+        """Return the lattice's data by cell; none for the surface."""
         return {} if self.mesh == "surface" else self._constant("c", "cells") | self._stress("c", frame)
 
     def _stress(self, letter: str, frame: int) -> dict[str, Array]:
@@ -70,7 +70,7 @@ class Moments:
 
 
 def normals(points: Array, triangles: Indices) -> Array:
-    """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
+    """Return area-weighted unit normals (v, 3) float32 at points (v, 3) of triangles (f, 3)."""
     corners = points[triangles].astype(float)
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     sums = [np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T]

@@ -1,4 +1,4 @@
-"""How far a run is: a bar on a terminal, now and then a plain line in a batch log."""
+"""The progress of a run: a bar on a terminal, a line now and then in a batch log."""
 
 import sys
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ class Lines:
             print(text.strip(), file=sys.stderr)
 
     def flush(self) -> None:
-        """Show what was written so far."""
+        """Flush standard error."""
         sys.stderr.flush()
 
 
@@ -46,7 +46,7 @@ class Progress:
         self._bar: tqdm | None = None
 
     def update(self, frame: Frame) -> None:
-        """Show that `frame` is done."""
+        """Show that a frame is done."""
         if not self._enabled:
             return
         if self._bar is None:  # whose rate counts from the first frame of a run that goes on
@@ -56,19 +56,19 @@ class Progress:
         self._bar.update(frame.index - self._bar.n)
 
     def close(self) -> None:
-        """Leave the bar as it is, or print the last frame if that had no line."""
+        """End the bar, and print the last frame if it had no line."""
         if self._bar is not None:
             self._bar.leave = self._is_terminal or self._bar.last_print_n < self._bar.n
         self._shown.close()
 
 
 def duration(seconds: float) -> str:
-    """Return a time for people: 31 s, 12 min, 3.4 h."""
+    """Return a duration in words: 31 s, 12 min, 3.4 h."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def counted(items: Sequence[Item], unit: str) -> Iterator[Item]:
-    """Yield the items, with a bar on a terminal that goes away with the last of them."""
+    """Yield the items, with a bar on a terminal that disappears at the end."""
     yield from tqdm(items, unit=f" {unit}", disable=None, leave=False, dynamic_ncols=True)

@@ -1,4 +1,4 @@
-"""What is written in pictures: captions, labels and the legend, all in one typeface."""
+"""Text in pictures: captions, labels and the legend, all in one typeface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +19,15 @@ CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its l
 
 @cache
 def typeface(size: int) -> ImageFont.FreeTypeFont:
-    """Return DejaVu Sans, which comes with matplotlib, in a size [px]."""
+    """Return the font DejaVu Sans, which comes with matplotlib, in a size [px]."""
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size)
 
 
 def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
-    """Return a caption's two lines (height, width, 3), in the middle; letters: their size, 1 in a sheet."""
+    """Return the picture (height, width, 3) of a caption's two centred lines.
+
+    letters: their size, 1 in a sheet
+    """
     picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
         at = width / 2, letters * middle
@@ -33,7 +36,7 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 
 
 def rounded(low: float, high: float) -> tuple[str, str]:
-    """Return the ends of a span as they are written: to a thousandth of it or finer, 0 in place of -1e-5."""
+    """Return the ends of an interval as text, rounded to a thousandth of its length or finer."""
     span = max(high - low, abs(high) * 1e-12, 1e-300)
     digits = 2 - int(np.floor(np.log10(span)))
     first, last = (np.format_float_positional(round(end, digits) + 0.0, trim="-") for end in (low, high))
@@ -46,7 +49,7 @@ FINE = 3  # a legend is drawn so many times larger, and shrunk
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry: a bar of colours, a swatch, an arrow or a line in front of a text.
+    """A legend entry: a bar of colours, a swatch, an arrow or a line in front of a text.
 
     kind  : "bar", "swatch", "glass", "arrow" or "line"
     width : of what stands in front of the text [px]
@@ -62,7 +65,7 @@ class Entry:
 
 
 def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]:
-    """Return the entries of the legend of what is drawn."""
+    """Return the legend's entries for some stills."""
     scene, colouring, entries = composition.subject.scene, composition.colouring, []
     if colouring is not None and colouring.classes:
         pairs = enumerate(colouring.classes)
@@ -85,7 +88,7 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
 
 
 def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> Array:
-    """Return the entries side by side, in as many lines as they need: (height, width, 3), no lines for none.
+    """Return the picture (height, width, 3) of legend entries side by side, in as many lines as they need.
 
     letters : their size, 1 in a sheet
     """
@@ -108,14 +111,14 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
 
 def _length(entries: Sequence[Entry], font: ImageFont.FreeTypeFont) -> float:
-    """Return how long entries side by side are [px]."""
+    """Return the width of legend entries side by side [px]."""
     texts = [text for entry in entries for text in (entry.text, entry.low, entry.high) if text]
     marks = sum(entry.width for entry in entries) + GAP * (len(entries) - 1)
     return marks + sum(font.getlength(text) / FINE + 8 for text in texts)
 
 
 def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, font: ImageFont.FreeTypeFont) -> None:
-    """Draw an entry from `left` on, around `middle`, in fine pixels."""
+    """Draw a legend entry from `left` on, vertically centred at `middle`, in fine pixels."""
     gap, half = 8 * FINE, 8 * FINE
     if entry.low:
         draw.text((left, middle), entry.low, INK, font, anchor="lm")

@@ -1,4 +1,4 @@
-"""The camera of a picture. It looks without perspective, so all lengths can be compared."""
+"""The orthographic camera of a picture, in which all lengths can be compared."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ YAW, ELEVATION = math.radians(25), math.radians(14)  # how far the eye stands to
 
 @dataclass(frozen=True)
 class Camera:
-    """The axes of a person who stands upright and faces the body, and how far above the horizon the eye is.
+    """The axes of an upright observer who faces the body, and the elevation of the view.
 
     right, away, up : (3,) each, unit vectors
     elevation       : of the eye above that person's horizon [rad]
@@ -36,12 +36,12 @@ class Camera:
         return math.cos(self.elevation) * self.up + math.sin(self.elevation) * self.away
 
     def flat(self, points: Positions) -> Rows:
-        """Return where points (n, 3) are seen, (n, 2): to the right and upwards [m]."""
+        """Return the projection (n, 2) of points (n, 3) to the right and upwards [m]."""
         return points @ np.stack([self.right, self.upward], axis=1)
 
 
 def camera_facing(points: Positions, gravity: Sequence[float] | None, eye: Sequence[float] | None = None) -> Camera:
-    """Return a camera in the direction `eye` (3,) of points (n, 3), of any length; up is against gravity, z without it.
+    """Return a camera in direction `eye` (3,) of points (n, 3); up is against gravity, z without it.
 
     Without eye, or with one straight above or below, the longer horizontal extent lies across the picture.
     """
@@ -59,7 +59,7 @@ def camera_facing(points: Positions, gravity: Sequence[float] | None, eye: Seque
 
 
 def _across(points: Positions, up: Floats) -> tuple[Floats, Floats]:
-    """Return right and away: right is the horizontal axis along which the points reach farther."""
+    """Return the axes right and away; right is the horizontal axis of the larger extent."""
     axes = np.delete(np.eye(3), np.argmax(abs(up)), axis=0)
     axes = np.array([unit(axis - (axis @ up) * up) for axis in axes])
     right = axes[np.argmax(np.ptp(points @ axes.T, axis=0))]
@@ -67,7 +67,7 @@ def _across(points: Positions, up: Floats) -> tuple[Floats, Floats]:
 
 
 def unit(vector: ArrayLike) -> Floats:
-    """Return the vector (3,) at length 1."""
+    """Return a vector (3,) normalised to length 1."""
     given: Floats = np.asarray(vector, float)
     scaled: Floats = given / np.abs(given).max()  # squares of very large or small components leave the range
     return np.divide(scaled, np.linalg.norm(scaled))

@@ -1,4 +1,4 @@
-"""The colours of what is drawn: fixed ones, and fields of numbers on the surface in a scale."""
+"""Colours of pictures: fixed colours, and fields on the surface in a colour scale."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -39,14 +39,14 @@ def rgb(colour: str) -> Floats:
 
 
 def on_scale(shares: Floats) -> Rows:
-    """Return the colours (n, 3), 0 to 255, of shares (n,) of the scale's end; what is beyond it has that of the end."""
+    """Return the colours (n, 3), 0 to 255, of shares (n,) of the scale; shares beyond an end get its colour."""
     stops = np.array([rgb(colour) for colour in SCALE])
     at = np.linspace(0, 1, len(stops))
     return np.stack([np.interp(np.nan_to_num(shares), at, channel) for channel in stops.T], axis=1)
 
 
 def of_classes(numbers: Array) -> Rows:
-    """Return the colours (n, 3), 0 to 255, of the numbers (n,) of classes."""
+    """Return the colours (n, 3), 0 to 255, of class numbers (n,)."""
     return np.take([rgb(colour) for colour in CLASSES], numbers.astype(int) % len(CLASSES), axis=0)
 
 
@@ -59,7 +59,7 @@ LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}  # of pascals alone: a body is some 2000 
 
 @dataclass(frozen=True)
 class Colouring:
-    """A field on the surface points.
+    """A scalar field on the surface points, with its colour scale.
 
     title   : what it is
     unit    : "m", "Pa", "%"; "" where the numbers are those of classes
@@ -93,7 +93,10 @@ class Colouring:
 
 
 def colouring_of(subject: Drawable, name: str, reference: Result | None = None) -> Colouring:
-    """Return a field by its name; `reference` is the result that an error is counted from. Raises InputError."""
+    """Return a field by name. Raises InputError.
+
+    reference : the result that an error is counted from
+    """
     if name not in COLOURINGS:
         near = did_you_mean(name, COLOURINGS)
         raise InputError(f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}")
@@ -103,13 +106,13 @@ def colouring_of(subject: Drawable, name: str, reference: Result | None = None) 
 
 
 def _displacement(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the distance from the point's place at rest."""
+    """Return the field of distances from the points at rest."""
     rest = subject.rest.points
     return Colouring("displacement", "m", lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1))
 
 
 def _speed(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the way between the frames before and after, over the time between them."""
+    """Return the field of mean speeds between the frames before and after."""
     last = len(subject.times) - 1
 
     def values(index: int) -> Floats:
@@ -123,7 +126,7 @@ def _speed(subject: Drawable, _: Result | None) -> Colouring:
 
 
 def _strain(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the springs' change of length over their rest length, its root mean square around a node."""
+    """Return the field of the springs' relative change of length, root mean square around a node."""
     springs, rest_length = subject.array("lattice/springs"), subject.array("lattice/rest_length")
     count = np.maximum(1, np.bincount(springs.ravel(), minlength=len(subject.rest.nodes)))
 
@@ -137,7 +140,7 @@ def _strain(subject: Drawable, _: Result | None) -> Colouring:
 
 
 def _stress(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by von Mises' stress, the mean of the cells around a node carried by the embedding."""
+    """Return the field of von Mises' stress at the nodes, carried by the embedding."""
     von_mises = subject.von_mises
     if von_mises is None:
         if subject.scene.material.poisson is None:
@@ -147,7 +150,7 @@ def _stress(subject: Drawable, _: Result | None) -> Colouring:
 
 
 def _error(subject: Drawable, reference: Result | None) -> Colouring:
-    """Colour by the distance from the same point of another result at the same time."""
+    """Return the field of distances from another result at the same time."""
     assert reference is not None  # as colouring_of sees to
     times = reference.frames.time[:]
     match = dict(common_times(subject.times, times))
@@ -163,7 +166,7 @@ def _error(subject: Drawable, reference: Result | None) -> Colouring:
 
 
 def _part(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the last of the scene's parts that the nearest cell belongs to."""
+    """Return the field of the scene's part to which the nearest cell belongs last."""
     rest, parts = subject.rest, list(subject.scene.tables("part"))
     if not parts:
         raise InputError(f"--colour part: the scene of {subject.name} has no part")
@@ -175,7 +178,7 @@ def _part(subject: Drawable, _: Result | None) -> Colouring:
 
 
 def plain_colouring(subject: Drawable) -> Colouring | None:
-    """Return colours of bodies that no field colours: each its own; None of one alone."""
+    """Return a colour for each body, or None for a single body."""
     number = (subject.rest.body_of_point % len(CLASSES)).astype(float)
     return Colouring("body", "", lambda _: number, 1.0, ("",) * len(CLASSES)) if number.any() else None
 
@@ -192,7 +195,7 @@ COLOURINGS: dict[str, Callable[[Drawable, Result | None], Colouring]] = {
 
 @contextmanager
 def opened_reference(path: Path | None, run: Result) -> Iterator[Result | None]:
-    """Open the result that errors are counted from, if there is one. Raises InputError where its mesh is another."""
+    """Open the reference result of errors, if any. Raises InputError where its mesh is another."""
     if path is None:
         yield None
         return
@@ -202,5 +205,5 @@ def opened_reference(path: Path | None, run: Result) -> Iterator[Result | None]:
 
 
 def scaled(colouring: Colouring, frames: Iterable[int]) -> Colouring:
-    """Return the colouring with a scale that ends at the greatest value of these frames."""
+    """Return a field whose colour scale ends at the greatest value in these frames."""
     return replace(colouring, high=max(float(colouring.values(index).max(initial=0)) for index in frames))

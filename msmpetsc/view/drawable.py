@@ -1,4 +1,4 @@
-"""What is drawn: a body at its times, of a result, or of a scene that was not run yet."""
+"""Bodies to be drawn: of a result in time, or of a scene before its first step."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ FARTHEST = 1e15  # [m]: what is drawn has single precision, and its squares must
 
 @dataclass(frozen=True)
 class BodiesAtRest:
-    """The bodies at rest: nodes (n, 3) [m], cells (c, 8) of them, surface points (v, 3) [m].
+    """Bodies at rest: nodes (n, 3) [m], cells (c, 8) and surface points (v, 3) [m].
 
     body_of_node, body_of_point : numbers (n,), (v,) of their bodies
     """
@@ -46,7 +46,7 @@ class BodiesAtRest:
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
     def find(self, table: OfBody) -> Mask:
-        """Tell which nodes (n,) a table's region means; none if it is painted in a file."""
+        """Return which nodes (n,) lie in a table's region; none if it is painted in a file."""
         region = table.table.region
         if region.painted is not None:
             return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
@@ -59,14 +59,14 @@ class BodiesAtRest:
         return np.asarray(self.nodes[self.cells].mean(axis=1))
 
     def find_cells(self, table: OfBody) -> Mask:
-        """Tell which cells (c,) the region of a table means, by their centres; none if it is painted in a file."""
+        """Return which cells (c,) have their centres in a table's region; none if it is painted in a file."""
         region = table.table.region
         if region.painted is not None:
             return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
         return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
 
     def _painted_cells(self, table: OfBody) -> Indices:
-        """Return the numbers of the cells of the table's body around its painted points."""
+        """Return the numbers of the cells of a table's body around its painted points."""
         painted, number = table.table.region.painted, table.body or 0
         if not isinstance(painted, tuple):  # listed in a file, which the result does not hold
             return np.empty(0, int)
@@ -74,7 +74,7 @@ class BodiesAtRest:
         return self.cells_around(points, np.full(len(points), number))
 
     def cells_around(self, points: Positions, body: Indices) -> Indices:
-        """Return the numbers (k,) of the cells of bodies (k,) that points (k, 3) lie in."""
+        """Return the numbers (k,) of the cells that contain points (k, 3) of bodies (k,)."""
         of_cell, around = self.body_of_node[self.cells[:, 0]], np.empty(len(points), int)
         for number in np.unique(body):
             own, inside = np.flatnonzero(of_cell == number), body == number
@@ -84,7 +84,7 @@ class BodiesAtRest:
 
 @dataclass(frozen=True)
 class Drawable:
-    """A body and the scene that says what stands beside it.
+    """Bodies in time, and the scene with their obstacles and forces.
 
     name      : of its file, for messages
     pinned    : (n,) which nodes are
@@ -120,16 +120,16 @@ class Drawable:
 
     @property
     def gravity(self) -> tuple[float, ...] | None:
-        """The scene's acceleration (3,) [m/s^2], which says what is up."""
+        """Acceleration of gravity (3,) [m/s^2], or None."""
         return self.scene.gravity.acceleration if self.scene.gravity else None
 
     @property
     def eye(self) -> tuple[float, ...] | None:
-        """Direction (3,) of the scene's picture, from the body to the eye."""
+        """Direction (3,) from the body to the eye in the scene's picture."""
         return self.scene.picture.eye
 
     def fixed(self, index: int) -> Floats:
-        """Return how far each surface point is pinned or led at a frame, (v,) in [0, 1]."""
+        """Return the pinned or led share (v,) in [0, 1] of each surface point at a frame."""
         fixed = self.pinned.copy()
         for anchor in self.scene.tables("anchor"):
             if within(float(self.times[index]), 0.0, anchor.table.stop):
@@ -137,14 +137,14 @@ class Drawable:
         return self.on_surface(fixed.astype(float), 1.0)
 
     def on_surface(self, numbers: Floats, most: float = np.inf) -> Floats:
-        """Return what numbers (n,) of the nodes are at the surface points, (v,) in [0, most]."""
+        """Return numbers (n,) of the nodes interpolated to the surface points, (v,) in [0, most]."""
         if not numbers.any():
             return np.zeros(len(self.rest.points))
         return np.asarray(np.clip(self.embedding @ numbers, 0, most))
 
 
 def drawable_of_result(run: Result) -> Drawable:
-    """Return what a result shows. Raises InputError where it cannot be drawn."""
+    """Return the bodies of a result. Raises InputError where they cannot be drawn."""
     scene = read_scene(run)
     if "embedding/weights" not in run:
         raise InputError(f"{run.path} has no surface to draw: its scene says output.surface = false")
@@ -173,7 +173,7 @@ def drawable_of_result(run: Result) -> Drawable:
 
 
 def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
-    """Return what a scene is before its first step, from the model that one process built of it."""
+    """Return the bodies of a scene before its first step, from a model on one process."""
     lattice, surface, embedding, owned = model.lattice, model.surface, model.embedding, model.lattice.owned
     if surface is None or embedding is None:
         raise InputError(f"{path} has no surface to draw: it says output.surface = false")
@@ -201,7 +201,7 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
 
 
 def solids_of(run: Result) -> dict[int, Surface]:
-    """Return surfaces of obstacles that a result holds. Raises InputError for damaged ones."""
+    """Return the obstacle surfaces stored in a result. Raises InputError for damaged ones."""
     if "obstacle/points" not in run:
         return {}
     points, triangles, numbers = run["obstacle/points"][:], run.indices("obstacle/triangles"), run["obstacle/number"][:]
@@ -211,7 +211,7 @@ def solids_of(run: Result) -> dict[int, Surface]:
 
 
 def read_scene(run: Result) -> SceneFile:
-    """Return the scene of a result, as run, with its keys checked."""
+    """Return the scene of a result with its keys checked. Raises InputError."""
     try:
         return SceneFile.model_validate(run.scene)
     except (InputError, ValueError, TypeError, AttributeError, RecursionError) as error:  # pydantic's among them

@@ -1,4 +1,4 @@
-"""Films: the frames of a result one after the other, for 3 to 8 s, and how fast they go."""
+"""Films of a result: its frames as MP4, GIF or WebP, and the speed at which they play."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
@@ -31,7 +31,7 @@ STEPS = (1, 2, 5)  # times powers of ten: how much slower or faster
 
 @dataclass(frozen=True)
 class Playback:
-    """How fast a film goes.
+    """The frames and the speed at which a film plays.
 
     numbers : which of the frames each picture shows
     fps     : pictures a second
@@ -44,7 +44,7 @@ class Playback:
 
     @property
     def words(self) -> str:
-        """How fast time goes: "10 times slower than real"; "" where it goes as it does."""
+        """Speed in words: "10 times slower than real"; "" in real time."""
         if self.speed in (0.0, 1.0):
             return ""
         if self.speed < 1:
@@ -53,7 +53,7 @@ class Playback:
 
 
 def usual_speed(span: float) -> float:
-    """Return the simulated seconds a second at which a span [s] takes 3 to 8 s: 1, or what is round and nearest."""
+    """Return the round simulated seconds a second at which a time span [s] takes 3 to 8 s."""
     if not 0 < span < np.inf:
         return 1.0
     factors = np.outer(10.0 ** np.arange(20), STEPS).ravel()
@@ -91,7 +91,7 @@ def write_film(
     playback: Playback,
     reference: Result | None = None,
 ) -> None:
-    """Write a film of these frames at a playback. Raises InputError where it cannot be drawn or written."""
+    """Write a film of some frames. Raises InputError where it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
     composition = composition_of(drawn(subject), played, style, reference)
     stills = composition.stills(played, playback.words)
@@ -107,7 +107,7 @@ def write_film(
 
 
 def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[Array]:
-    """Yield the picture (height, width, 3) of each still; of equal ones in a row the first is drawn only."""
+    """Yield the picture (height, width, 3) of each still; equal ones in a row are drawn once."""
     width, height = size
     letters = min(1.0, max(height / USUAL, SMALLEST))
     entries = entries_of(composition, stills)
@@ -126,7 +126,7 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
 
 
 def write_pictures(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
-    """Write pictures (height, width, 3) as a film, named when it is whole. Raises InputError."""
+    """Write pictures (height, width, 3) as a film. Raises InputError."""
     with whole_file(path) as part:
         if path.suffix.lower() == ".mp4":
             _write_video(part, pictures, size, fps)
@@ -135,7 +135,7 @@ def write_pictures(path: Path, pictures: Iterable[Array], size: tuple[int, int],
 
 
 def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
-    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError for a film that is not whole.
+    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError for an incomplete film.
 
     That is asked of the film itself, for imageio-ffmpeg does not ask how ffmpeg ended.
     """
@@ -157,7 +157,7 @@ def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], f
 
 
 def _write_images(path: Path, pictures: Iterable[Array], fps: float) -> None:
-    """Write a GIF or an animated WebP, for ever over; Pillow takes the pictures together."""
+    """Write an endless GIF or animated WebP by Pillow, which takes all pictures at once."""
     images = [Image.fromarray(picture) for picture in pictures]
     options: dict[str, Any] = dict(quality=80, method=4)
     if path.suffix.lower() == ".gif":

@@ -1,4 +1,4 @@
-"""The meshes that are drawn: the surface, and cells and springs of the half of the lattice behind its middle.
+"""Meshes to be drawn: the surface, and cells and springs of the half of the lattice behind its middle.
 
 Triangles of the surface that are larger than cells follow the cells that carry them, and sharp edges are sharp. Drawn
 points are those of the file, in their order, then those put into long edges, then copies along sharp edges.
@@ -24,12 +24,12 @@ CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1
 
 
 def drawn(subject: Drawable) -> Drawable:
-    """Return the subject with its surface as it is drawn."""
+    """Return bodies with their surface refined and split for drawing."""
     return _split(_refined(subject))
 
 
 def _refined(subject: Drawable) -> Drawable:
-    """Return the subject with no edge of its surface longer than a cell, new points carried by the cells."""
+    """Return bodies with no edge of their surface longer than a cell; cells carry the new points."""
     rest, W = subject.rest, subject.embedding
     cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
     if cell == 0:
@@ -52,14 +52,17 @@ def _refined(subject: Drawable) -> Drawable:
 
 
 def surface_of(points: Array, triangles: Array) -> pv.PolyData:
-    """Return a surface as VTK has it."""
+    """Return points (v, 3) and triangles (f, 3) as VTK's data set."""
     surface: pv.PolyData = pv.PolyData.from_regular_faces(points, triangles)
     return surface
 
 
 def subdivided(points: Positions, triangles: Indices, longest: float) -> tuple[Positions, Indices, csr_array]:
-    """Return a surface whose edges longer than `longest` [m] are divided: points (p, 3), of which the first are those
-    given, triangles (f, 3), and the matrix (p, v) that carries numbers at the given points to these."""
+    """Return a surface whose edges longer than `longest` [m] are divided.
+
+    It is points (p, 3), the first of which are those given, triangles (f, 3), and the matrix (p, v)
+    that carries numbers at the given points to these.
+    """
     surface = surface_of(points, triangles)
     surface.cell_data["triangle"] = np.arange(len(triangles))
     fine = surface.subdivide_adaptive(max_edge_len=longest)
@@ -76,7 +79,7 @@ def subdivided(points: Positions, triangles: Indices, longest: float) -> tuple[P
 
 
 def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array:
-    """Return the matrix (p, n) that carries points (p, 3) of bodies (p,) by the corners of the cells around them."""
+    """Return the matrix (p, n) of trilinear weights of nodes at points (p, 3) of bodies (p,)."""
     corners = rest.cells[rest.cells_around(points, body)]
     low, high = rest.nodes[corners[:, 0]], rest.nodes[corners[:, 6]]
     u = np.clip((points - low) / (high - low), 0, 1)[:, None]
@@ -86,7 +89,7 @@ def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array
 
 
 def _split(subject: Drawable) -> Drawable:
-    """Return the subject with a copy of each point for every smooth piece of surface there."""
+    """Return bodies with a copy of each surface point for every smooth part of the surface around it."""
     rest, W = subject.rest, subject.embedding
     _, first, equal = np.unique(
         np.column_stack([rest.body_of_point, rest.points]), axis=0, return_index=True, return_inverse=True
@@ -104,7 +107,7 @@ def _split(subject: Drawable) -> Drawable:
 
 
 def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indices]:
-    """Return the points that drawn points are copies of, (d,), the first v themselves, and triangles (f, 3) of them.
+    """Return the original (d,) of each drawn point, the first v themselves, and triangles (f, 3).
 
     Two corners of triangles at one point stay one drawn point where no sharp edge parts them.
     """
@@ -123,7 +126,7 @@ KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "
 
 @dataclass(frozen=True)
 class Cut:
-    """What is left of the lattice when the half before its middle is taken away.
+    """The half of the lattice that remains when the half before its middle is cut away.
 
     cells   : (c, 8) by their kind
     springs : (s, 2), both ends of which lie behind

@@ -1,4 +1,4 @@
-"""A page for any browser, all in one file: the body turns with the mouse, its frames play under a slider.
+"""A web page of a result in one file: the body turns with the mouse, its frames play under a slider.
 
 page.html is its frame, page.css its look, page*.js draws and steers it; this file says what is drawn. Positions are
 whole numbers of 16 bits over the box around all frames. Frame by frame they are what is left of a prediction that goes
@@ -42,7 +42,7 @@ SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js", "page_begin.js")
 def write_page(
     subject: Drawable, path: Path, frames: Sequence[int], style: Style, reference: Result | None = None
 ) -> None:
-    """Write the page of these frames; of fewer, evenly chosen, where it would be larger than `MOST`.
+    """Write the page of these frames, or of fewer if it would be larger than `MOST`.
 
     Raises InputError where they cannot be drawn or the page not be written.
     """
@@ -66,7 +66,7 @@ def write_page(
 
 
 def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, bytes]:
-    """Return positions, colours and triangles as deflated bytes for the script to read."""
+    """Return positions, colours and triangles as deflated bytes for the script."""
     subject = composition.subject
     bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     streams = {
@@ -86,7 +86,7 @@ def quantised(points: Callable[[int], Positions], frames: Iterable[int], box: Po
 
 
 def residuals(frames: Iterable[Indices]) -> Iterator[bytes]:
-    """Yield each frame less its prediction 2 p - q from the frames p, q before: all low bytes, then all high ones.
+    """Yield each frame less its linear extrapolation 2 p - q from the frames p, q before, low bytes first.
 
     A residual r is stored as 2 r, or -2 r - 1 where it is negative, so that small ones have no high byte.
     """
@@ -107,7 +107,7 @@ def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[Array]:
 
 
 def changes(frames: Iterable[Array]) -> Iterator[bytes]:
-    """Yield what each frame of numbers (v,) of 8 bits changes of the one before it."""
+    """Yield the differences (v,) of 8 bits between each frame and the one before it."""
     before = None
     for frame in frames:
         yield (frame if before is None else frame - before).tobytes()
@@ -115,13 +115,13 @@ def changes(frames: Iterable[Array]) -> Iterator[bytes]:
 
 
 def deflated(parts: Iterable[bytes]) -> bytes:
-    """Return the parts, one after the other, deflated."""
+    """Return consecutive parts as one deflated stream."""
     packer = zlib.compressobj(6)
     return b"".join([*map(packer.compress, parts), packer.flush()])
 
 
 def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, Any]:
-    """Return what the script must know beside the streams, in types of JSON."""
+    """Return the script's data but the streams, in types of JSON."""
     subject, frames = composition.subject, [still.index for still in stills]
     return {
         "title": subject.title,
@@ -145,7 +145,7 @@ def plain(facts: Any) -> Any:
 
 
 def scale_colours(colouring: Colouring | None) -> list[list[int]]:
-    """Return the 256 colours of the numbers of 8 bits that stand for the colours of points."""
+    """Return the 256 colours that numbers of 8 bits stand for."""
     numbers = np.arange(256)
     if colouring is None:
         table = np.tile(colours.rgb(colours.BODY), (256, 1))
@@ -156,14 +156,14 @@ def scale_colours(colouring: Colouring | None) -> list[list[int]]:
 
 
 def distinct(overlays: Sequence[Overlays]) -> dict[str, list[Any]]:
-    """Return what stands beside the body, each different state once, and the number of its state for each frame."""
+    """Return each distinct state of obstacles and arrows once, and the state's number of each frame."""
     states: dict[str, int] = {}
     numbers = [states.setdefault(json.dumps(plain(shown)), len(states)) for shown in overlays]
     return {"states": [json.loads(state) for state in states], "numbers": numbers}
 
 
 def solid_facts(surface: Surface) -> dict[str, list[float]]:
-    """Return an obstacle's surface as the script draws it: each triangle's corners, and its normal at each."""
+    """Return an obstacle's surface for the script: corners of each triangle, with a normal at each."""
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), TINY)[:, None]
@@ -175,7 +175,7 @@ def solid_facts(surface: Surface) -> dict[str, list[float]]:
 
 
 def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> str:
-    """Return the text of the page, with nothing left to load."""
+    """Return the text of the page, which loads no other file."""
     data = facts | {"streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}}
     parts = {
         "title": html.escape(title),

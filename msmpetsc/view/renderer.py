@@ -1,4 +1,4 @@
-"""Bodies and what stands beside them, drawn by VTK: one window off screen, one camera without perspective."""
+"""Rendering of bodies, obstacles and arrows by VTK, off screen, with one orthographic camera."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -25,13 +25,13 @@ LABEL_GAP = 8  # [px] between an edge and what is written at it
 
 
 class Renderer:
-    """A window off screen in which stills are drawn, one after the other. Used as a context, which closes it.
+    """An off-screen window in which stills are drawn; a context, which closes it.
 
     scale : [px/m]
     """
 
     def __init__(self, composition: Composition, stills: Sequence[Still], size: tuple[int, int]):
-        """Open a window of width and height [px] in which there is room for all stills."""
+        """Open a window of width and height [px] that has room for all stills."""
         self._composition, self._size = composition, np.array(size)
         low, high, self._depth = composition.room(stills)  # nothing reaches farther towards the eye
         self._centre = (low + high) / 2  # across the picture and upward [m]
@@ -69,7 +69,7 @@ class Renderer:
         return self._with_extents(picture) if has_axes else picture
 
     def _face(self) -> None:
-        """Look through the camera, without perspective."""
+        """Set the orthographic camera."""
         camera = self._composition.camera
         view, far = self._plotter.camera, 4 * self._depth
         across, upward = self._centre
@@ -81,7 +81,7 @@ class Renderer:
         view.clipping_range = (far / 100, 2 * far)
 
     def _with_extents(self, picture: Array) -> Array:
-        """Return the picture with the coordinates that the box spans, each at the outermost edge along its axis."""
+        """Return the picture with the coordinates of the box written at its outermost edges."""
         box, drawn = self._composition.box, Image.fromarray(picture)
         corners = (self._composition.camera.flat(corners_of(box)) - self._centre) * [
             1,
@@ -101,7 +101,7 @@ class Renderer:
         return np.array(drawn)
 
     def _draw(self, still: Still) -> None:
-        """Draw the body and what stands beside it."""
+        """Draw the bodies, obstacles and arrows of a still."""
         subject, colouring = self._composition.subject, self._composition.colouring
         surface = surface_of(subject.surface(still.index), subject.triangles)
         for ground in still.overlays.grounds:
@@ -145,7 +145,7 @@ def _faces(surface: pv.PolyData, chosen: Mask) -> pv.PolyData:
 
 
 def _hexahedron(corners: Positions) -> pv.StructuredGrid:
-    """Return the body of corners (8, 3) numbered 4i + 2j + k."""
+    """Return a hexahedron of corners (8, 3) numbered 4i + 2j + k."""
     grid = pv.StructuredGrid()
     grid.points, grid.dimensions = corners, (2, 2, 2)
     return grid
@@ -161,7 +161,7 @@ def _draw_lattice(plotter: pv.Plotter, cut: Cut, nodes: Positions) -> None:
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None:
-    """Draw a disk that fades towards its rim, and the body's shadow on it, which shows how high the body is."""
+    """Draw a disk that fades towards its rim, and the body's shadow on it."""
     middle = ground.corners.mean(axis=0)
     radius = float(np.linalg.norm(ground.corners[1] - ground.corners[0])) / 2
     disk = pv.Disc(center=middle, inner=0, outer=radius, normal=ground.normal.tolist(), r_res=20, c_res=AROUND)
@@ -185,7 +185,7 @@ def _draw_arrow(plotter: pv.Plotter, tail: Floats, along: Floats) -> None:
 
 @contextmanager
 def quiet_opengl() -> Iterator[None]:
-    """Keep what the graphics libraries say on their own off the terminal; InputError if there is no OpenGL."""
+    """Keep messages of the graphics libraries off the terminal. Raises InputError without OpenGL."""
     terminal = os.dup(2)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 2)

@@ -153,7 +153,7 @@ MESHES: dict[str, tuple[Mesh, ...]] = {".vtu": ("lattice", "surface")}  # of whi
 def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Frames | None = None) -> Path:
     """Write frames of a result in the format of the path's ending, and return the path.
 
-    mesh   : "surface" or "lattice"; what the format holds, and the result has, if None
+    mesh   : "surface" or "lattice"; the first that the format holds if None
     frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
 
     Raises InputError.
@@ -164,21 +164,18 @@ def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frame
         raise InputError(f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}")
     with Result(result) as run:
         numbers = _frames(run, path, write is not write_one_frame, frames)
-        moments = Moments(run, _mesh(run, path, mesh), numbers)
+        moments = Moments(run, _mesh(path, mesh), numbers)
         with whole_file(path) as part:
             write(moments, part)
     return path
 
 
-def _mesh(run: Result, path: Path, mesh: Mesh | None) -> Mesh:
+def _mesh(path: Path, mesh: Mesh | None) -> Mesh:
     """Return the mesh to export. Raises InputError if the format does not hold it."""
     meshes = MESHES.get(path.suffix.lower(), ("surface",))
-    if mesh is None:
-        has_surface = "surface/points" in run
-        return next((m for m in meshes if m == "lattice" or has_surface), meshes[0])
-    if mesh not in meshes:
+    if mesh is not None and mesh not in meshes:
         raise InputError(f"{path}: a *{path.suffix} holds no {mesh}, but the {' or the '.join(meshes)}")
-    return mesh
+    return mesh or meshes[0]
 
 
 def _frames(run: Result, path: Path, moves: bool, frames: Frames | None) -> list[int]:

@@ -24,10 +24,6 @@ class Lines:
         if text.strip():
             print(text.strip(), file=sys.stderr)
 
-    def flush(self) -> None:
-        """Flush standard error."""
-        sys.stderr.flush()
-
 
 class Progress:
     """The progress of a run of `total` steps, shown frame by frame; enabled on rank 0 alone.

@@ -24,10 +24,7 @@ def typeface(size: int) -> ImageFont.FreeTypeFont:
 
 
 def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
-    """Return the picture (height, width, 3) of a caption's two centred lines.
-
-    letters: their size, 1 in a sheet
-    """
+    """Return the picture (height, width, 3) of two centred lines; letters: their size, 1 in a sheet."""
     picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
         at = width / 2, letters * middle
@@ -66,7 +63,8 @@ class Entry:
 
 def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]:
     """Return the legend's entries for some stills."""
-    scene, colouring, entries = composition.subject.scene, composition.colouring, []
+    scene, colouring = composition.subject.scene, composition.colouring
+    entries: list[Entry] = []
     if colouring is not None and colouring.classes:
         pairs = enumerate(colouring.classes)
         entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
@@ -77,7 +75,7 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
     if any(still.cut and len(still.cut.springs) for still in stills):
         entries.append(Entry("line", "spring", SPRING))
-    if composition.fixed:
+    if any(composition.subject.fixed(still.index).any() for still in (stills[0], stills[-1])):
         held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
     if any(still.overlays.arrows for still in stills):

@@ -54,7 +54,6 @@ class Composition:
     extremes  : (e, 3) points that reach farthest in some direction at some frame [m]
     camera    : of all stills
     colouring : with its scale; None for a plain body
-    fixed     : whether any of the surface is ever pinned or led
     """
 
     subject: Drawable
@@ -62,7 +61,6 @@ class Composition:
     extremes: Positions
     camera: Camera
     colouring: Colouring | None
-    fixed: bool
 
     @property
     def box(self) -> Positions:
@@ -131,5 +129,4 @@ def composition_of(
     if colouring is not None and style.colour:
         colouring = scaled(colouring, distinct)
     camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
-    fixed = any(subject.fixed(index).any() for index in (distinct[0], distinct[-1]))
-    return Composition(subject, style, everywhere, camera, colouring, fixed)
+    return Composition(subject, style, everywhere, camera, colouring)

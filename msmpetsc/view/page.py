@@ -36,7 +36,7 @@ MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
 TINY = 1e-300
 PARTS = files("msmpetsc.view")
-SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js", "page_begin.js")
+SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js")
 
 
 def write_page(
@@ -135,7 +135,6 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
         "legend": [vars(entry) for entry in entries_of(composition, stills)],
         "overlays": distinct([still.overlays for still in stills]),
         "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
-        "axes": composition.style.axes,
     }
 
 

@@ -1,4 +1,4 @@
-// Drawing with WebGL: the body, its ground and shadow, glass, arrows and axes.
+// Drawing with WebGL: the body, its ground and shadow, glass and arrows.
 
 const LIGHT = `
 float light(vec3 n) {
@@ -133,7 +133,7 @@ function cameraMatrix(eye) {
   const scale = perMetre(), x = 2 * scale / canvas.clientWidth, y = 2 * scale / canvas.clientHeight;
   const depth = 1 / (8 * reach), rows = [scaled(eye.across, x), scaled(eye.upward, y), scaled(eye.toEye, -depth)];
   const shift = rows.map((row, k) => -dot(row, middle) + [x * view.right, y * view.up, 0][k]);
-  return { matrix: new Float32Array([0, 1, 2].flatMap((k) => [rows[0][k], rows[1][k], rows[2][k], 0]).concat(shift, 1)), rows, shift };
+  return new Float32Array([0, 1, 2].flatMap((k) => [rows[0][k], rows[1][k], rows[2][k], 0]).concat(shift, 1));
 }
 
 function use(used, camera, low, extent) {
@@ -248,27 +248,6 @@ function drawArrow(camera, [tail, tip], eye) { // flat, as wide seen from every 
 
 const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [n >> 2 & 1, n >> 1 & 1, n & 1].map((bit, k) => box[bit][k]));
 
-function drawAxes(camera, rows, shift) {
-  byId("labels").replaceChildren();
-  if (!data.axes) return;
-  drawFlat(camera, CORNERS, gl.LINES, [...colour(dark.matches ? "#98a1ab" : "#6b737d"), 1], EDGES);
-  const seen = (point) => [0, 1].map((k) => (dot(rows[k], point) + shift[k]) * [canvas.clientWidth, canvas.clientHeight][k] / 2);
-  const centre = seen(middle);
-  [2, 1, 0].forEach((axis, number) => { // four edges along each: the label is at the outermost
-    const ends = [0, 1, 2, 3].map((k) => EDGES.slice(8 * number + 2 * k, 8 * number + 2 * k + 2));
-    const ways = ends.map(([a, b]) => sum(seen(scaled(sum(CORNERS[a], CORNERS[b]), 0.5)), centre, -1));
-    const way = ways.reduce((a, b) => Math.hypot(...b) > Math.hypot(...a) + 1e-6 ? b : a);
-    const span = Math.max(box[1][axis] - box[0][axis], 1e-12 * Math.abs(box[1][axis]), 1e-300);
-    const [low, high] = box.map((end) => +end[axis].toFixed(Math.min(100, Math.max(0, 2 - Math.floor(Math.log10(span))))) + 0);
-    const label = document.createElement("span"), [x, y] = sum(sum(centre, way), unit(way), 14);
-    label.textContent = `${"xyz"[axis]}: ${low} to ${high} m`;
-    label.style.left = `${canvas.clientWidth / 2 + x}px`;
-    label.style.top = `${canvas.clientHeight / 2 - y}px`;
-    label.style.transform = `translate(${Math.abs(unit(way)[0]) < 0.3 ? -50 : way[0] > 0 ? 0 : -100}%, -50%)`;
-    byId("labels").append(label);
-  });
-}
-
 function draw() {
   const density = Math.min(window.devicePixelRatio || 1, 2);
   canvas.width = Math.max(1, Math.round(canvas.clientWidth * density));
@@ -277,12 +256,11 @@ function draw() {
   gl.clearColor(0, 0, 0, 0);
   gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   loadFrame();
-  const eye = axesOfEye(), { matrix, rows, shift } = cameraMatrix(eye);
+  const eye = axesOfEye(), matrix = cameraMatrix(eye);
   const state = data.overlays.states[data.overlays.numbers[view.frame]];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
   for (const mesh of state.meshes) drawMesh(matrix, eye, mesh);
   drawBody(matrix, eye);
-  drawAxes(matrix, rows, shift);
   for (const corners of state.glass) drawGlass(matrix, corners);
   for (const ball of state.balls) drawBall(matrix, ball, eye);
   gl.clear(gl.DEPTH_BUFFER_BIT); // arrows are in front of all

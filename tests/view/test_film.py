@@ -131,6 +131,7 @@ def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
         (["-o", "x.mp4", "--speed", "nan"], "--speed must be above 0"),
         (["-o", "x.mp4", "--count", "3"], r"--count is for \*.png"),
         (["-o", "x.html", "--size", "100x100"], r"--size is for \*.png"),
+        (["-o", "x.html", "--axes"], r"--axes is for \*.png"),
         (["-o", "x.html", "--show", "cells"], r"--show is for \*.png"),
         (["-o", "x.gif", "--size", "64x64", "--colour", "speed"], "too small for caption and legend"),
     ],

@@ -28,6 +28,7 @@ ONLY = {  # options by the endings of what they are for
     "fps": MOVIE_NAMES,
     "speed": MOVIE_NAMES,
     "show": (*PICTURE_NAMES, *MOVIE_NAMES),
+    "axes": (*PICTURE_NAMES, *MOVIE_NAMES),
 }
 FASTEST = {"fps": 240, "speed": 1e6}
 

@@ -134,7 +134,6 @@ RENDER = (
     ),
     switch("--axes", "draw a box around the body, with lengths"),
     argument("--show", metavar="cells,springs", help="cut the body open: boundary cells red, interior ones blue"),
-    argument("--fps", type=float, metavar="N", help="pictures a second; alone: every frame is one picture"),
     argument("--speed", type=float, metavar="S", help="simulated seconds a second (1, which is real time)"),
     SET,
 )  # fmt: skip

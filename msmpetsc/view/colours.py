@@ -53,8 +53,7 @@ def of_classes(numbers: Array) -> Rows:
 # Fields on the surface
 
 
-PREFIXES = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
-LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}  # of pascals alone: a body is some 2000 m long
+PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
 
 @dataclass(frozen=True)
@@ -87,9 +86,8 @@ class Colouring:
         """Both ends of the scale, in the unit that the title names: ("0", "displacement [mm]", "12.5")."""
         if self.unit == "%":
             return "0", f"{self.title} [%]", f"{100 * self.high:.3g}"
-        prefixes = LARGE | PREFIXES if self.unit == "Pa" else PREFIXES
-        size = next((size for size in prefixes if self.high >= size), 1.0)
-        return "0", f"{self.title} [{prefixes[size]}{self.unit}]", f"{self.high / size:.3g}"
+        size = next((size for size in PREFIXES if self.high >= size), 1.0)
+        return "0", f"{self.title} [{PREFIXES[size]}{self.unit}]", f"{self.high / size:.3g}"
 
 
 def colouring_of(subject: Drawable, name: str, reference: Result | None = None) -> Colouring:

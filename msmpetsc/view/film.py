@@ -24,7 +24,7 @@ from msmpetsc.view.renderer import Renderer
 LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
 USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
 QUALITY = 8  # of 10, as imageio-ffmpeg counts
-FASTEST = 30.0  # pictures a second, where nothing is said
+FASTEST = 30.0  # pictures a second
 LENGTHS = 3.0, 8.0  # [s] that a film lasts, where nothing is said
 STEPS = (1, 2, 5)  # times powers of ten: how much slower or faster
 
@@ -63,22 +63,18 @@ def usual_speed(span: float) -> float:
     return float(factors[np.argmax(span / factors <= most)])
 
 
-def playback_of(times: Floats, fps: float | None = None, speed: float | None = None) -> Playback:
-    """Return the playback of frames at these times (k,) [s].
+def playback_of(times: Floats, speed: float | None = None) -> Playback:
+    """Return the playback of frames at these times (k,) [s], which lasts 3 to 8 s unless a speed is given.
 
-    So that it lasts 3 to 8 s unless fps or speed says otherwise. With fps alone every frame is one picture; with both,
-    or speed, each picture shows the frame nearest to its time. Raises InputError where time does not go on.
+    Each picture shows the frame nearest to its time. Raises InputError where time does not go on.
     """
-    count = np.arange(len(times))
     steps = np.diff(times)
     if len(times) == 1 or not (steps > 0).all():
         if speed is not None:
             raise InputError("--speed needs frames in order of time, more than one")
-        return Playback(count, fps or FASTEST / 3, 0.0)
-    if fps is not None and speed is None:
-        return Playback(count, fps, float(steps.mean() * fps))
+        return Playback(np.arange(len(times)), FASTEST / 3, 0.0)
     speed = speed or usual_speed(float(times[-1] - times[0]))
-    fps = fps or max(1.0, min(FASTEST, speed / float(np.median(steps))))
+    fps = max(1.0, min(FASTEST, speed / float(np.median(steps))))
     shown = times[0] + np.arange(0, (times[-1] - times[0]) * (1 + 1e-9) + speed / fps / 2, speed / fps)
     return Playback(abs(shown[:, None] - times).argmin(axis=1), fps, speed)
 

@@ -25,12 +25,11 @@ STILL = (760, 900)  # [px]: a panel of a scene
 ONLY = {  # options by the endings of what they are for
     "count": PICTURE_NAMES,
     "size": (*PICTURE_NAMES, *MOVIE_NAMES),
-    "fps": MOVIE_NAMES,
     "speed": MOVIE_NAMES,
     "show": (*PICTURE_NAMES, *MOVIE_NAMES),
     "axes": (*PICTURE_NAMES, *MOVIE_NAMES),
 }
-FASTEST = {"fps": 240, "speed": 1e6}
+FASTEST = 1e6  # simulated seconds a second
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,10 +57,8 @@ def style_of(args: argparse.Namespace) -> Style:
     for name in shown:
         if name not in SHOWN:
             raise InputError(f"--show takes {' and '.join(SHOWN)}, not {name!r}{did_you_mean(name, SHOWN)}")
-    for option in ("fps", "speed"):
-        number = getattr(args, option)
-        if number is not None and not (0 < number <= FASTEST[option]):
-            raise InputError(f"--{option} must be above 0, and {FASTEST[option]:g} at most, not {number:g}")
+    if args.speed is not None and not (0 < args.speed <= FASTEST):
+        raise InputError(f"--speed must be above 0, and {FASTEST:g} at most, not {args.speed:g}")
     return Style(eye, args.colour, _size(args.size), args.axes, shown)
 
 
@@ -77,7 +74,7 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
         if path.suffix.lower() in PAGE_NAMES:
             write_page(subject, path, numbers, style, reference)
         else:
-            playback = playback_of(subject.times[numbers], args.fps, args.speed)
+            playback = playback_of(subject.times[numbers], args.speed)
             write_film(subject, path, numbers, style, playback, reference)
 
 

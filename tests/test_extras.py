@@ -53,18 +53,17 @@ OF_RUNS = tuple(name for name in EXTRAS["run"] if name not in (*EXTRAS["render"]
 DRAWN = [
     "render {} -o x.png",
     "render {} -o x.gif --frames 0:4:2",
-    "render {} -o x.html --colour contact",
-    "render ball.ply -o mesh.png",
+    "render {} -o x.html --colour speed",
 ]
 
 
 @pytest.mark.parametrize("command", DRAWN)
 def test_drawing_exporting_and_comparing_need_neither_mpi_nor_petsc_nor_a_compiler(
-    command: str, tmp_path: Path, ball: Path, monkeypatch
+    command: str, tmp_path: Path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     write_ball(tmp_path / "ball.h5", surface=True)
-    words = command.replace("ball.ply", str(ball)).format("ball.h5", "ball.h5").split()
+    words = command.format("ball.h5").split()
     done = without(OF_RUNS, *words)
     assert done.returncode == 0, done.stderr
     assert "-o" not in words or Path(words[words.index("-o") + 1]).stat().st_size > 1000

@@ -113,7 +113,7 @@ def ranks(about: str) -> Argument:
 
 
 RENDER = (
-    argument("subject", metavar="OUT.h5|SCENE.toml|MESH", type=checked_file, help="what is drawn"),
+    argument("subject", metavar="OUT.h5|SCENE.toml", type=checked_file, help="what is drawn"),
     argument(
         "-o", "--output", metavar="FILE", type=checked_file,
         help="*.png, *.mp4, *.gif, *.webp or *.html; default: beside what is drawn, ending in .png",
@@ -124,7 +124,7 @@ RENDER = (
     argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)"),
     argument(
         "--colour", metavar="FIELD",
-        help="colour by displacement, speed, strain, stress, contact, part or error, with a legend",
+        help="colour by displacement, speed, strain, stress, part or error, with a legend",
     ),
     argument(
         "--reference", metavar="OUT.h5", type=checked_file,
@@ -132,7 +132,6 @@ RENDER = (
     ),
     switch("--axes", "draw a box around the body, with lengths"),
     argument("--show", metavar="cells,springs", help="cut the body open: boundary cells red, interior ones blue"),
-    argument("--fps", type=float, metavar="N", help="pictures a second; alone: every frame is one picture"),
     argument("--speed", type=float, metavar="S", help="simulated seconds a second (1, which is real time)"),
     SET,
 )  # fmt: skip
@@ -232,7 +231,7 @@ COMMANDS = {
         "Exit status 0: they agree; 1: they differ; 2: they cannot be compared.",
     ),
     "render": Command(
-        "draw a result as a picture, a film or a page; or a scene or a mesh before anything is run",
+        "draw a result as a picture, a film or a page; or a scene before anything is run",
         (
             "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5",
             "msmpetsc render out/my.h5 -o out/my.mp4 --speed 0.1",
@@ -241,7 +240,7 @@ COMMANDS = {
         ),
         RENDER,
         description="Draw some moments of a result side by side (*.png), a film (*.mp4, *.gif, *.webp), or a page for "
-        "a browser in which the body turns and its frames play (*.html). A scene or a mesh is drawn as it lies.",
+        "a browser in which the body turns and its frames play (*.html). A scene is drawn as it lies.",
     ),
     "export": Command(
         "write frames of a result in another format",

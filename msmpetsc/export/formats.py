@@ -1,30 +1,131 @@
-"""The formats that a result is exported to, in one table, and the export itself."""
+"""The formats of exported results in one table, and the export itself.
 
+glTF is written by a small writer of our own: libraries that read glTF write neither morph targets nor their animation.
+The surface moves by morph targets, one a frame, as Blender and browsers play it. The file is a JSON chunk and one
+binary chunk (the glTF 2.0 specification, 4.4); it has y up, so the node is turned.
+"""
+
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError
-from msmpetsc.export.gltf import write_glb
-from msmpetsc.export.moments import Mesh, Moments
+from msmpetsc.export.moments import Mesh, Moments, normals
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result
 
 CELL_TYPES = {"surface": "triangle", "lattice": "hexahedron"}
 BARE = (".obj", ".ply", ".stl")  # formats of points and triangles alone
+FLOAT, UNSIGNED = 5126, 5125  # component types
+POINTS, TRIANGLES = 34962, 34963  # uses of a buffer view: vertex data, indices
+MOST_BYTES = 2**32 - 2**20  # less what is no vertex
+Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # a quarter turn about x
+CLAY = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0}, "doubleSided": True}
+
+
+class Chunk:
+    """The binary chunk of a glTF file, to which numbers of four bytes are added.
+
+    accessors, views : as the JSON chunk lists them
+    parts, size      : its bytes so far, and how many
+    """
+
+    def __init__(self) -> None:
+        self.accessors: list[dict[str, Any]] = []
+        self.views: list[dict[str, Any]] = []
+        self.parts: list[bytes] = []
+        self.size = 0
+
+    def add(self, rows: Array, use: int | None = None, bounds: bool = False) -> int:
+        """Add numbers (n,) or vectors (n, 3), float32 or uint32; return the accessor's number.
+
+        bounds : whether to say the least and greatest values, as points, targets and times must
+        """
+        component = UNSIGNED if use == TRIANGLES else FLOAT
+        accessor: dict[str, Any] = {"bufferView": len(self.views), "componentType": component, "count": len(rows)}
+        accessor["type"] = "VEC3" if rows.ndim == 2 else "SCALAR"
+        if bounds:
+            ends = np.reshape([rows.min(axis=0), rows.max(axis=0)], (2, -1)).tolist()
+            accessor |= {"min": ends[0], "max": ends[1]}
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
+        self.views.append(view | ({"target": use} if use else {}))
+        self.accessors.append(accessor)
+        self.parts.append(rows.tobytes())
+        self.size += rows.nbytes
+        return len(self.accessors) - 1
+
+    def add_shape(self, points: Array, normals: Array) -> dict[str, int]:
+        """Add points and normals, (v, 3) float32 each; return their accessors."""
+        return {"POSITION": self.add(points, POINTS, bounds=True), "NORMAL": self.add(normals, POINTS)}
+
+
+def write_glb(moments: Moments, path: Path) -> None:
+    """Write frames as glTF. Raises InputError where the file would be longer than its format allows."""
+    first, *others = moments.frames
+    base = moments.points(first).astype(np.float32)
+    upright = normals(base, moments.cells)
+    chunk = Chunk()
+    indices = chunk.add(moments.cells.astype("<u4").ravel(), TRIANGLES)
+    shape = chunk.add_shape(base, upright)
+    targets = []
+    for frame in others:
+        points = moments.points(frame).astype(np.float32)
+        targets.append(chunk.add_shape(points - base, normals(points, moments.cells) - upright))
+        if chunk.size > MOST_BYTES:
+            raise InputError(f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)")
+    document = _document(shape, indices, targets, moments.run.path.stem)
+    if others:
+        document["animations"] = [_animation(chunk, moments.times, len(others))]
+    document |= {"accessors": chunk.accessors, "bufferViews": chunk.views, "buffers": [{"byteLength": chunk.size}]}
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    with open(path, "wb") as file:
+        file.write(struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + chunk.size, len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", chunk.size, b"BIN\0"))
+        file.writelines(chunk.parts)
+
+
+def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]], name: str) -> dict[str, Any]:
+    """Return the scene of glTF's JSON chunk: one node with one mesh."""
+    primitive: dict[str, Any] = {"attributes": shape, "indices": indices, "material": 0}
+    mesh: dict[str, Any] = {"primitives": [primitive], "name": name}
+    if targets:
+        primitive["targets"] = targets
+        mesh["weights"] = [0.0] * len(targets)
+    return {
+        "asset": {"version": "2.0", "generator": "msmpetsc"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": Z_UP_TO_Y_UP, "name": name}],
+        "meshes": [mesh],
+        "materials": [CLAY],
+    }
+
+
+def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
+    """Return the animation that blends linearly between morph targets at the frames' times (t,) [s]."""
+    since = (times - times[0]).astype(np.float32)
+    weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
+    sampler = {"input": chunk.add(since, bounds=True), "output": chunk.add(weights), "interpolation": "LINEAR"}
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    return {"samplers": [sampler], "channels": [channel]}
 
 
 def write_usd(moments: Moments, path: Path) -> None:
-    """Write the frames as USD, by a library that only this format needs."""
+    """Write frames as USD, by a library that only this format needs."""
     from msmpetsc.export import usd
 
     usd.write_usd(moments, path)
 
 
 def write_one_frame(moments: Moments, path: Path) -> None:
-    """Write the one frame by meshio, with its data where the format has them."""
+    """Write a single frame by meshio, with data if the format holds them."""
     import meshio
 
     (frame,) = moments.frames
@@ -50,9 +151,9 @@ MESHES: dict[str, tuple[Mesh, ...]] = {".vtu": ("lattice", "surface")}  # of whi
 
 
 def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Frames | None = None) -> Path:
-    """Write frames of a result in the format that the path's ending names, and return the path.
+    """Write frames of a result in the format of the path's ending, and return the path.
 
-    mesh   : "surface" or "lattice"; what the format holds, and the result has, if None
+    mesh   : "surface" or "lattice"; the first that the format holds if None
     frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
 
     Raises InputError.
@@ -63,25 +164,22 @@ def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frame
         raise InputError(f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}")
     with Result(result) as run:
         numbers = _frames(run, path, write is not write_one_frame, frames)
-        moments = Moments(run, _mesh(run, path, mesh), numbers)
+        moments = Moments(run, _mesh(path, mesh), numbers)
         with whole_file(path) as part:
             write(moments, part)
     return path
 
 
-def _mesh(run: Result, path: Path, mesh: Mesh | None) -> Mesh:
-    """Return which mesh is meant. Raises InputError for one that the format does not hold."""
+def _mesh(path: Path, mesh: Mesh | None) -> Mesh:
+    """Return the mesh to export. Raises InputError if the format does not hold it."""
     meshes = MESHES.get(path.suffix.lower(), ("surface",))
-    if mesh is None:
-        has_surface = "surface/points" in run
-        return next((m for m in meshes if m == "lattice" or has_surface), meshes[0])
-    if mesh not in meshes:
+    if mesh is not None and mesh not in meshes:
         raise InputError(f"{path}: a *{path.suffix} holds no {mesh}, but the {' or the '.join(meshes)}")
-    return mesh
+    return mesh or meshes[0]
 
 
 def _frames(run: Result, path: Path, moves: bool, frames: Frames | None) -> list[int]:
-    """Return the numbers of the frames meant. Raises InputError for frames that the result does not have."""
+    """Return the numbers of the frames to export. Raises InputError for frames that the result lacks."""
     count = len(run.frames.time)
     if not count:
         raise InputError(f"{run.path} has no finished frame")

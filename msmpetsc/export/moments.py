@@ -1,10 +1,11 @@
-"""The chosen frames of a result as any format has them, one frame in memory at a time."""
+"""The exported frames of a result, independent of the format, one frame in memory at a time."""
 
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.errors import InputError
 from msmpetsc.fields import FRAME_FIELDS, LATTICE, STRESS
 from msmpetsc.results.reader import Result
@@ -22,7 +23,7 @@ class Moments:
     """
 
     def __init__(self, run: Result, mesh: Mesh, frames: Sequence[int]):
-        """Raises InputError for a result without the surface asked for, or a damaged one."""
+        """Choose frames. Raises InputError for a result without the surface asked for, or a damaged one."""
         self.run, self.mesh, self.frames = run, mesh, list(frames)
         if mesh == "surface" and "surface/points" not in run:
             raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
@@ -30,12 +31,12 @@ class Moments:
         names = ("surface/points", "surface/triangles") if mesh == "surface" else ("lattice/nodes", "lattice/cells")
         self.rest, self.cells = run[names[0]][:], run.indices(names[1])
 
-    def points(self, frame: int) -> np.ndarray:
+    def points(self, frame: int) -> Array:
         """Return the points of a frame, (n, 3) [m]."""
         return self.run.frames.position[frame] if self.mesh == "lattice" else self.run.surface_at(frame)
 
-    def data_of_points(self, frame: int) -> dict[str, np.ndarray]:
-        """Return what is known at the points: of the lattice masses, which are pinned; its stress, if it was stored.
+    def data_of_points(self, frame: int) -> dict[str, Array]:
+        """Return the data at the points: displacement, velocity, stored stress; of the lattice mass and pins.
 
         displacement : from rest, (n, 3) [m]
         velocity     : the mean since the frame before, (n, 3) [m/s]; 0 at the first
@@ -55,44 +56,24 @@ class Moments:
             pinned[self.run.lattice.pinned[:]] = 1
         return data | {"pinned": pinned} | self._constant("n", "nodes") | stress
 
-    def data_of_cells(self, frame: int) -> dict[str, np.ndarray]:
-        """Return what is known of the lattice's cells: strain, (c, 6) [-], and all that the file has of each."""
-        if self.mesh == "surface":
-            return {}
-        strain = green_strain(self.rest, self.cells, self.points(frame))
-        return {"strain": strain} | self._constant("c", "cells") | self._stress("c", frame)
+    def data_of_cells(self, frame: int) -> dict[str, Array]:
+        """Return the lattice's data by cell; none for the surface."""
+        return {} if self.mesh == "surface" else self._constant("c", "cells") | self._stress("c", frame)
 
-    def _stress(self, letter: str, frame: int) -> dict[str, np.ndarray]:
+    def _stress(self, letter: str, frame: int) -> dict[str, Array]:
         arrays = self.run.frames
         return {name: arrays[name][frame] for name in STRESS if name in arrays and letter in FRAME_FIELDS[name].shape}
 
-    def _constant(self, letter: str, points: str) -> dict[str, np.ndarray]:
+    def _constant(self, letter: str, points: str) -> dict[str, Array]:
         arrays = self.run.lattice
         return {name: arrays[name][:] for name in arrays if name != points and LATTICE[name].shape == (letter,)}
 
 
-def green_strain(rest: np.ndarray, cells: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return Green's strain (F^T F - I) / 2 at the cells' centres, (c, 6) [-]: xx, yy, zz, xy, yz, xz, as VTK has it.
-
-    rest, points : (n, 3) [m]; cells (c, 8), all cubes of one size and alike at rest
-    """
-    if not len(cells):
-        return np.empty((0, 6))
-    corners = rest[cells[0]]
-    sides = np.ptp(corners, axis=0)
-    gradients = np.sign(corners - corners.mean(axis=0)) / (4 * sides)  # (8, 3) of the trilinear functions [1/m]
-    F = np.zeros((len(cells), 3, 3))
-    for corner, gradient in enumerate(gradients):
-        F += points[cells[:, corner], :, None] * gradient
-    strain = 0.5 * (F.transpose(0, 2, 1) @ F - np.eye(3))
-    return strain[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
-
-
-def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
+def normals(points: Array, triangles: Indices) -> Array:
+    """Return area-weighted unit normals (v, 3) float32 at points (v, 3) of triangles (f, 3)."""
     corners = points[triangles].astype(float)
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     sums = [np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T]
     vectors = np.stack(sums, axis=1)
     vectors[~vectors.any(axis=1)] = (0, 0, 1)  # a point of no triangle, or of folded ones: any direction is as good
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    return np.divide(vectors, np.linalg.norm(vectors, axis=1, keepdims=True), dtype=np.float32)

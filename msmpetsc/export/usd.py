@@ -1,4 +1,4 @@
-"""USD, by its own library: a mesh for each body, whose points have a sample a frame.
+"""USD by its own library: a mesh for each body, with a time sample of its points for each frame.
 
 .usda is text, .usdc and .usd are binary. Normals go with the points, for without them programs draw each triangle flat.
 """
@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
+from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import one_line
 from msmpetsc.export.moments import Moments, normals
 
@@ -18,7 +19,7 @@ SAVED = 16  # frames: so many are in memory at a time, where the format is binar
 
 
 def write_usd(moments: Moments, path: Path) -> None:
-    """Write the frames. Raises OSError where the library cannot."""
+    """Write frames as USD. Raises OSError where the library cannot."""
     path.touch()  # or the library would say why not, in many lines
     try:
         stage = Usd.Stage.CreateNew(str(path))
@@ -46,14 +47,13 @@ def write_usd(moments: Moments, path: Path) -> None:
 
 
 class UsdBody:
-    """The mesh of one body, to which frames are added."""
+    """The USD mesh of one body, to which frames are added."""
 
-    def __init__(self, stage: Any, root: Any, moments: Moments, of_point: np.ndarray, number: int):
-        """Define what stays as it is: triangles, colour and points at rest."""
+    def __init__(self, stage: Any, root: Any, moments: Moments, of_point: Indices, number: int):
+        """Define the constant parts: triangles and colour."""
         self._rows = np.flatnonzero(of_point == number)
         own = moments.cells[of_point[moments.cells[:, 0]] == number]
         self._triangles = np.searchsorted(self._rows, own)
-        self._rest = moments.rest[self._rows]
         name = "body" if of_point.max() == 0 else f"body_{number}"
         self._mesh = UsdGeom.Mesh.Define(stage, root.AppendChild(name))
         self._mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)  # or it would be rounded off
@@ -61,32 +61,30 @@ class UsdBody:
         self._mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(self._triangles.ravel().astype(np.int32)))
         self._mesh.CreateDisplayColorAttr([Gf.Vec3f(*CLAY)])
         self._mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        kind = Sdf.ValueTypeNames.FloatArray
-        self._displacement = UsdGeom.PrimvarsAPI(self._mesh).CreatePrimvar("displacement", kind, UsdGeom.Tokens.vertex)
 
-    def add(self, points: np.ndarray, code: float) -> None:
-        """Add the sample of a time code, of the points (v, 3) [m] of all bodies."""
+    def add(self, points: Array, code: float) -> None:
+        """Add a sample at a time code, of the points (v, 3) [m] of all bodies."""
         own = points[self._rows]
-        length = np.linalg.norm(own - self._rest, axis=1).astype(np.float32)
         corners = np.array([own.min(axis=0), own.max(axis=0)])
         self._mesh.CreatePointsAttr().Set(_vectors(own), code)
         self._mesh.CreateNormalsAttr().Set(_vectors(normals(own, self._triangles)), code)
         self._mesh.CreateExtentAttr().Set(_vectors(corners), code)
-        self._displacement.Set(Vt.FloatArray.FromNumpy(length), code)
 
 
 def up_axis(scene: dict[str, Any]) -> str:
-    """Return the axis that is upward: against gravity where USD knows that one, else z."""
+    """Return the upward axis: against gravity if USD supports that axis, else z."""
     acceleration = np.array(scene.get("gravity", {}).get("acceleration", (0, 0, 0)), float)
-    return UP.get(int(np.argmax(abs(acceleration))), UsdGeom.Tokens.z) if acceleration.any() else UsdGeom.Tokens.z
+    return str(UP.get(int(np.argmax(abs(acceleration))), UsdGeom.Tokens.z))
 
 
-def frames_a_second(times: np.ndarray) -> float:
-    """Return how many frames there are in a second of times (t,) [s], so that a frame is one time
-    code if all are spaced alike."""
+def frames_a_second(times: Floats) -> float:
+    """Return the frames a second of times (t,) [s].
+
+    Of equally spaced ones a frame is one time code.
+    """
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return float(f"{1 / spacing:.9g}")
 
 
-def _vectors(rows: np.ndarray) -> Any:
+def _vectors(rows: Array) -> Any:
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rows, np.float32))

@@ -1,4 +1,4 @@
-"""Two runs held against each other, frame by frame, without MPI and without PETSc.
+"""Compare two results frame by frame, without MPI and without PETSc.
 
 Of one lattice all fields are. An error is the greatest difference at a frame over the scale of its field, which is
 the same for all frames:
@@ -35,12 +35,12 @@ MEAN = "surface, rms"  # name of the field
 
 
 class DifferentLattices(InputError):
-    """Raised for two runs that are not of one lattice."""
+    """Two results are not of one lattice."""
 
 
 @dataclass
 class FieldError:
-    """How far one field of two runs is apart.
+    """The difference between two results in one field.
 
     scale  : what errors are relative to
     errors : (p,) relative, one a frame compared; inf where only one run has a number
@@ -54,14 +54,14 @@ class FieldError:
     worst: Indices
 
     def first_above(self, rtol: float) -> int | None:
-        """Return which frame compared is the first whose error is above rtol; None for none."""
+        """Return the first compared frame whose error is above rtol, or None."""
         above = np.flatnonzero(self.errors > rtol)
         return int(above[0]) if len(above) else None
 
 
 @dataclass
 class Comparison:
-    """Two runs compared, frame by frame.
+    """The differences between two results, frame by frame.
 
     pairs    : (p, 2) frames of equal time in the two runs
     times    : (p,) [s]
@@ -79,7 +79,7 @@ Distances = tuple[Floats, Indices, float]
 
 @np.errstate(all="ignore")  # what overflows differs, and is reported as that
 def compare(a: Result, b: Result) -> Comparison:
-    """Compare the fields COMPARED of two runs, those that both have, at the times that both have.
+    """Compare the fields COMPARED that two results share, at the times that both have.
 
     Raises DifferentLattices if the lattices do not match, InputError if the runs have no time in common.
     """
@@ -100,14 +100,16 @@ def compare(a: Result, b: Result) -> Comparison:
 
 
 def rest_of(run: Result, name: str) -> Positions | None:
-    """Return the rows (r, 3) at rest [m] of a field of positions; None for other fields, or without them."""
+    """Return the rest positions (r, 3) [m] of a field of positions; None for other fields."""
     at_rest = FRAME_FIELDS[name].at_rest
     return run[at_rest][:] if at_rest in run else None
 
 
 def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
-    """Return of a field the greatest distance of two rows and its row, (p,) each; and the greatest
-    size in any frame, from rest where the field is one of positions."""
+    """Return a field's greatest distance between two rows and that row, (p,) each, and the greatest size.
+
+    The size is that in any frame, from rest where the field is one of positions.
+    """
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
         raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
@@ -128,7 +130,7 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
 
 
 def difference(a: Array, b: Array, digits: float) -> Floats:
-    """Return |a - b| less what rounding to these relative `digits` may do.
+    """Return |a - b|, less what rounding to these relative `digits` may do.
 
     It is 0 of two NaN, inf of a NaN and a number.
     """
@@ -139,14 +141,14 @@ def difference(a: Array, b: Array, digits: float) -> Floats:
 
 
 def _row_lengths(rows: Array) -> Floats:
-    """Return (r,) lengths of vectors (r, 3) or of one (3,), or sizes of plain numbers."""
+    """Return the lengths (r,) of vectors (r, 3), of one vector (3,), or the sizes of plain numbers."""
     if rows.ndim == 0:
         return np.abs(rows)[None]
     return np.ravel(np.linalg.norm(rows, axis=-1))
 
 
 def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:
-    """Return what the errors of each field are relative to."""
+    """Return the scale of each field, by which its errors are divided."""
     scales = {name: size for name, (_, _, size) in distances.items()}
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
     least = 0.0  # of the stiffest and longest spring, strained by LEAST_STRAIN [J]
@@ -171,7 +173,7 @@ def longest_side(points: Positions, body: Indices) -> float:
 
 
 def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> float:
-    """Return the largest size of these energies at the frames compared, of both runs."""
+    """Return the largest size of the named energies at the compared frames of both results."""
     runs = (a, pairs[:, 0]), (b, pairs[:, 1])
     energies = [(name, run.frames[name][frames]) for run, frames in runs for name in names if name in run.frames]
     # the potential energy's zero means nothing
@@ -181,7 +183,7 @@ def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> floa
 
 
 def rows_agree(a: Array, b: Array, slack: float) -> Mask:
-    """Tell which rows (n,) of a and b, (n, 3) or (n,) each, are apart by no more than `slack`."""
+    """Return which rows (n,) of a and b, (n, 3) or (n,) each, differ by at most `slack`."""
     rows: Array = (a - b).reshape(len(a), -1)
     agree: Mask = np.linalg.norm(rows, axis=1) <= slack
     return agree
@@ -204,7 +206,7 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
 
 
 def first_apart(a: Positions, b: Positions, slack: float) -> str:
-    """Return which of points (n, 3) [m] is the first that two runs have farther apart than this, in words."""
+    """Return in words the first of points (n, 3) [m] that differs between two results by more than `slack`."""
     same = rows_agree(a, b, slack)
     if same.all():
         return ""
@@ -213,7 +215,7 @@ def first_apart(a: Positions, b: Positions, slack: float) -> str:
 
 
 def cell_size(run: Result, nodes: Positions) -> float:
-    """Return the edge of a cell [m], from the first; 0 where the file has none."""
+    """Return the edge length [m] of the first cell; 0 for a file without cells."""
     if "cells" not in run.lattice or not len(run.lattice.cells):
         return 0.0
     corners = run.indices("lattice/cells")[0]
@@ -221,7 +223,7 @@ def cell_size(run: Result, nodes: Positions) -> float:
 
 
 def point_text(point: Floats) -> str:
-    """Return a point (3,) [m] for a message."""
+    """Return a point (3,) [m] as text for a message."""
     return "(" + ", ".join(f"{x:.6g}" for x in point) + ") m"
 
 
@@ -239,7 +241,7 @@ def common_times(a: Floats, b: Floats) -> Indices:
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is far apart, and is reported as that
 def compare_surfaces(run: Result, reference: Result) -> Comparison:
-    """Return how far the surface of a run is from that of a reference run, at the times that both have.
+    """Return the distances between the surfaces of a result and its reference, at the times that both have.
 
     Its fields are the greatest distance of a point, and the root mean square over the area (MEAN).
     Both are relative to the largest displacement of a point in the reference, their scale [m]; if
@@ -275,7 +277,7 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
 
 
 def point_areas(run: Result) -> Array:
-    """Return the area around each surface point at rest, (v,) [m^2]: a third of its triangles'."""
+    """Return the area (v,) [m^2] of each surface point at rest: a third of its triangles'."""
     points, triangles = run["surface/points"][:], run.indices("surface/triangles")
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2

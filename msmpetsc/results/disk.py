@@ -1,4 +1,4 @@
-"""The disk below what is written: files that come whole or not at all, a lock, room for what is planned."""
+"""Files on disk: atomic writes, a lock, checks of free space, and errors in one line."""
 
 import fcntl
 import io
@@ -20,7 +20,7 @@ LONGEST_STEM = 50  # letters of a name that its part keeps: with more it could b
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a name to write a file under; it gets its own when it is whole, and of one that fails nothing is left.
+    """Yield a temporary name to write to; the file gets its own name only when it is complete.
 
     That name ends alike, for many writers go by the ending. Links are followed; a file that is
     replaced keeps its rights, and one that may not be written stays. Every file that a command
@@ -48,7 +48,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a text or bytes as a whole file. Raises InputError."""
+    """Write a text or bytes as one complete file. Raises InputError."""
     with whole_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -62,7 +62,7 @@ def refuse_no_file(path: Path) -> None:
 
 
 class Storage(io.FileIO):
-    """A file for HDF5 to write, which hears of no failure: with what it could not write, HDF5 crashes as it ends.
+    """A file that HDF5 writes to, which keeps write errors back: HDF5 crashes on them as it ends.
 
     failure : the first, to be raised by who writes
     """
@@ -70,7 +70,7 @@ class Storage(io.FileIO):
     failure: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Write all of it where the file stands."""
+        """Write all data at the file's present position."""
         left = memoryview(data).cast("B")
         try:
             while len(left):
@@ -80,7 +80,7 @@ class Storage(io.FileIO):
         return len(data)
 
     def truncate(self, size: int | None = None) -> int:
-        """Give the file another length [byte]."""
+        """Set the length of the file [byte]."""
         try:
             return super().truncate(size)
         except OSError as error:
@@ -89,7 +89,7 @@ class Storage(io.FileIO):
 
     @contextmanager
     def telling(self) -> Iterator[None]:
-        """Raise after the block what failed so far: whatever HDF5 makes of it comes from it."""
+        """Raise the first write error after the block, whatever HDF5 made of it."""
         try:
             yield
         finally:
@@ -98,7 +98,7 @@ class Storage(io.FileIO):
 
 
 class Lock:
-    """Held on a file beside `path` while that is written; the system itself takes it from a run that is killed."""
+    """A lock on a file beside `path` during writing; the system frees it when a run is killed."""
 
     def __init__(self, path: Path):
         """Take the lock. Raises InputError where another run has it."""
@@ -118,25 +118,25 @@ class Lock:
             os.close(self._file)  # who had it took its name away meanwhile: another run may have locked a new one
 
     def free(self) -> None:
-        """Give the lock back and remove its file."""
+        """Free the lock and remove its file."""
         self.path.unlink(missing_ok=True)  # while it is locked: the name is still this file's
         os.close(self._file)
 
 
 def bytes_taken(path: Path) -> int:
-    """Return what a file takes on the disk [byte], 0 for none."""
+    """Return the disk space of a file [byte]; 0 if there is none."""
     return path.stat().st_blocks * 512 if path.exists() else 0
 
 
 def refuse_small_disk(path: Path, planned: int) -> None:
-    """Raise InputError where `planned` [byte] are not free: better now than hours later."""
+    """Raise InputError where `planned` bytes are not free on the disk."""
     free = shutil.disk_usage(path.parent).free
     if planned > free:
         raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
 
 
 def copy_sparse(source: int, path: Path) -> None:
-    """Copy a descriptor's file to a new name; zeros, which frames to come are, take no room."""
+    """Copy an open file to a new name; blocks of zeros, such as frames to come, take no space."""
     with open(path, "xb") as copy:
         for start in range(0, size := os.fstat(source).st_size, 2**20):
             if (piece := os.pread(source, 2**20, start)).strip(b"\0"):
@@ -146,7 +146,7 @@ def copy_sparse(source: int, path: Path) -> None:
 
 @contextmanager
 def plain_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the file system into one line; HDF5 words them at length, and not always as OSError."""
+    """Turn errors of the file system, and HDF5's long wording of them, into an InputError of one line."""
     try:
         yield
     except (OSError, RuntimeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""The frames of a result that are asked for by numbers and slices, as Python counts: "0,10:250:5,-1"."""
+"""Choice of a result's frames by numbers and slices as Python counts: "0,10:250:5,-1"."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ def frames_in(text: str) -> Frames:
 
 
 def _slice(text: str) -> slice:
-    """Return the slice of "0:250:5", from start to end without its end."""
+    """Return the slice that "0:250:5" means."""
     numbers = [int(word) if word else None for word in text.split(":")]
     if len(numbers) > 3 or numbers[2:] == [0]:
         raise ValueError(text)
@@ -24,7 +24,7 @@ def _slice(text: str) -> slice:
 
 
 def frames_of(path: str, frames: Frames, total: int) -> list[int]:
-    """Return the numbers of frames and slices of them. Raises InputError for none."""
+    """Return the numbers of the chosen frames. Raises InputError if there are none."""
     numbers = range(total)
     chosen: list[int] = []
     for part in frames:

@@ -1,4 +1,4 @@
-"""How a result file is laid out, so that a kill at any moment leaves it whole: all metadata before the first frame.
+"""The layout of a result file: all metadata before the first frame, so that a kill leaves it readable.
 
 Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the start, its chunks
 allocated, nothing buffered. While frames are written, no metadata changes.
@@ -19,7 +19,7 @@ CHUNK_BYTES = 64 * 2**20
 
 
 def open_to_write(storage: Storage, mode: str) -> h5py.File:
-    """Begin an empty file ("w") of a kind that a kill cannot spoil, or write one of that kind further ("r+").
+    """Open a new file ("w") or an existing one ("r+") in a way that a kill cannot spoil.
 
     libver earliest: its superblock has no flag "open for writing", which would shut a killed run's
     file. No chunk cache: nothing waits to be written. No lock: a running result may be looked at.
@@ -28,12 +28,12 @@ def open_to_write(storage: Storage, mode: str) -> h5py.File:
 
 
 def of_ranks(name: str) -> bool:
-    """Return whether each rank has rows of its own of a field of frames."""
+    """Return whether a field of frames is distributed over the ranks."""
     return bool(RANKS_SHARE.intersection(FRAME_FIELDS[name].shape))
 
 
 class Plan(NamedTuple):
-    """One dataset to be laid out: name in the file, its shape and that of its chunks, its type."""
+    """One planned dataset: name, shape, shape of its chunks, and type."""
 
     name: str
     shape: tuple[int, ...]
@@ -43,7 +43,7 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes of all that is written frame by frame.
+    """The sizes of all datasets that are written frame by frame.
 
     frames  : planned, frame 0 included
     nodes   : of all ranks
@@ -82,11 +82,11 @@ class Layout:
 
     @property
     def nbytes(self) -> int:
-        """Room that the datasets need [byte]."""
+        """Size of all datasets [byte]."""
         return sum(math.prod(plan.shape) * np.dtype(plan.dtype).itemsize for plan in self.plans())
 
     def create(self, file: h5py.File) -> None:
-        """Lay out all datasets in a new file: no frame is finished, no checkpoint holds."""
+        """Create all datasets in a new file, without a finished frame or checkpoint."""
         for name in ("frames", "checkpoint"):
             file.create_group(name)
         for plan in self.plans():
@@ -97,7 +97,7 @@ class Layout:
             file["checkpoint/numbers"].attrs["names"] = " ".join(self.numbers)
 
     def first_misfit(self, file: h5py.File) -> str | None:
-        """Return the name of the first dataset that a file does not have as planned; None if it has all."""
+        """Return the name of the first dataset that a file lacks or has in another shape; None if all fit."""
         for plan in self.plans():
             dataset = file.get(plan.name)
             if dataset is None or dataset.shape != plan.shape or dataset.dtype != np.dtype(plan.dtype):
@@ -112,7 +112,7 @@ def _rows_plan(name: str, times: int, rows: int, shape: tuple[int, ...], dtype: 
 
 
 def _plan_dataset(file: h5py.File, plan: Plan) -> None:
-    """Create a dataset that can shrink, with all its room in the file set aside now and nothing written to it.
+    """Create a dataset that can shrink, with all its space in the file allocated now and nothing written.
 
     Through h5py's lower layer: its create_dataset insists on filling datasets that can change their size.
     """

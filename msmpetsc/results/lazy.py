@@ -1,4 +1,4 @@
-"""Arrays of a file, read where they are indexed: as h5py's datasets are, or through xarray."""
+"""Arrays of a file that are read when they are indexed, as h5py's datasets are, or through xarray."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Result files, read without MPI and without PETSc: ``msmpetsc.open``.
+"""Reading of result files without MPI and without PETSc: ``msmpetsc.open``.
 
 What a file claims is checked when it is opened, before anything of that size is read: whoever made the file, it ends in
 an InputError of one line, or its arrays have the shapes and types of `msmpetsc.fields`.
@@ -11,7 +11,6 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +46,7 @@ AXES: dict[int | str, str] = {  # xarray's names of dimensions
 
 
 class Result:
-    """A result file, opened to be read; also one that is being written, up to the frames finished by now.
+    """A result file opened for reading, also while it is written: then up to the frames finished by now.
 
     attributes : who made it and how: msmpetsc_version, petsc_options, ranks, command, ...
     lattice, surface, frames : their arrays as in the file, each read where it is indexed; one that the file does not
@@ -56,7 +55,7 @@ class Result:
     """
 
     def __init__(self, path: str | Path):
-        """Raises InputError, one line, if the file is no result, or damaged."""
+        """Open the file. Raises InputError if it is no result, or damaged."""
         self.path = Path(path)
         self.file = open_result(path)
         try:
@@ -92,17 +91,6 @@ class Result:
         counts = f"{len(self.frames.time)} frames of {len(self.lattice.nodes)} nodes"
         return f"<{self.path}: {counts}, {self.attributes.get('command', 'no command')}>"
 
-    def _repr_html_(self) -> str:
-        """Return the result as a notebook shows it: what it is of, and its arrays."""
-        title = self.scene.get("title") if "scene" in self.attributes else None
-        lines = [f"<b>{escape(str(title))}</b>"] if title else []
-        lines.append(f"<code>{escape(repr(self))}</code>")
-        if self.file and len(self.frames.time):
-            lines.append(f"t = {self.frames.time[0]:g} s to {self.frames.time[-1]:g} s")
-        arrays = [repr(group) for group in (self.frames, self.lattice, self.surface) if group] if self.file else []
-        listed = "\n".join(arrays)
-        return "<br>".join(lines) + (f"<details><summary>arrays</summary><pre>{escape(listed)}</pre></details>")
-
     def __contains__(self, name: str) -> bool:
         return name in self._datasets
 
@@ -113,7 +101,7 @@ class Result:
         return self._datasets[name]
 
     def indices(self, name: str) -> Indices:
-        """Return a dataset that names nodes or points. Raises InputError where it names others."""
+        """Return a dataset of node or point numbers. Raises InputError where one is out of range."""
         rows, count = self[name][:].astype(np.int64), len(self[NAMED[name]])
         plural = NAMED[name].partition("/")[2]
         if rows.size and not 0 <= rows.min() <= rows.max() < count:
@@ -185,7 +173,7 @@ def _variable(name: str, array: LazyArray) -> Any:
 
 
 def open_result(path: str | Path) -> h5py.File:
-    """Open a result file to read it; InputError if it is none."""
+    """Open a result file for reading. Raises InputError if it is none."""
     path = Path(path)
     if not path.is_file():
         kind = "a folder" if path.is_dir() else "a pipe or a device"
@@ -206,7 +194,7 @@ def open_result(path: str | Path) -> h5py.File:
 
 
 def refuse_deadly(path: Path) -> None:
-    """Raise InputError for a file on which the HDF5 library itself crashes or hangs: a child process reads it first.
+    """Raise InputError for a file on which the HDF5 library crashes or hangs: a child process reads it first.
 
     For commands: a process that has threads should not be forked.
     """
@@ -229,7 +217,7 @@ def refuse_deadly(path: Path) -> None:
 
 
 def _read_tables(path: Path) -> None:
-    """Read every table of the file, and of each dataset a row; of the frames one row of each."""
+    """Read the metadata of every dataset, and one row of each."""
     with Result(path) as run:
         for array in run._datasets.values():
             _ = array[:, :1] if array.ndim == 3 else array[:1]
@@ -242,7 +230,7 @@ def finished(file: h5py.File) -> int:
 
 
 def newest_slot(steps: Indices) -> int | None:
-    """Return the slot of the newest checkpoint from the steps (2,) of both; None for none."""
+    """Return the slot of the newest checkpoint from the steps (2,) of both slots, or None."""
     slot = int(np.argmax(steps))
     return slot if steps[slot] >= 0 else None
 
@@ -261,7 +249,7 @@ def _check_is_result(path: Path, file: h5py.File) -> None:
 
 @contextmanager
 def plain_damage(path: Path) -> Iterator[None]:
-    """Turn what HDF5 and h5py raise on damaged files into an InputError of one line."""
+    """Turn errors of HDF5 and h5py on damaged files into an InputError of one line."""
     try:
         yield
     except PermissionError as error:
@@ -280,7 +268,7 @@ def as_python(value: Any) -> Any:
 
 
 def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Return all that belong to a result by their names. Raises InputError for a wrong one."""
+    """Return all known datasets of a result by name. Raises InputError for a wrong one."""
     path = Path(file.filename)
     for name in NEEDED:
         if object_at(path, file, name) is None:
@@ -292,7 +280,7 @@ def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> None:
-    """Raise InputError where a letter of the table is two numbers, or frames are too few."""
+    """Raise InputError where a size of the table of fields is not the same everywhere, or frames are too few."""
     sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
         for axis, (size, symbol) in enumerate(zip(dataset.shape, FIELDS[name].shape, strict=True)):
@@ -306,7 +294,7 @@ def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> N
 
 
 def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
-    """Return what the file has under a name, None for nothing. Raises InputError for links."""
+    """Return the HDF5 object of a name, or None. Raises InputError for links."""
     node = file
     for part in name.split("/"):
         # the lower layer: h5py's own `in` and `get` follow a link to say whether it leads anywhere
@@ -319,7 +307,7 @@ def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
 
 
 def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """Return the dataset, if it holds numbers as it should, no more than the file can hold."""
+    """Return a dataset of the expected type and axes, no larger than the file can hold."""
     dataset = object_at(path, file, name)
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{path} is damaged: it has no dataset {name}")

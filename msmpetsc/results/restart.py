@@ -1,4 +1,4 @@
-"""Restart: what a result file says of its run, its last checkpoint, its lattice."""
+"""Restart from a result file: its run, its last checkpoint, its lattice."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -24,7 +24,7 @@ SAME = 1e-9  # of the greatest: sums over cells go another way on another number
 
 @dataclass(frozen=True)
 class Earlier:
-    """The run that wrote a result file, as far as a run that goes on must know it.
+    """What a resumed run must know of the run that wrote the result file.
 
     texts      : the file's attributes that are text
     true_error : every so many steps the true error was measured, 0 for never
@@ -44,7 +44,7 @@ class Earlier:
 
     @classmethod
     def read(cls, path: Path) -> "Earlier":
-        """Read it on one rank. Raises InputError for what is no result, or a damaged one."""
+        """Read the earlier run on one rank. Raises InputError for a file that is no result, or damaged."""
         with Result(path) as result:  # which checks it
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
@@ -59,7 +59,7 @@ class Earlier:
 
 
 def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
-    """Return slot, step and numbers, and names of the rows of the newest checkpoint; None for none.
+    """Return the slot, the step with its numbers, and the names of rows of the newest checkpoint, or None.
 
     Raises InputError for a checkpoint that no run wrote so.
     """
@@ -87,12 +87,12 @@ def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
 
 
 def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None:
-    """Return the last checkpoint, this rank's rows of it; None if there is none (collective).
+    """Return the last checkpoint with this rank's rows, or None if there is none (collective).
 
     owned : nodes of this rank; the ranks' follow each other
     """
     with opened_on_root(comm, path) as run:
-        newest = comm.bcast(on_root(comm, lambda: _newest(run)))
+        newest: tuple[int, Checkpoint, list[str]] | None = comm.bcast(on_root(comm, lambda: _newest(run)))
         if newest is None:
             return None
         slot, empty, names = newest
@@ -100,7 +100,7 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
 
 
 def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
-    """Raise InputError where the newest checkpoint's positions cannot be those of a body as a frame shows it.
+    """Raise InputError where the newest checkpoint's positions cannot follow from those of a frame.
 
     number   : of the last frame up to its step
     is_frame : whether it is of that very step
@@ -125,7 +125,7 @@ def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
 
 
 def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]) -> None:
-    """Raise InputError where a lattice is not the one of the file (collective).
+    """Raise InputError where a lattice differs from the one in the file (collective).
 
     lattice : this rank's rows by dataset, "lattice/nodes"
     """
@@ -145,13 +145,13 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
 
 @contextmanager
 def opened_on_root(comm: MPI.Comm, path: Path) -> Iterator[Any]:
-    """Open a result file on rank 0 alone, None elsewhere (collective). Raises InputError."""
+    """Open a result file on rank 0 alone; yield None on other ranks (collective). Raises InputError."""
     with on_root(comm, lambda: Result(path)) or nullcontext() as run:
         yield run
 
 
 def _own_rows(comm: MPI.Comm, run: Any, place: tuple[str] | tuple[str, int], count: int) -> Array:
-    """Return this rank's `count` rows of a dataset, or of its row of a number: (count, ...) (collective)."""
+    """Return this rank's `count` rows of a dataset, or of one of its slots (collective)."""
     name, *index = place
     counts = comm.allgather(count)
     dtype, shape = comm.bcast(on_root(comm, lambda: (run[name].dtype, run[name].shape[1 + len(index) :])))

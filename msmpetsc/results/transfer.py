@@ -1,4 +1,4 @@
-"""Rows on their way between the ranks, each of which has its own, and a file that rank 0 has open.
+"""Transfer of distributed rows between the ranks and a file that rank 0 has open.
 
 Rank 0 takes or gives them in pieces. Or each rank writes its own straight to their bytes: a frame's are known from the
 start, for its chunks lie where HDF5 put them when the file was laid out, uncompressed, and stay there (results.layout).
@@ -22,7 +22,7 @@ PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
 
 
 def pieces(rows: Array, counts: Sequence[int]) -> Iterator[tuple[int, slice, slice]]:
-    """Yield parts of the ranks' rows, of at most PIECE_BYTES each: a rank, the part of its rows and of those of all.
+    """Yield pieces of the ranks' rows of at most PIECE_BYTES: rank, its own slice, and the slice of all rows.
 
     rows   : (counts[rank], ...) this rank's
     counts : rows of each rank
@@ -37,7 +37,7 @@ def pieces(rows: Array, counts: Sequence[int]) -> Iterator[tuple[int, slice, sli
 
 
 def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[slice, Array], None]) -> None:
-    """Hand store(part, piece), on rank 0, the rows of all ranks, one after the other (collective).
+    """Call store(part, piece) on rank 0 for the rows of all ranks, in order (collective).
 
     rows   : (counts[rank], ...) this rank's, contiguous
     counts : rows of each rank
@@ -62,7 +62,7 @@ def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Calla
 
 
 def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Callable[[slice], Any]) -> Exception | None:
-    """Fill each rank's rows with what load(part) gives on rank 0; return there what could not be read (collective).
+    """Fill each rank's rows with load(part) of rank 0, and return an error of reading there (collective).
 
     rows   : (counts[rank], ...) this rank's, to be filled
     counts : rows of each rank
@@ -86,7 +86,7 @@ def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Calla
 
 
 def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
-    """Return a descriptor of the file on each rank, None where they see others (collective)."""
+    """Return a descriptor of the file on each rank; None where the ranks see different files (collective)."""
     descriptor, identity = None, None
     try:
         descriptor = os.open(path, os.O_WRONLY)
@@ -102,14 +102,14 @@ def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
 
 
 def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
-    """Return where in the file [byte] the chunks of dataset[index] begin, in the order of its rows."""
+    """Return the byte offsets in the file of the chunks of dataset[index], in the order of its rows."""
     starts = range(0, dataset.shape[1], dataset.chunks[1])
     rest = (0,) * (dataset.ndim - 2)
     return [dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts]
 
 
 def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequence[int]) -> None:
-    """Write rows (n, ...), contiguous, to their bytes in a file. Raises OSError.
+    """Write contiguous rows (n, ...) at their byte offsets in a file. Raises OSError.
 
     start   : number of the first of them in its dataset
     chunk   : rows of a chunk

@@ -1,4 +1,4 @@
-"""The result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
+"""Writing of the result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
 
 Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank
 writes its own where it can reach the file (results.transfer). The file is the same.
@@ -48,7 +48,7 @@ NOTHING = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))  # what ranks bu
 
 
 class Begin(Enum):
-    """What a result file begins as."""
+    """How the writing of a result file begins."""
 
     NEW = "a new file, of a name that is free"
     OVERWRITE = "a new file, which may replace another"
@@ -108,7 +108,7 @@ class ResultFile:
                 self._finish(trim=not self._failed)  # a full disk is no place to change metadata
 
     def write(self, name: str, rows: Array) -> None:
-        """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes".
+        """Store the rows of all ranks, (n_local, ...) on each, in order as dataset `name`: "lattice/nodes".
 
         A file that begins in place has it; raises InputError where its shape is another.
         """
@@ -126,7 +126,7 @@ class ResultFile:
             self._collect(rows, dtype, counts, name)
 
     def keep(self, frames: int) -> None:
-        """Take no more than so many frames of the earlier file over."""
+        """Limit the number of frames that are copied from the earlier file."""
         self._copied = frames
 
     def start_frames(
@@ -170,7 +170,7 @@ class ResultFile:
             self._direct = open_on_all_ranks(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:
-        """Store the next frame; once this returns, no kill can lose it."""
+        """Store the next frame, so that no kill can lose it once this returns."""
         index = self.finished
         for name, counts in self._rows.items():
             self._collect(getattr(frame, name), np.dtype(FRAME_FIELDS[name].dtype), counts, f"frames/{name}", index)
@@ -184,7 +184,7 @@ class ResultFile:
         self.finished += 1
 
     def write_checkpoint(self, saved: Checkpoint) -> None:
-        """Store what the run can go on from; rows and numbers named as those that were planned."""
+        """Store a checkpoint, with the rows and numbers that were planned."""
         slot = 0
         with self._together():
             if self._file is not None:
@@ -235,7 +235,7 @@ class ResultFile:
         self._lock = lock
 
     def _flush(self, file: h5py.File) -> None:
-        """Write what is still in memory. Raises OSError for what could not be written so far."""
+        """Flush the file. Raises OSError for an earlier write error."""
         file.flush()
         if self._storage is not None and self._storage.failure is not None:
             raise self._storage.failure
@@ -259,7 +259,7 @@ class ResultFile:
             self._copy_frames(file)
 
     def _copy_frames(self, file: h5py.File) -> None:
-        """Take the frames of the earlier file over, as far as it has them and `keep` allows."""
+        """Copy the frames of the earlier file, as many as it has and `keep` allows."""
         with Result(self.path) as earlier:
             datasets = {name: file["frames"][name] for name in earlier.frames if name in file["frames"]}
             for name, dataset in datasets.items():
@@ -274,7 +274,7 @@ class ResultFile:
         self.finished = count
 
     def _refuse_removed(self) -> None:
-        """Raise InputError where no name leads to the file now; what it holds gets one again."""
+        """Raise InputError if the file was removed during writing, after its contents are saved under a name."""
         if self._same is None or os.fstat(self._same).st_nlink:
             return
         copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
@@ -311,7 +311,7 @@ class ResultFile:
 
     @contextmanager
     def _together(self) -> Iterator[None]:
-        """Raise after the block, on all ranks, what one rank could not do in it."""
+        """Raise an error of any rank on all ranks after the block."""
         try:
             telling = self._storage.telling() if self._storage else nullcontext()
             with together(self._comm), plain_errors(self.path), telling:
@@ -323,7 +323,7 @@ class ResultFile:
     def _collect(
         self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
     ) -> None:
-        """Write the ranks' rows, `counts` of them, into dataset `name`, or its row `index`."""
+        """Write the ranks' rows, `counts` of each, into dataset `name`, or into its row `index`."""
         rows = np.ascontiguousarray(rows, dtype)
         if self._direct is not None and index is not None:
             self._write_directly(self._direct, rows, counts, name, index)

@@ -1,4 +1,4 @@
-"""The XDMF 3 file beside a result: it lets ParaView open the frames and holds no data itself."""
+"""The XDMF 3 file of a result, which lets ParaView open the frames and holds no data itself."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -42,7 +42,7 @@ def write_xdmf(h5_path: str | Path) -> Path:
 
 
 def _collection(domain: ET.Element, name: str, kind: str, run: Result, elements: str, points: str) -> list[ET.Element]:
-    """Add one grid a finished frame: `elements` of topology `kind` on `points` (T, n, 3). Return the grids."""
+    """Add a grid for each finished frame, of topology `kind` on `points` (T, n, 3). Return the grids."""
     collection = ET.SubElement(domain, "Grid", Name=name, GridType="Collection", CollectionType="Temporal")
     grids = []
     for index, time in enumerate(run.frames.time[:]):
@@ -60,7 +60,7 @@ def _collection(domain: ET.Element, name: str, kind: str, run: Result, elements:
 
 
 def _frame_slab(run: Result, name: str, index: int, first: int | None = 0) -> ET.Element:
-    """Return frame `index` of a dataset (T, r, k), its 3 columns from the ``first`` on, or of one (T, r), with None.
+    """Return a reference to frame `index` of a dataset: (T, r, k) from column ``first`` on, or (T, r) with None.
 
     It is start, stride, count, and the dataset.
     """
@@ -77,7 +77,7 @@ def _frame_slab(run: Result, name: str, index: int, first: int | None = 0) -> ET
 
 
 def _data_item(run: Result, name: str) -> ET.Element:
-    """Return a reference to a whole dataset, by its file's name alone so that both files can move together."""
+    """Return a reference to a whole dataset by the file's name alone, so that both files can move together."""
     array = run[name]
     item = ET.Element(
         "DataItem",

@@ -1,4 +1,4 @@
-"""What is written in pictures: captions, labels and the legend, all in one typeface."""
+"""Text in pictures: captions, labels and the legend, all in one typeface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
@@ -18,12 +19,12 @@ CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its l
 
 @cache
 def typeface(size: int) -> ImageFont.FreeTypeFont:
-    """Return DejaVu Sans, which comes with matplotlib, in a size [px]."""
+    """Return the font DejaVu Sans, which comes with matplotlib, in a size [px]."""
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size)
 
 
-def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> np.ndarray:
-    """Return a caption's two lines (height, width, 3), in the middle; letters: their size, 1 in a sheet."""
+def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
+    """Return the picture (height, width, 3) of two centred lines; letters: their size, 1 in a sheet."""
     picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
         at = width / 2, letters * middle
@@ -32,7 +33,7 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 
 
 def rounded(low: float, high: float) -> tuple[str, str]:
-    """Return the ends of a span as they are written: to a thousandth of it or finer, 0 in place of -1e-5."""
+    """Return the ends of an interval as text, rounded to a thousandth of its length or finer."""
     span = max(high - low, abs(high) * 1e-12, 1e-300)
     digits = 2 - int(np.floor(np.log10(span)))
     first, last = (np.format_float_positional(round(end, digits) + 0.0, trim="-") for end in (low, high))
@@ -45,7 +46,7 @@ FINE = 3  # a legend is drawn so many times larger, and shrunk
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry: a bar of colours, a swatch, an arrow or a line in front of a text.
+    """A legend entry: a bar of colours, a swatch, an arrow or a line in front of a text.
 
     kind  : "bar", "swatch", "glass", "arrow" or "line"
     width : of what stands in front of the text [px]
@@ -61,8 +62,9 @@ class Entry:
 
 
 def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]:
-    """Return the entries of the legend of what is drawn."""
-    scene, colouring, entries = composition.subject.scene, composition.colouring, []
+    """Return the legend's entries for some stills."""
+    scene, colouring = composition.subject.scene, composition.colouring
+    entries: list[Entry] = []
     if colouring is not None and colouring.classes:
         pairs = enumerate(colouring.classes)
         entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
@@ -73,7 +75,7 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
     if any(still.cut and len(still.cut.springs) for still in stills):
         entries.append(Entry("line", "spring", SPRING))
-    if composition.fixed and scene is not None:
+    if any(composition.subject.fixed(still.index).any() for still in (stills[0], stills[-1])):
         held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
     if any(still.overlays.arrows for still in stills):
@@ -83,8 +85,8 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     return entries
 
 
-def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> np.ndarray:
-    """Return the entries side by side, in as many lines as they need: (height, width, 3), no lines for none.
+def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> Array:
+    """Return the picture (height, width, 3) of legend entries side by side, in as many lines as they need.
 
     letters : their size, 1 in a sheet
     """
@@ -107,14 +109,14 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
 
 def _length(entries: Sequence[Entry], font: ImageFont.FreeTypeFont) -> float:
-    """Return how long entries side by side are [px]."""
+    """Return the width of legend entries side by side [px]."""
     texts = [text for entry in entries for text in (entry.text, entry.low, entry.high) if text]
     marks = sum(entry.width for entry in entries) + GAP * (len(entries) - 1)
     return marks + sum(font.getlength(text) / FINE + 8 for text in texts)
 
 
 def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, font: ImageFont.FreeTypeFont) -> None:
-    """Draw an entry from `left` on, around `middle`, in fine pixels."""
+    """Draw a legend entry from `left` on, vertically centred at `middle`, in fine pixels."""
     gap, half = 8 * FINE, 8 * FINE
     if entry.low:
         draw.text((left, middle), entry.low, INK, font, anchor="lm")

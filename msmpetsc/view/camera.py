@@ -1,44 +1,47 @@
-"""The camera of a picture. It looks without perspective, so all lengths can be compared."""
+"""The orthographic camera of a picture, in which all lengths can be compared."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-YAW, ELEVATION = np.radians(25), np.radians(14)  # how far the eye stands to the side, and above, if nothing is said
+from msmpetsc.backend.arrays import Floats, Positions, Rows
+
+YAW, ELEVATION = math.radians(25), math.radians(14)  # how far the eye stands to the side, and above, if nothing is said
 
 
 @dataclass(frozen=True)
 class Camera:
-    """The axes of a person who stands upright and faces the body, and how far above the horizon the eye is.
+    """The axes of an upright observer who faces the body, and the elevation of the view.
 
     right, away, up : (3,) each, unit vectors
     elevation       : of the eye above that person's horizon [rad]
     """
 
-    right: np.ndarray
-    away: np.ndarray
-    up: np.ndarray
+    right: Floats
+    away: Floats
+    up: Floats
     elevation: float
 
     @property
-    def to_eye(self) -> np.ndarray:
+    def to_eye(self) -> Floats:
         """Unit vector (3,) from the body to the eye."""
-        return np.sin(self.elevation) * self.up - np.cos(self.elevation) * self.away
+        return math.sin(self.elevation) * self.up - math.cos(self.elevation) * self.away
 
     @property
-    def upward(self) -> np.ndarray:
+    def upward(self) -> Floats:
         """Unit vector (3,) that points upwards in the picture."""
-        return np.cos(self.elevation) * self.up + np.sin(self.elevation) * self.away
+        return math.cos(self.elevation) * self.up + math.sin(self.elevation) * self.away
 
-    def flat(self, points: np.ndarray) -> np.ndarray:
-        """Return where points (n, 3) are seen, (n, 2): to the right and upwards [m]."""
-        return points @ np.array([self.right, self.upward]).T
+    def flat(self, points: Positions) -> Rows:
+        """Return the projection (n, 2) of points (n, 3) to the right and upwards [m]."""
+        return points @ np.stack([self.right, self.upward], axis=1)
 
 
-def camera_facing(points: np.ndarray, gravity: Sequence[float] | None, eye: Sequence[float] | None = None) -> Camera:
-    """Return a camera in the direction `eye` (3,) of points (n, 3), of any length; up is against gravity, z without it.
+def camera_facing(points: Positions, gravity: Sequence[float] | None, eye: Sequence[float] | None = None) -> Camera:
+    """Return a camera in direction `eye` (3,) of points (n, 3); up is against gravity, z without it.
 
     Without eye, or with one straight above or below, the longer horizontal extent lies across the picture.
     """
@@ -47,24 +50,24 @@ def camera_facing(points: np.ndarray, gravity: Sequence[float] | None, eye: Sequ
         right, away = _across(points, up)
         cosine, sine = np.cos(YAW), np.sin(YAW)
         return Camera(cosine * right + sine * away, cosine * away - sine * right, up, ELEVATION)
-    height = unit(eye) @ up
+    height = float(unit(eye) @ up)
     level = unit(eye) - height * up
     if np.linalg.norm(level) < 1e-6:
-        return Camera(*_across(points, up), up, np.copysign(np.pi / 2, height))
+        return Camera(*_across(points, up), up, math.copysign(math.pi / 2, height))
     away = -unit(level)
-    return Camera(np.cross(away, up), away, up, np.arcsin(height))
+    return Camera(np.cross(away, up), away, up, math.asin(height))
 
 
-def _across(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return right and away: right is the horizontal axis along which the points reach farther."""
+def _across(points: Positions, up: Floats) -> tuple[Floats, Floats]:
+    """Return the axes right and away; right is the horizontal axis of the larger extent."""
     axes = np.delete(np.eye(3), np.argmax(abs(up)), axis=0)
     axes = np.array([unit(axis - (axis @ up) * up) for axis in axes])
     right = axes[np.argmax(np.ptp(points @ axes.T, axis=0))]
     return right, np.cross(up, right)
 
 
-def unit(vector: ArrayLike) -> np.ndarray:
-    """Return the vector (3,) at length 1."""
-    scaled = np.asarray(vector, float)
-    scaled = scaled / np.abs(scaled).max()  # the squares of very large or small components leave the range
-    return scaled / np.linalg.norm(scaled)
+def unit(vector: ArrayLike) -> Floats:
+    """Return a vector (3,) normalised to length 1."""
+    given: Floats = np.asarray(vector, float)
+    scaled: Floats = given / np.abs(given).max()  # squares of very large or small components leave the range
+    return np.divide(scaled, np.linalg.norm(scaled))

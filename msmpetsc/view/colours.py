@@ -1,4 +1,4 @@
-"""The colours of what is drawn: fixed ones, and fields of numbers on the surface in a scale."""
+"""Colours of pictures: fixed colours, and fields on the surface in a colour scale."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats, Rows
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.results.comparison import common_times, refuse_different_meshes
 from msmpetsc.results.reader import Result
 from msmpetsc.view.drawable import Drawable
-from msmpetsc.view.gaps import SurfaceGaps, gaps_to_obstacles
 
 BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"
@@ -33,55 +33,51 @@ CLASSES = (
 )  # a body's parts, over and over
 
 
-def rgb(colour: str) -> np.ndarray:
+def rgb(colour: str) -> Floats:
     """Return red, green and blue (3,) of "#8fabc6", 0 to 255."""
     return np.array([int(colour[digit : digit + 2], 16) for digit in (1, 3, 5)], float)
 
 
-def on_scale(shares: np.ndarray) -> np.ndarray:
-    """Return the colours (n, 3), 0 to 255, of shares (n,) of the scale's end; what is beyond it has that of the end."""
+def on_scale(shares: Floats) -> Rows:
+    """Return the colours (n, 3), 0 to 255, of shares (n,) of the scale; shares beyond an end get its colour."""
     stops = np.array([rgb(colour) for colour in SCALE])
     at = np.linspace(0, 1, len(stops))
     return np.stack([np.interp(np.nan_to_num(shares), at, channel) for channel in stops.T], axis=1)
 
 
-def of_classes(numbers: np.ndarray) -> np.ndarray:
-    """Return the colours (n, 3), 0 to 255, of the numbers (n,) of classes."""
-    return np.array([rgb(colour) for colour in CLASSES])[numbers.astype(int) % len(CLASSES)]
+def of_classes(numbers: Array) -> Rows:
+    """Return the colours (n, 3), 0 to 255, of class numbers (n,)."""
+    return np.take([rgb(colour) for colour in CLASSES], numbers.astype(int) % len(CLASSES), axis=0)
 
 
 # Fields on the surface
 
 
-NEAR = 0.01  # of the longest side of a body: gaps up to this are told apart
-PREFIXES = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
-LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}  # of pascals alone: a body is some 2000 m long
+PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
 
 @dataclass(frozen=True)
 class Colouring:
-    """A field on the surface points.
+    """A scalar field on the surface points, with its colour scale.
 
     title   : what it is
     unit    : "m", "Pa", "%"; "" where the numbers are those of classes
     values  : number of a frame -> (v,)
     high    : end of the scale, which begins at 0
     classes : names, where the field is a number of a class; those without a name are not in the legend
-    below   : what is shown is so much less the values, from 0 to that; None: the values themselves
     """
 
     title: str
     unit: str
-    values: Callable[[int], np.ndarray]
+    values: Callable[[int], Floats]
     high: float = 1.0
     classes: tuple[str, ...] = ()
-    below: float | None = None
 
-    def shares(self, index: int) -> np.ndarray:
+    def shares(self, index: int) -> Floats:
         """Return the values (v,) of a frame as shares of the scale's end."""
         return self.values(index) / (self.high or 1.0)
 
-    def rgb(self, index: int) -> np.ndarray:
+    def rgb(self, index: int) -> Rows:
         """Return the colours (v, 3) of a frame, 0 to 255."""
         return of_classes(self.values(index)) if self.classes else on_scale(self.shares(index))
 
@@ -90,56 +86,49 @@ class Colouring:
         """Both ends of the scale, in the unit that the title names: ("0", "displacement [mm]", "12.5")."""
         if self.unit == "%":
             return "0", f"{self.title} [%]", f"{100 * self.high:.3g}"
-        largest = self.below or self.high
-        prefixes = LARGE | PREFIXES if self.unit == "Pa" else PREFIXES
-        size = next((size for size in prefixes if largest >= size), 1.0)
-        title = f"{self.title} [{prefixes[size]}{self.unit}]"
-        if self.below is None:
-            return "0", title, f"{self.high / size:.3g}"
-        return f"{self.below / size:.3g} or more", title, "0"
+        size = next((size for size in PREFIXES if self.high >= size), 1.0)
+        return "0", f"{self.title} [{PREFIXES[size]}{self.unit}]", f"{self.high / size:.3g}"
 
 
 def colouring_of(subject: Drawable, name: str, reference: Result | None = None) -> Colouring:
-    """Return a field by its name; `reference` is the result that an error is counted from. Raises InputError."""
+    """Return a field by name. Raises InputError.
+
+    reference : the result that an error is counted from
+    """
     if name not in COLOURINGS:
         near = did_you_mean(name, COLOURINGS)
         raise InputError(f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}")
     if (name == "error") != (reference is not None):
         raise InputError("--colour error goes with --reference OUT.h5, the result that it is counted from")
-    if subject.embedding is None:
-        raise InputError(f"--colour: {subject.name} is a mesh alone, without fields")
     return COLOURINGS[name](subject, reference)
 
 
 def _displacement(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the distance from the point's place at rest."""
-
-    def values(index: int) -> np.ndarray:
-        return np.linalg.norm(subject.surface(index) - subject.rest.points, axis=1)
-
-    return Colouring("displacement", "m", values)
+    """Return the field of distances from the points at rest."""
+    rest = subject.rest.points
+    return Colouring("displacement", "m", lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1))
 
 
 def _speed(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the way between the frames before and after, over the time between them."""
+    """Return the field of mean speeds between the frames before and after."""
     last = len(subject.times) - 1
 
-    def values(index: int) -> np.ndarray:
+    def values(index: int) -> Floats:
         before, after = max(index - 1, 0), min(index + 1, last)
         if before == after:
             return np.zeros(len(subject.rest.points))
-        way = subject.surface(after) - subject.surface(before)
-        return np.linalg.norm(way, axis=1) / (subject.times[after] - subject.times[before])
+        velocity = (subject.surface(after) - subject.surface(before)) / (subject.times[after] - subject.times[before])
+        return np.asarray(np.linalg.norm(velocity, axis=1))
 
     return Colouring("speed", "m/s", values)
 
 
 def _strain(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the springs' change of length over their rest length, its root mean square around a node."""
+    """Return the field of the springs' relative change of length, root mean square around a node."""
     springs, rest_length = subject.array("lattice/springs"), subject.array("lattice/rest_length")
     count = np.maximum(1, np.bincount(springs.ravel(), minlength=len(subject.rest.nodes)))
 
-    def values(index: int) -> np.ndarray:
+    def values(index: int) -> Floats:
         nodes = subject.nodes(index)
         length = np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1)
         squares = np.repeat((length / rest_length - 1) ** 2, 2)
@@ -149,34 +138,34 @@ def _strain(subject: Drawable, _: Result | None) -> Colouring:
 
 
 def _stress(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by von Mises' stress, the mean of the cells around a node carried by the embedding."""
+    """Return the field of von Mises' stress at the nodes, carried by the embedding."""
     von_mises = subject.von_mises
     if von_mises is None:
-        if subject.scene is not None and subject.scene.material.poisson is None:
+        if subject.scene.material.poisson is None:
             raise InputError(f"--colour stress: {subject.name} is of springs, whose law has no stress")
         raise InputError(f"--colour stress: {subject.name} has no stress: run its scene with output.stress = true")
     return Colouring("von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)))
 
 
 def _error(subject: Drawable, reference: Result | None) -> Colouring:
-    """Colour by the distance from the same point of another result at the same time."""
+    """Return the field of distances from another result at the same time."""
     assert reference is not None  # as colouring_of sees to
     times = reference.frames.time[:]
     match = dict(common_times(subject.times, times))
 
-    def values(index: int) -> np.ndarray:
+    def values(index: int) -> Floats:
         if index not in match:
             raise InputError(f"{reference.path} has no frame of {subject.times[index]:.6g} s, as frame {index}")
         true = reference.frames.surface[match[index]]
         apart = np.linalg.norm(subject.surface(index)[: len(true)] - true, axis=1)  # of the file's points, the first
-        return apart if subject.carry is None else subject.carry @ apart
+        return np.asarray(apart if subject.carry is None else subject.carry @ apart)
 
     return Colouring("distance from the reference", "m", values)
 
 
 def _part(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the last of the scene's parts that the nearest cell belongs to."""
-    rest, parts = subject.rest, list(subject.scene.tables("part")) if subject.scene else []
+    """Return the field of the scene's part to which the nearest cell belongs last."""
+    rest, parts = subject.rest, list(subject.scene.tables("part"))
     if not parts:
         raise InputError(f"--colour part: the scene of {subject.name} has no part")
     number = np.zeros(len(rest.cells))
@@ -186,28 +175,9 @@ def _part(subject: Drawable, _: Result | None) -> Colouring:
     return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts)))
 
 
-def _contact(subject: Drawable, _: Result | None) -> Colouring:
-    """Colour by the gap to obstacles, and where the scene has self-contact to parts of the surface, as far as near."""
-    scene, rest = subject.scene, subject.rest
-    if scene is None or not (scene.obstacle or scene.self_contact):
-        raise InputError(f"--colour contact: the scene of {subject.name} has neither obstacles nor self-contact")
-    reach = NEAR * float(np.ptp(rest.bounds, axis=1).max())
-    surface = SurfaceGaps(rest.points, subject.triangles, rest.body_of_point, reach) if scene.self_contact else None
-    touched = [word for word, there in (("obstacles", scene.obstacle), ("the surface itself", surface)) if there]
-
-    def values(index: int) -> np.ndarray:
-        points = subject.surface(index)
-        gaps = gaps_to_obstacles(scene.obstacle, subject.solids, points, float(subject.times[index]))
-        if surface is not None:
-            gaps = np.minimum(gaps, surface.distances(points))
-        return reach - np.clip(gaps, 0, reach)
-
-    return Colouring(f"gap to {' and '.join(touched)}", "m", values, below=reach)
-
-
 def plain_colouring(subject: Drawable) -> Colouring | None:
-    """Return colours of bodies that no field colours: each its own; None of one alone."""
-    number = subject.rest.body_of_point % len(CLASSES)
+    """Return a colour for each body, or None for a single body."""
+    number = (subject.rest.body_of_point % len(CLASSES)).astype(float)
     return Colouring("body", "", lambda _: number, 1.0, ("",) * len(CLASSES)) if number.any() else None
 
 
@@ -218,13 +188,12 @@ COLOURINGS: dict[str, Callable[[Drawable, Result | None], Colouring]] = {
     "stress": _stress,
     "error": _error,
     "part": _part,
-    "contact": _contact,
 }
 
 
 @contextmanager
 def opened_reference(path: Path | None, run: Result) -> Iterator[Result | None]:
-    """Open the result that errors are counted from, if there is one. Raises InputError where its mesh is another."""
+    """Open the reference result of errors, if any. Raises InputError where its mesh is another."""
     if path is None:
         yield None
         return
@@ -234,7 +203,5 @@ def opened_reference(path: Path | None, run: Result) -> Iterator[Result | None]:
 
 
 def scaled(colouring: Colouring, frames: Iterable[int]) -> Colouring:
-    """Return the colouring with a scale that ends at the greatest value of these frames."""
-    return replace(
-        colouring, high=colouring.below or max(float(colouring.values(index).max(initial=0)) for index in frames)
-    )
+    """Return a field whose colour scale ends at the greatest value in these frames."""
+    return replace(colouring, high=max(float(colouring.values(index).max(initial=0)) for index in frames))

@@ -1,10 +1,11 @@
-"""The composition of pictures, films and pages: the camera that sees all frames drawn, their colours, their extent."""
+"""The composition of pictures, films and pages: one camera, colour scale and extent for all frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.errors import InputError
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
@@ -20,7 +21,7 @@ LABELS = np.array([0.55, 0.15])  # of the bodies' longest extent: beside and abo
 
 @dataclass(frozen=True)
 class Style:
-    """How a picture, a film or a page is to look: what ``msmpetsc render`` is asked for, beside frames and files.
+    """The look of a picture, film or page as ``msmpetsc render`` is asked for it.
 
     eye    : direction (3,) from the body to the eye; the scene's picture.eye if None
     colour : name of a field
@@ -38,8 +39,7 @@ class Style:
 
 @dataclass(frozen=True)
 class Still:
-    """One picture: the number of its frame, what stands beside the body, two lines below it, and what is shown of the
-    lattice."""
+    """One picture: number of its frame, obstacles and forces, a caption of two lines, and cells shown."""
 
     index: int
     overlays: Overlays
@@ -49,32 +49,33 @@ class Still:
 
 @dataclass(frozen=True)
 class Composition:
-    """All frames that are drawn of a subject, as far as must be known before the first.
+    """All frames to be drawn of a subject, with the camera, colours and extent that they share.
 
     extremes  : (e, 3) points that reach farthest in some direction at some frame [m]
     camera    : of all stills
     colouring : with its scale; None for a plain body
-    fixed     : whether any of the surface is ever pinned or led
     """
 
     subject: Drawable
     style: Style
-    extremes: np.ndarray
+    extremes: Positions
     camera: Camera
     colouring: Colouring | None
-    fixed: bool
 
     @property
-    def box(self) -> np.ndarray:
+    def box(self) -> Positions:
         """Corners (2, 3) of the box around all frames [m]."""
         return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
     def cut(self, shown: tuple[str, ...]) -> Cut | None:
-        """Return what is shown of the lattice, as the camera sees it."""
+        """Return the cells and springs behind the body's middle, as the camera sees it."""
         return cut_open(self.subject, self.camera, shown) if shown else None
 
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
-        """Return the still of each frame, with its time and words below; equal ones in a row are one."""
+        """Return the still of each frame, with its time and `words` in the caption.
+
+        Equal stills in a row are one object.
+        """
         cut = self.cut(self.style.shown)
         made: list[Still] = []
         for index in frames:
@@ -85,9 +86,11 @@ class Composition:
             made.append(Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
         return made
 
-    def room(self, stills: Sequence[Still]) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return lower left (2,) and upper right (2,) of all stills in the picture's plane, with a margin, and how
-        deep they reach [m]. Of a ground it is what lies below the bodies, their shadows."""
+    def room(self, stills: Sequence[Still]) -> tuple[Floats, Floats, float]:
+        """Return lower left (2,) and upper right (2,) of all stills in the picture's plane, and their depth [m].
+
+        With a margin. Of a ground only the shadows of the bodies count.
+        """
         margin = (LABELS if self.style.axes else MARGIN) * np.ptp(self.box, axis=0).max()
         ends, corners = [], [self.extremes]
         for still in stills:
@@ -103,7 +106,7 @@ class Composition:
 def composition_of(
     subject: Drawable, frames: Sequence[int], style: Style, reference: Result | None = None
 ) -> Composition:
-    """Read the surfaces of the frames, one at a time. Raises InputError where they cannot be drawn.
+    """Return the composition of frames, which are read one at a time. Raises InputError.
 
     reference : result that the colour "error" is counted from
     """
@@ -126,5 +129,4 @@ def composition_of(
     if colouring is not None and style.colour:
         colouring = scaled(colouring, distinct)
     camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
-    fixed = any(subject.fixed(index).any() for index in (distinct[0], distinct[-1]))
-    return Composition(subject, style, everywhere, camera, colouring, fixed)
+    return Composition(subject, style, everywhere, camera, colouring)

@@ -1,4 +1,4 @@
-"""What is drawn: a body at its times, of a result, of a scene that was not run yet, or of a mesh alone."""
+"""Bodies to be drawn: of a result in time, or of a scene before its first step."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
 from msmpetsc.constraints.loads import within
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside_bodies
@@ -27,25 +28,25 @@ FARTHEST = 1e15  # [m]: what is drawn has single precision, and its squares must
 
 @dataclass(frozen=True)
 class BodiesAtRest:
-    """The bodies at rest: nodes (n, 3) [m], cells (c, 8) of them, surface points (v, 3) [m].
+    """Bodies at rest: nodes (n, 3) [m], cells (c, 8) and surface points (v, 3) [m].
 
     body_of_node, body_of_point : numbers (n,), (v,) of their bodies
     """
 
-    nodes: np.ndarray
-    cells: np.ndarray
-    points: np.ndarray
-    body_of_node: np.ndarray
-    body_of_point: np.ndarray
+    nodes: Positions
+    cells: Indices
+    points: Positions
+    body_of_node: Indices
+    body_of_point: Indices
 
     @property
-    def bounds(self) -> np.ndarray:
+    def bounds(self) -> Positions:
         """Corners (b, 2, 3) of the bounding box of each body's surface [m]."""
         of_bodies = (self.points[self.body_of_point == number] for number in range(self.body_of_point.max() + 1))
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
-    def find(self, table: OfBody) -> np.ndarray:
-        """Tell which nodes (n,) a table's region means; none if it is painted in a file."""
+    def find(self, table: OfBody) -> Mask:
+        """Return which nodes (n,) lie in a table's region; none if it is painted in a file."""
         region = table.table.region
         if region.painted is not None:
             return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
@@ -53,27 +54,27 @@ class BodiesAtRest:
         return inside_bodies(region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body)
 
     @property
-    def middles(self) -> np.ndarray:
+    def middles(self) -> Positions:
         """Centres (c, 3) of the cells [m]."""
-        return self.nodes[self.cells].mean(axis=1)
+        return np.asarray(self.nodes[self.cells].mean(axis=1))
 
-    def find_cells(self, table: OfBody) -> np.ndarray:
-        """Tell which cells (c,) the region of a table means, by their centres; none if it is painted in a file."""
+    def find_cells(self, table: OfBody) -> Mask:
+        """Return which cells (c,) have their centres in a table's region; none if it is painted in a file."""
         region = table.table.region
         if region.painted is not None:
             return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
         return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
 
-    def _painted_cells(self, table: OfBody) -> np.ndarray:
-        """Return the numbers of the cells of the table's body around its painted points."""
+    def _painted_cells(self, table: OfBody) -> Indices:
+        """Return the numbers of the cells of a table's body around its painted points."""
         painted, number = table.table.region.painted, table.body or 0
         if not isinstance(painted, tuple):  # listed in a file, which the result does not hold
             return np.empty(0, int)
         points = self.points[self.body_of_point == number][list(painted)]
         return self.cells_around(points, np.full(len(points), number))
 
-    def cells_around(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Return the numbers (k,) of the cells of bodies (k,) that points (k, 3) lie in."""
+    def cells_around(self, points: Positions, body: Indices) -> Indices:
+        """Return the numbers (k,) of the cells that contain points (k, 3) of bodies (k,)."""
         of_cell, around = self.body_of_node[self.cells[:, 0]], np.empty(len(points), int)
         for number in np.unique(body):
             own, inside = np.flatnonzero(of_cell == number), body == number
@@ -83,16 +84,15 @@ class BodiesAtRest:
 
 @dataclass(frozen=True)
 class Drawable:
-    """A body and the scene that says what stands beside it.
+    """Bodies in time, and the scene with their obstacles and forces.
 
     name      : of its file, for messages
-    scene     : None for a mesh alone
     pinned    : (n,) which nodes are
     triangles : (f, 3) of the surface points
     times     : (T,) of its frames [s]
     nodes     : number of a frame -> node positions (n, 3) [m]
     surface   : number of a frame -> surface points (v, 3) [m]
-    embedding : W (v, n); None where the surface points are the nodes
+    embedding : W (v, n)
     array     : name of a dataset of a result, "lattice/springs" -> its numbers
     solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
     von_mises : number of a frame -> stress at the nodes (n,) [Pa]; None where none was stored
@@ -100,51 +100,51 @@ class Drawable:
     """
 
     name: str
-    scene: SceneFile | None
+    scene: SceneFile
     rest: BodiesAtRest
-    pinned: np.ndarray
-    triangles: np.ndarray
-    times: np.ndarray
-    nodes: Callable[[int], np.ndarray]
-    surface: Callable[[int], np.ndarray]
-    embedding: csr_array | None
-    array: Callable[[str], np.ndarray]
+    pinned: Mask
+    triangles: Indices
+    times: Floats
+    nodes: Callable[[int], Positions]
+    surface: Callable[[int], Positions]
+    embedding: csr_array
+    array: Callable[[str], Array]
     solids: Mapping[int, Surface]
     carry: csr_array | None = None
-    von_mises: Callable[[int], np.ndarray] | None = None
+    von_mises: Callable[[int], Floats] | None = None
 
     @property
     def title(self) -> str:
         """Title of the scene, or the file's name."""
-        return (self.scene and self.scene.title) or Path(self.name).stem
+        return self.scene.title or Path(self.name).stem
 
     @property
     def gravity(self) -> tuple[float, ...] | None:
-        """The scene's acceleration (3,) [m/s^2], which says what is up."""
-        return self.scene.gravity.acceleration if self.scene and self.scene.gravity else None
+        """Acceleration of gravity (3,) [m/s^2], or None."""
+        return self.scene.gravity.acceleration if self.scene.gravity else None
 
     @property
     def eye(self) -> tuple[float, ...] | None:
-        """Direction (3,) of the scene's picture, from the body to the eye."""
-        return self.scene.picture.eye if self.scene else None
+        """Direction (3,) from the body to the eye in the scene's picture."""
+        return self.scene.picture.eye
 
-    def fixed(self, index: int) -> np.ndarray:
-        """Return how far each surface point is pinned or led at a frame, (v,) in [0, 1]."""
+    def fixed(self, index: int) -> Floats:
+        """Return the pinned or led share (v,) in [0, 1] of each surface point at a frame."""
         fixed = self.pinned.copy()
-        for anchor in self.scene.tables("anchor") if self.scene else ():
+        for anchor in self.scene.tables("anchor"):
             if within(float(self.times[index]), 0.0, anchor.table.stop):
                 fixed |= self.rest.find(anchor)
         return self.on_surface(fixed.astype(float), 1.0)
 
-    def on_surface(self, numbers: np.ndarray, most: float = np.inf) -> np.ndarray:
-        """Return what numbers (n,) of the nodes are at the surface points, (v,) in [0, most]."""
+    def on_surface(self, numbers: Floats, most: float = np.inf) -> Floats:
+        """Return numbers (n,) of the nodes interpolated to the surface points, (v,) in [0, most]."""
         if not numbers.any():
             return np.zeros(len(self.rest.points))
-        return np.clip(numbers if self.embedding is None else self.embedding @ numbers, 0, most)
+        return np.asarray(np.clip(self.embedding @ numbers, 0, most))
 
 
 def drawable_of_result(run: Result) -> Drawable:
-    """Return what a result shows. Raises InputError where it cannot be drawn."""
+    """Return the bodies of a result. Raises InputError where they cannot be drawn."""
     scene = read_scene(run)
     if "embedding/weights" not in run:
         raise InputError(f"{run.path} has no surface to draw: its scene says output.surface = false")
@@ -173,7 +173,7 @@ def drawable_of_result(run: Result) -> Drawable:
 
 
 def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
-    """Return what a scene is before its first step, from the model that one process built of it."""
+    """Return the bodies of a scene before its first step, from a model on one process."""
     lattice, surface, embedding, owned = model.lattice, model.surface, model.embedding, model.lattice.owned
     if surface is None or embedding is None:
         raise InputError(f"{path} has no surface to draw: it says output.surface = false")
@@ -199,26 +199,8 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     )
 
 
-def drawable_of_surface(path: Path, surface: Surface) -> Drawable:
-    """Return a mesh as it lies in its file, in the file's own unit: the nodes are its points."""
-    points, no_cells, body = surface.points, np.empty((0, 8), int), np.zeros(len(surface.points), int)
-    return Drawable(
-        name=str(path),
-        scene=None,
-        rest=BodiesAtRest(points, no_cells, points, body, body),
-        pinned=np.zeros(len(points), bool),
-        triangles=surface.triangles,
-        times=np.zeros(1),
-        nodes=lambda _: points,
-        surface=lambda _: points,
-        embedding=None,
-        array={"lattice/cell_kind": no_cells[:, 0], "lattice/springs": no_cells[:, :2]}.__getitem__,
-        solids={},
-    )
-
-
 def solids_of(run: Result) -> dict[int, Surface]:
-    """Return surfaces of obstacles that a result holds. Raises InputError for damaged ones."""
+    """Return the obstacle surfaces stored in a result. Raises InputError for damaged ones."""
     if "obstacle/points" not in run:
         return {}
     points, triangles, numbers = run["obstacle/points"][:], run.indices("obstacle/triangles"), run["obstacle/number"][:]
@@ -228,7 +210,7 @@ def solids_of(run: Result) -> dict[int, Surface]:
 
 
 def read_scene(run: Result) -> SceneFile:
-    """Return the scene of a result, as run, with its keys checked."""
+    """Return the scene of a result with its keys checked. Raises InputError."""
     try:
         return SceneFile.model_validate(run.scene)
     except (InputError, ValueError, TypeError, AttributeError, RecursionError) as error:  # pydantic's among them

@@ -1,4 +1,4 @@
-"""Films: the frames of a result one after the other, for 3 to 8 s, and how fast they go."""
+"""Films of a result: its frames as MP4, GIF or WebP, and the speed at which they play."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import whole_file
@@ -23,27 +24,27 @@ from msmpetsc.view.renderer import Renderer
 LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
 USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
 QUALITY = 8  # of 10, as imageio-ffmpeg counts
-FASTEST = 30.0  # pictures a second, where nothing is said
+FASTEST = 30.0  # pictures a second
 LENGTHS = 3.0, 8.0  # [s] that a film lasts, where nothing is said
 STEPS = (1, 2, 5)  # times powers of ten: how much slower or faster
 
 
 @dataclass(frozen=True)
 class Playback:
-    """How fast a film goes.
+    """The frames and the speed at which a film plays.
 
     numbers : which of the frames each picture shows
     fps     : pictures a second
     speed   : simulated seconds a second; 0 where they are not in order of time
     """
 
-    numbers: np.ndarray
+    numbers: Indices
     fps: float
     speed: float
 
     @property
     def words(self) -> str:
-        """How fast time goes: "10 times slower than real"; "" where it goes as it does."""
+        """Speed in words: "10 times slower than real"; "" in real time."""
         if self.speed in (0.0, 1.0):
             return ""
         if self.speed < 1:
@@ -52,7 +53,7 @@ class Playback:
 
 
 def usual_speed(span: float) -> float:
-    """Return the simulated seconds a second at which a span [s] takes 3 to 8 s: 1, or what is round and nearest."""
+    """Return the round simulated seconds a second at which a time span [s] takes 3 to 8 s."""
     if not 0 < span < np.inf:
         return 1.0
     factors = np.outer(10.0 ** np.arange(20), STEPS).ravel()
@@ -62,22 +63,18 @@ def usual_speed(span: float) -> float:
     return float(factors[np.argmax(span / factors <= most)])
 
 
-def playback_of(times: np.ndarray, fps: float | None = None, speed: float | None = None) -> Playback:
-    """Return the playback of frames at these times (k,) [s].
+def playback_of(times: Floats, speed: float | None = None) -> Playback:
+    """Return the playback of frames at these times (k,) [s], which lasts 3 to 8 s unless a speed is given.
 
-    So that it lasts 3 to 8 s unless fps or speed says otherwise. With fps alone every frame is one picture; with both,
-    or speed, each picture shows the frame nearest to its time. Raises InputError where time does not go on.
+    Each picture shows the frame nearest to its time. Raises InputError where time does not go on.
     """
-    count = np.arange(len(times))
     steps = np.diff(times)
     if len(times) == 1 or not (steps > 0).all():
         if speed is not None:
             raise InputError("--speed needs frames in order of time, more than one")
-        return Playback(count, fps or FASTEST / 3, 0.0)
-    if fps is not None and speed is None:
-        return Playback(count, fps, float(steps.mean() * fps))
+        return Playback(np.arange(len(times)), FASTEST / 3, 0.0)
     speed = speed or usual_speed(float(times[-1] - times[0]))
-    fps = fps or max(1.0, min(FASTEST, speed / float(np.median(steps))))
+    fps = max(1.0, min(FASTEST, speed / float(np.median(steps))))
     shown = times[0] + np.arange(0, (times[-1] - times[0]) * (1 + 1e-9) + speed / fps / 2, speed / fps)
     return Playback(abs(shown[:, None] - times).argmin(axis=1), fps, speed)
 
@@ -90,7 +87,7 @@ def write_film(
     playback: Playback,
     reference: Result | None = None,
 ) -> None:
-    """Write a film of these frames at a playback. Raises InputError where it cannot be drawn or written."""
+    """Write a film of some frames. Raises InputError where it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
     composition = composition_of(drawn(subject), played, style, reference)
     stills = composition.stills(played, playback.words)
@@ -105,8 +102,8 @@ def write_film(
     write_pictures(path, _pictures(composition, stills, size), size, playback.fps)
 
 
-def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Yield the picture (height, width, 3) of each still; of equal ones in a row the first is drawn only."""
+def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[Array]:
+    """Yield the picture (height, width, 3) of each still; equal ones in a row are drawn once."""
     width, height = size
     letters = min(1.0, max(height / USUAL, SMALLEST))
     entries = entries_of(composition, stills)
@@ -124,8 +121,8 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
             yield picture
 
 
-def write_pictures(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
-    """Write pictures (height, width, 3) as a film, named when it is whole. Raises InputError."""
+def write_pictures(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+    """Write pictures (height, width, 3) as a film. Raises InputError."""
     with whole_file(path) as part:
         if path.suffix.lower() == ".mp4":
             _write_video(part, pictures, size, fps)
@@ -133,8 +130,8 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, 
             _write_images(part, pictures, fps)
 
 
-def _write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
-    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError for a film that is not whole.
+def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError for an incomplete film.
 
     That is asked of the film itself, for imageio-ffmpeg does not ask how ffmpeg ended.
     """
@@ -155,8 +152,8 @@ def _write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, in
         raise OSError("ffmpeg did not write all of it: the disk may be full")
 
 
-def _write_images(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """Write a GIF or an animated WebP, for ever over; Pillow takes the pictures together."""
+def _write_images(path: Path, pictures: Iterable[Array], fps: float) -> None:
+    """Write an endless GIF or animated WebP by Pillow, which takes all pictures at once."""
     images = [Image.fromarray(picture) for picture in pictures]
     options: dict[str, Any] = dict(quality=80, method=4)
     if path.suffix.lower() == ".gif":

@@ -1,4 +1,4 @@
-"""The meshes that are drawn: the surface, and cells and springs of the half of the lattice behind its middle.
+"""Meshes to be drawn: the surface, and cells and springs of the half of the lattice behind its middle.
 
 Triangles of the surface that are larger than cells follow the cells that carry them, and sharp edges are sharp. Drawn
 points are those of the file, in their order, then those put into long edges, then copies along sharp edges.
@@ -12,7 +12,7 @@ import pyvista as pv
 from scipy.sparse import csr_array, eye_array, vstack
 from trimesh.triangles import points_to_barycentric
 
-from msmpetsc.errors import InputError
+from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
@@ -24,15 +24,15 @@ CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1
 
 
 def drawn(subject: Drawable) -> Drawable:
-    """Return the subject with its surface as it is drawn."""
+    """Return bodies with their surface refined and split for drawing."""
     return _split(_refined(subject))
 
 
 def _refined(subject: Drawable) -> Drawable:
-    """Return the subject with no edge of its surface longer than a cell, new points carried by the cells."""
+    """Return bodies with no edge of their surface longer than a cell; cells carry the new points."""
     rest, W = subject.rest, subject.embedding
-    cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max()) if len(rest.cells) else 0.0
-    if W is None or cell == 0:
+    cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
+    if cell == 0:
         return subject
     a, b, c = rest.points[subject.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
@@ -51,10 +51,19 @@ def _refined(subject: Drawable) -> Drawable:
     )
 
 
-def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray, csr_array]:
-    """Return a surface whose edges longer than `longest` [m] are divided: points (p, 3), of which the first are those
-    given, triangles (f, 3), and the matrix (p, v) that carries numbers at the given points to these."""
-    surface = pv.PolyData.from_regular_faces(points, triangles)
+def surface_of(points: Array, triangles: Array) -> pv.PolyData:
+    """Return points (v, 3) and triangles (f, 3) as VTK's data set."""
+    surface: pv.PolyData = pv.PolyData.from_regular_faces(points, triangles)
+    return surface
+
+
+def subdivided(points: Positions, triangles: Indices, longest: float) -> tuple[Positions, Indices, csr_array]:
+    """Return a surface whose edges longer than `longest` [m] are divided.
+
+    It is points (p, 3), the first of which are those given, triangles (f, 3), and the matrix (p, v)
+    that carries numbers at the given points to these.
+    """
+    surface = surface_of(points, triangles)
     surface.cell_data["triangle"] = np.arange(len(triangles))
     fine = surface.subdivide_adaptive(max_edge_len=longest)
     around = np.zeros(fine.n_points, int)
@@ -62,15 +71,15 @@ def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> tup
     around[fine.regular_faces[largest_last]] = fine.cell_data["triangle"][largest_last, None]
     corners = triangles[around[len(points) :]]
     with np.errstate(all="ignore"):  # a triangle without an area has no such weights
-        weights = points_to_barycentric(points[corners], fine.points[len(points) :])
+        weights = points_to_barycentric(points[corners], fine.points[len(points) :])  # type: ignore[no-untyped-call]
     weights[~np.isfinite(weights).all(axis=1)] = 1 / 3
     shape = (len(corners), len(points))
     new = csr_array((weights.ravel(), corners.ravel(), 3 * np.arange(len(corners) + 1)), shape)
     return fine.points, fine.regular_faces, csr_array(vstack([eye_array(len(points)), new]))
 
 
-def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_array:
-    """Return the matrix (p, n) that carries points (p, 3) of bodies (p,) by the corners of the cells around them."""
+def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array:
+    """Return the matrix (p, n) of trilinear weights of nodes at points (p, 3) of bodies (p,)."""
     corners = rest.cells[rest.cells_around(points, body)]
     low, high = rest.nodes[corners[:, 0]], rest.nodes[corners[:, 6]]
     u = np.clip((points - low) / (high - low), 0, 1)[:, None]
@@ -80,7 +89,7 @@ def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_a
 
 
 def _split(subject: Drawable) -> Drawable:
-    """Return the subject with a copy of each point for every smooth piece of surface there."""
+    """Return bodies with a copy of each surface point for every smooth part of the surface around it."""
     rest, W = subject.rest, subject.embedding
     _, first, equal = np.unique(
         np.column_stack([rest.body_of_point, rest.points]), axis=0, return_index=True, return_inverse=True
@@ -92,17 +101,17 @@ def _split(subject: Drawable) -> Drawable:
         rest=rest,
         triangles=triangles,
         surface=lambda index: subject.surface(index)[origin],
-        embedding=None if W is None else W[origin],
+        embedding=W[origin],
         carry=(csr_array(eye_array(len(subject.rest.points))) if subject.carry is None else subject.carry)[origin],
     )
 
 
-def split_at_edges(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points that drawn points are copies of, (d,), the first v themselves, and triangles (f, 3) of them.
+def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indices]:
+    """Return the original (d,) of each drawn point, the first v themselves, and triangles (f, 3).
 
     Two corners of triangles at one point stay one drawn point where no sharp edge parts them.
     """
-    surface = pv.PolyData.from_regular_faces(points, triangles)
+    surface = surface_of(points, triangles)
     options: dict[str, Any] = dict(consistent_normals=False, non_manifold_traversal=False, cell_normals=False)
     split = surface.compute_normals(split_vertices=True, feature_angle=SHARP, **options)
     return split["pyvistaOriginalPointIds"], split.regular_faces
@@ -117,28 +126,21 @@ KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "
 
 @dataclass(frozen=True)
 class Cut:
-    """What is left of the lattice when the half before its middle is taken away.
+    """The half of the lattice that remains when the half before its middle is cut away.
 
     cells   : (c, 8) by their kind
     springs : (s, 2), both ends of which lie behind
     """
 
-    cells: dict[int, np.ndarray]
-    springs: np.ndarray
-
-    @property
-    def used(self) -> np.ndarray:
-        """Numbers of the nodes of cells and springs, each once."""
-        return np.unique(np.concatenate([part.ravel() for part in (*self.cells.values(), self.springs)]))
+    cells: dict[int, Indices]
+    springs: Indices
 
 
 def cut_open(subject: Drawable, camera: Camera, shown: tuple[str, ...]) -> Cut:
-    """Return the half of the lattice behind the middle of the body at rest. Raises InputError where there is none."""
-    if not len(subject.rest.cells):
-        raise InputError(f"--show: {subject.name} is a mesh without cells")
+    """Return the half of the lattice behind the middle of the body at rest."""
     cells, depth = subject.rest.cells, subject.rest.nodes @ camera.to_eye
     middle = (depth.min() + depth.max()) / 2
-    parts: dict[int, np.ndarray] = {}
+    parts: dict[int, Indices] = {}
     if "cells" in shown:
         behind, kind = depth[cells].mean(axis=1) <= middle, subject.array("lattice/cell_kind")
         parts = {number: cells[behind & (kind == number)] for number in KINDS}

@@ -1,9 +1,10 @@
-"""What stands beside the body at a time: obstacles, and arrows for the forces, in the scene's axes [m]."""
+"""Obstacles and force arrows around the bodies at a time, in the scene's axes [m]."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.constraints.loads import Motion, total_of, within
 from msmpetsc.geometry.surface import bounds_of
 from msmpetsc.scene.schema import SceneFile
@@ -20,37 +21,37 @@ THICKNESS = 0.02  # of a plate of glass, of the bodies' longest extent
 
 @dataclass(frozen=True)
 class Ground:
-    """A plane that the body stands on or lies against: corners (4, 3) around the disk drawn, unit normal (3,)."""
+    """A plane drawn as ground: corners (4, 3) around its disk, unit normal (3,)."""
 
-    corners: np.ndarray
-    normal: np.ndarray
+    corners: Positions
+    normal: Floats
 
-    def below(self, points: np.ndarray) -> np.ndarray:
-        """Return the points of the plane that points (n, 3) are above."""
+    def below(self, points: Positions) -> Positions:
+        """Return the projection of points (n, 3) onto the plane."""
         return points - np.outer((points - self.corners[0]) @ self.normal, self.normal)
 
 
 @dataclass(frozen=True)
 class Ball:
-    """A sphere: center (3,), radius [m], and corners (8, 3) of the part of its bounding box that is worth showing."""
+    """A spherical obstacle: center (3,), radius [m], and corners (8, 3) of the visible part of its box."""
 
-    center: np.ndarray
+    center: Floats
     radius: float
-    seen: np.ndarray
+    seen: Positions
 
 
 @dataclass(frozen=True)
 class MeshObstacle:
-    """A mesh: number of its obstacle, how far it moved (3,) [m], corners (8, 3) as of a Ball."""
+    """An obstacle with a surface: its number, its displacement (3,) [m], corners (8, 3) as of a Ball."""
 
     number: int
-    by: np.ndarray
-    seen: np.ndarray
+    by: Floats
+    seen: Positions
 
 
 @dataclass(frozen=True)
 class Overlays:
-    """What stands beside the body in one picture.
+    """Obstacles and force arrows of one picture.
 
     grounds : planes drawn as they are
     glass   : (8, 3) corners each, of boxes and of planes that would hide the body; corner number 4i + 2j + k
@@ -60,26 +61,24 @@ class Overlays:
     """
 
     grounds: list[Ground] = field(default_factory=list)
-    glass: list[np.ndarray] = field(default_factory=list)
-    arrows: list[np.ndarray] = field(default_factory=list)
+    glass: list[Positions] = field(default_factory=list)
+    arrows: list[Positions] = field(default_factory=list)
     balls: list[Ball] = field(default_factory=list)
     meshes: list[MeshObstacle] = field(default_factory=list)
 
     @property
-    def obstacles(self) -> np.ndarray:
-        """Corners (n, 3) of boxes and plates, and of what of a ball or a mesh is to be seen [m]."""
+    def obstacles(self) -> Positions:
+        """Corners (n, 3) of all obstacles but grounds, as far as they are visible [m]."""
         seen = [*(ball.seen for ball in self.balls), *(mesh.seen for mesh in self.meshes)]
         return np.concatenate([np.empty((0, 3)), *self.glass, *seen])
 
 
-def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camera) -> Overlays:
-    """Return what stands beside the body at a frame.
+def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera) -> Overlays:
+    """Return the obstacles and force arrows of a frame.
 
     bodies : (b, 3) surface points of all pictures [m], which say how much of an obstacle is worth showing
     """
     scene, time, solids = subject.scene, float(subject.times[index]), subject.solids
-    if scene is None:
-        return Overlays()
     shown = Overlays(arrows=_arrows(scene, time, subject.rest, subject.nodes(index)))
     for number, obstacle in enumerate(scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):
@@ -101,8 +100,8 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
     return shown
 
 
-def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, camera: Camera) -> None:
-    """Add a plane as ground, or as a plate of glass where it hides the body; far from it, none."""
+def _add_plane(shown: Overlays, point: Floats, normal: Floats, bodies: Positions, camera: Camera) -> None:
+    """Add a near plane, as ground or, where it hides the body, as a plate of glass."""
     if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
         return
     sides = _sides(normal)
@@ -118,24 +117,24 @@ def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: n
         shown.glass.append(np.concatenate([front, front - THICKNESS * _reach(bodies) * normal]))
 
 
-def _reach(bodies: np.ndarray) -> float:
-    return np.ptp(bodies, axis=0).max()
+def _reach(bodies: Positions) -> float:
+    return float(np.ptp(bodies, axis=0).max())
 
 
-def _sides(normal: np.ndarray) -> np.ndarray:
-    """Return two unit vectors (2, 3) of a plane, the first along an axis of the scene if it can."""
+def _sides(normal: Floats) -> Rows:
+    """Return two orthogonal unit vectors (2, 3) in a plane, the first along an axis if possible."""
     across = min(np.eye(3), key=lambda axis: abs(axis @ normal))
     first = unit(across - (across @ normal) * normal)
     return np.array([first, np.cross(normal, first)])
 
 
-def corners_of(box: np.ndarray) -> np.ndarray:
-    """Return the corners (2^d, d) of a box (2, d), the last axis first: those in space have the numbers 4i + 2j + k."""
+def corners_of(box: Positions) -> Positions:
+    """Return the corners (2^d, d) of a box (2, d), the last axis first: number 4i + 2j + k in space."""
     return np.array([[box[end, axis] for axis, end in enumerate(ends)] for ends in np.ndindex((2,) * box.shape[1])])
 
 
-def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
-    """Return the corners (8, 3) of a box (2, 3), cut where it is much longer than the bodies; none if far away."""
+def _box(box: Positions, bodies: Positions) -> list[Positions]:
+    """Return the corners (8, 3) of a box (2, 3), clipped near the bodies; none for a distant box."""
     low, high = bodies.min(axis=0), bodies.max(axis=0)
     extent = high - low
     margin = (CUT - 1) / 2 * extent
@@ -147,7 +146,7 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
     return [corners_of(box)]
 
 
-def _arrows(scene: SceneFile, time: float, rest: BodiesAtRest, position: np.ndarray) -> list[np.ndarray]:
+def _arrows(scene: SceneFile, time: float, rest: BodiesAtRest, position: Positions) -> list[Positions]:
     length = ARROW * np.ptp(rest.bounds, axis=1).max()
     arrows = []
     for table in scene.tables("force"):

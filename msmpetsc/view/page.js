@@ -21,11 +21,6 @@ const colour = (text) => [1, 3, 5].map((k) => parseInt(text.slice(k, k + 2), 16)
 
 // Unpacking
 
-async function numbersOf(name, count) { // of so many things
-  const packed = await inflated(name);
-  return new (count > 65535 ? Uint32Array : Uint16Array)(packed.buffer);
-}
-
 async function inflated(name) {
   const text = atob(data.streams[name]), bytes = new Uint8Array(text.length);
   for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
@@ -33,8 +28,8 @@ async function inflated(name) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-function predicted(bytes, count) { // the frames' positions of so many points, from what is left of their prediction
-  const n = 3 * count, all = new Uint16Array(frames * n);
+function predicted(bytes) { // the frames' positions, from what is left of their prediction
+  const n = 3 * points, all = new Uint16Array(frames * n);
   for (let f = 0; f < frames; f++) {
     const low = 2 * n * f, high = low + n, at = n * f, p = at - n, q = p - n;
     for (let k = 0; k < n; k++) {

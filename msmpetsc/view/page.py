@@ -1,4 +1,4 @@
-"""A page for any browser, all in one file: the body turns with the mouse, its frames play under a slider.
+"""A web page of a result in one file: the body turns with the mouse, its frames play under a slider.
 
 page.html is its frame, page.css its look, page*.js draws and steers it; this file says what is drawn. Positions are
 whole numbers of 16 bits over the box around all frames. Frame by frame they are what is left of a prediction that goes
@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.progress_bar import counted
@@ -27,22 +27,22 @@ from msmpetsc.view import colours
 from msmpetsc.view.annotations import entries_of
 from msmpetsc.view.colours import Colouring
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
-from msmpetsc.view.drawable import FARTHEST, Drawable
+from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.film import usual_speed
-from msmpetsc.view.gaps import TINY, unit_vectors
-from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, drawn
+from msmpetsc.view.mesh import HELD, drawn
 from msmpetsc.view.overlays import Overlays
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
+TINY = 1e-300
 PARTS = files("msmpetsc.view")
-SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", "page_begin.js")
+SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js")
 
 
 def write_page(
     subject: Drawable, path: Path, frames: Sequence[int], style: Style, reference: Result | None = None
 ) -> None:
-    """Write the page of these frames; of fewer, evenly chosen, where it would be larger than `MOST`.
+    """Write the page of these frames, or of fewer if it would be larger than `MOST`.
 
     Raises InputError where they cannot be drawn or the page not be written.
     """
@@ -66,61 +66,27 @@ def write_page(
 
 
 def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, bytes]:
-    """Return positions, colours and triangles, and the lattice's nodes, cells and springs as far as they are shown, as
-    deflated bytes for the script to read. Raises InputError where they cannot be drawn."""
-    subject, cut = composition.subject, composition.cut(composition.style.shown)
+    """Return positions, colours and triangles as deflated bytes for the script."""
+    subject = composition.subject
+    bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     streams = {
         "positions": deflated(residuals(quantised(subject.surface, frames, composition.box))),
-        "triangles": packed_numbers(subject.triangles, len(subject.rest.points)),
+        "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
     }
     if composition.colouring is not None:
         streams["colours"] = deflated(changes(levels(composition.colouring, frames)))
-    if cut is not None:
-        used, cells = cut.used, np.concatenate([np.empty((0, 8), int), *cut.cells.values()])
-        box = lattice_box(subject, cut, frames)
-        streams |= {
-            "nodes": deflated(residuals(quantised(lambda index: subject.nodes(index)[used], frames, box))),
-            "cells": packed_numbers(np.searchsorted(used, cells), len(used)),
-            "springs": packed_numbers(np.searchsorted(used, cut.springs), len(used)),
-        }
     return streams
 
 
-def lattice_box(subject: Drawable, cut: Cut, frames: Iterable[int]) -> np.ndarray:
-    """Return the box (2, 3) around what is shown of a lattice [m]. Raises InputError where it cannot be drawn."""
-    ends = [(nodes.min(axis=0), nodes.max(axis=0)) for nodes in (subject.nodes(index)[cut.used] for index in frames)]
-    box = np.array([np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)])
-    if not (np.abs(box) < FARTHEST).all():
-        raise InputError(f"--show: {subject.name} has nodes that cannot be drawn")
-    return box
-
-
-def lattice_facts(subject: Drawable, cut: Cut, frames: Iterable[int]) -> dict[str, Any]:
-    """Return what the script must know of a lattice beside its streams."""
-    return {
-        "box": lattice_box(subject, cut, frames).tolist(),
-        "nodes": len(cut.used),
-        "kinds": [{"cells": len(part), "colour": KINDS[kind][0]} for kind, part in cut.cells.items()],
-        "springColour": colours.SPRING,
-        "shrunk": SHRUNK,
-        "opacity": THROUGH,
-    }
-
-
-def packed_numbers(numbers: np.ndarray, count: int) -> bytes:
-    """Return numbers of so many things, deflated: of 16 bits where these do."""
-    return zlib.compress(numbers.astype("<u2" if count <= LEVELS else "<u4").tobytes(), 6)
-
-
-def quantised(points: Callable[[int], np.ndarray], frames: Iterable[int], box: np.ndarray) -> Iterator[np.ndarray]:
+def quantised(points: Callable[[int], Positions], frames: Iterable[int], box: Positions) -> Iterator[Indices]:
     """Yield the points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
     scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
     for index in counted(list(frames), "frames packed"):
         yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
 
 
-def residuals(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
-    """Yield each frame less its prediction 2 p - q from the frames p, q before: all low bytes, then all high ones.
+def residuals(frames: Iterable[Indices]) -> Iterator[bytes]:
+    """Yield each frame less its linear extrapolation 2 p - q from the frames p, q before, low bytes first.
 
     A residual r is stored as 2 r, or -2 r - 1 where it is negative, so that small ones have no high byte.
     """
@@ -133,15 +99,15 @@ def residuals(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
         p, q = frame, p
 
 
-def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[np.ndarray]:
+def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[Array]:
     """Yield the colours (v,) of each frame as whole numbers of 8 bits: shares of the scale, or classes."""
     for index in frames:
         shown = colouring.values(index) if colouring.classes else 255 * colouring.shares(index)
         yield np.clip(np.round(np.nan_to_num(shown)), 0, 255).astype(np.uint8)
 
 
-def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
-    """Yield what each frame of numbers (v,) of 8 bits changes of the one before it."""
+def changes(frames: Iterable[Array]) -> Iterator[bytes]:
+    """Yield the differences (v,) of 8 bits between each frame and the one before it."""
     before = None
     for frame in frames:
         yield (frame if before is None else frame - before).tobytes()
@@ -149,14 +115,14 @@ def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
 
 
 def deflated(parts: Iterable[bytes]) -> bytes:
-    """Return the parts, one after the other, deflated."""
+    """Return consecutive parts as one deflated stream."""
     packer = zlib.compressobj(6)
     return b"".join([*map(packer.compress, parts), packer.flush()])
 
 
 def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, Any]:
-    """Return what the script must know beside the streams, in types of JSON."""
-    subject, frames, cut = composition.subject, [still.index for still in stills], stills[0].cut
+    """Return the script's data but the streams, in types of JSON."""
+    subject, frames = composition.subject, [still.index for still in stills]
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
@@ -169,8 +135,6 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
         "legend": [vars(entry) for entry in entries_of(composition, stills)],
         "overlays": distinct([still.overlays for still in stills]),
         "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
-        "axes": composition.style.axes,
-        "lattice": lattice_facts(subject, cut, frames) if cut else None,
     }
 
 
@@ -180,26 +144,28 @@ def plain(facts: Any) -> Any:
 
 
 def scale_colours(colouring: Colouring | None) -> list[list[int]]:
-    """Return the 256 colours of the numbers of 8 bits that stand for the colours of points."""
+    """Return the 256 colours that numbers of 8 bits stand for."""
     numbers = np.arange(256)
     if colouring is None:
         table = np.tile(colours.rgb(colours.BODY), (256, 1))
     else:
         table = colours.of_classes(numbers) if colouring.classes else colours.on_scale(numbers / 255)
-    return np.round(table).astype(int).tolist()
+    rounded: list[list[int]] = np.round(table).astype(int).tolist()
+    return rounded
 
 
-def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
-    """Return what stands beside the body, each different state once, and the number of its state for each frame."""
+def distinct(overlays: Sequence[Overlays]) -> dict[str, list[Any]]:
+    """Return each distinct state of obstacles and arrows once, and the state's number of each frame."""
     states: dict[str, int] = {}
     numbers = [states.setdefault(json.dumps(plain(shown)), len(states)) for shown in overlays]
     return {"states": [json.loads(state) for state in states], "numbers": numbers}
 
 
-def solid_facts(surface: Surface) -> dict[str, list]:
-    """Return an obstacle's surface as the script draws it: each triangle's corners, and its normal at each."""
+def solid_facts(surface: Surface) -> dict[str, list[float]]:
+    """Return an obstacle's surface for the script: corners of each triangle, with a normal at each."""
     corners = surface.points[surface.triangles]
-    normals = unit_vectors(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), TINY)[:, None]
     digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=TINY))))
     return {
         "corners": np.round(corners, digits).ravel().tolist(),
@@ -208,7 +174,7 @@ def solid_facts(surface: Surface) -> dict[str, list]:
 
 
 def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> str:
-    """Return the text of the page, with nothing left to load."""
+    """Return the text of the page, which loads no other file."""
     data = facts | {"streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}}
     parts = {
         "title": html.escape(title),

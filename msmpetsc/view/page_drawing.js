@@ -1,4 +1,4 @@
-// Drawing with WebGL: the body, its ground and shadow, glass, arrows and axes.
+// Drawing with WebGL: the body, its ground and shadow, glass and arrows.
 
 const LIGHT = `
 float light(vec3 n) {
@@ -17,11 +17,11 @@ void main() {
   gl_Position = camera * vec4(low + size * position, 1.0);
 }`, `#version 300 es
 precision mediump float;
-in vec3 facing; in vec3 paint; in float held; uniform float opacity; uniform vec3 fixedColour; out vec4 pixel;
+in vec3 facing; in vec3 paint; in float held; uniform vec3 fixedColour; out vec4 pixel;
 ${LIGHT}
 void main() {
   vec3 colour = held > 0.99 ? fixedColour : paint; // a face is held whose corners all are
-  pixel = vec4(colour * light(normalize(facing)), 1.0) * opacity;
+  pixel = vec4(colour * light(normalize(facing)), 1.0);
 }`];
 const FLAT = [`#version 300 es
 in vec3 position; uniform mat4 camera; uniform vec3 low; uniform vec3 size; uniform vec4 plane; uniform float lift;
@@ -48,7 +48,7 @@ function program(sources) {
   gl.linkProgram(made);
   const attributes = {}, uniforms = {};
   for (const name of ["position", "normal", "number", "fixing"]) attributes[name] = gl.getAttribLocation(made, name);
-  for (const name of ["camera", "turning", "low", "size", "scale", "fixedColour", "plane", "lift", "paint", "opacity"])
+  for (const name of ["camera", "turning", "low", "size", "scale", "fixedColour", "plane", "lift", "paint"])
     uniforms[name] = gl.getUniformLocation(made, name);
   return { made, attributes, uniforms };
 }
@@ -80,7 +80,6 @@ function start() {
   for (const what of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, what, gl.NEAREST);
   filled("triangles", triangles, gl.ELEMENT_ARRAY_BUFFER);
   filled("numbers", new Uint8Array(points));
-  if (data.lattice) startLattice();
 }
 
 function normals(at) { // of the points, from the triangles around each, weighed by their areas
@@ -107,7 +106,6 @@ function loadFrame() {
   filled("normals", normals(at));
   filled("fixing", fixing.subarray(points * data.fixed[counted], points * (data.fixed[counted] + 1)));
   if (numbers) filled("numbers", numbers.subarray(points * counted, points * (counted + 1)));
-  if (data.lattice) loadLattice(counted);
 }
 
 function axesOfEye() {
@@ -135,7 +133,7 @@ function cameraMatrix(eye) {
   const scale = perMetre(), x = 2 * scale / canvas.clientWidth, y = 2 * scale / canvas.clientHeight;
   const depth = 1 / (8 * reach), rows = [scaled(eye.across, x), scaled(eye.upward, y), scaled(eye.toEye, -depth)];
   const shift = rows.map((row, k) => -dot(row, middle) + [x * view.right, y * view.up, 0][k]);
-  return { matrix: new Float32Array([0, 1, 2].flatMap((k) => [rows[0][k], rows[1][k], rows[2][k], 0]).concat(shift, 1)), rows, shift };
+  return new Float32Array([0, 1, 2].flatMap((k) => [rows[0][k], rows[1][k], rows[2][k], 0]).concat(shift, 1));
 }
 
 function use(used, camera, low, extent) {
@@ -192,18 +190,14 @@ function drawGround(camera, ground, eye) { // a disk within its corners, ring ov
 const turningOf = ({ across, upward, toEye }) => [0, 1, 2].flatMap((k) => [across[k], upward[k], toEye[k]]);
 
 function drawBody(camera, eye) {
-  const through = shown.size > 0; // what of the lattice is shown is seen through it
   use(lit, camera, box[0], size);
   gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
-  gl.uniform1f(lit.uniforms.opacity, through ? data.lattice.opacity : 1);
   attribute(lit, "position", "positions", 3, gl.UNSIGNED_SHORT, true);
   attribute(lit, "normal", "normals", 3, gl.FLOAT, false);
   attribute(lit, "number", "numbers", 1, gl.UNSIGNED_BYTE, false);
   attribute(lit, "fixing", "fixing", 1, gl.UNSIGNED_BYTE, true);
   gl.uniform3fv(lit.uniforms.fixedColour, colour("#46566b"));
-  if (through) { gl.enable(gl.BLEND); gl.depthMask(false); }
   bodyElements();
-  if (through) { gl.depthMask(true); gl.disable(gl.BLEND); }
 }
 
 const FACES = [0, 1, 3, 0, 3, 2, 4, 5, 7, 4, 7, 6, 0, 1, 5, 0, 5, 4, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 3, 7, 1, 7, 5];
@@ -234,7 +228,6 @@ function drawMesh(camera, eye, { number, by }) { // a mesh, in the colour of obs
   const { corners, normals } = data.solids[number];
   use(lit, camera, by, [1, 1, 1]);
   gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
-  gl.uniform1f(lit.uniforms.opacity, 1);
   gl.uniform3fv(lit.uniforms.fixedColour, colour("#a3b6c4"));
   gl.vertexAttrib1f(lit.attributes.number, 0);
   gl.vertexAttrib1f(lit.attributes.fixing, 1);
@@ -255,27 +248,6 @@ function drawArrow(camera, [tail, tip], eye) { // flat, as wide seen from every 
 
 const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [n >> 2 & 1, n >> 1 & 1, n & 1].map((bit, k) => box[bit][k]));
 
-function drawAxes(camera, rows, shift) {
-  byId("labels").replaceChildren();
-  if (!data.axes) return;
-  drawFlat(camera, CORNERS, gl.LINES, [...colour(dark.matches ? "#98a1ab" : "#6b737d"), 1], EDGES);
-  const seen = (point) => [0, 1].map((k) => (dot(rows[k], point) + shift[k]) * [canvas.clientWidth, canvas.clientHeight][k] / 2);
-  const centre = seen(middle);
-  [2, 1, 0].forEach((axis, number) => { // four edges along each: the label is at the outermost
-    const ends = [0, 1, 2, 3].map((k) => EDGES.slice(8 * number + 2 * k, 8 * number + 2 * k + 2));
-    const ways = ends.map(([a, b]) => sum(seen(scaled(sum(CORNERS[a], CORNERS[b]), 0.5)), centre, -1));
-    const way = ways.reduce((a, b) => Math.hypot(...b) > Math.hypot(...a) + 1e-6 ? b : a);
-    const span = Math.max(box[1][axis] - box[0][axis], 1e-12 * Math.abs(box[1][axis]), 1e-300);
-    const [low, high] = box.map((end) => +end[axis].toFixed(Math.min(100, Math.max(0, 2 - Math.floor(Math.log10(span))))) + 0);
-    const label = document.createElement("span"), [x, y] = sum(sum(centre, way), unit(way), 14);
-    label.textContent = `${"xyz"[axis]}: ${low} to ${high} m`;
-    label.style.left = `${canvas.clientWidth / 2 + x}px`;
-    label.style.top = `${canvas.clientHeight / 2 - y}px`;
-    label.style.transform = `translate(${Math.abs(unit(way)[0]) < 0.3 ? -50 : way[0] > 0 ? 0 : -100}%, -50%)`;
-    byId("labels").append(label);
-  });
-}
-
 function draw() {
   const density = Math.min(window.devicePixelRatio || 1, 2);
   canvas.width = Math.max(1, Math.round(canvas.clientWidth * density));
@@ -284,13 +256,11 @@ function draw() {
   gl.clearColor(0, 0, 0, 0);
   gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   loadFrame();
-  const eye = axesOfEye(), { matrix, rows, shift } = cameraMatrix(eye);
+  const eye = axesOfEye(), matrix = cameraMatrix(eye);
   const state = data.overlays.states[data.overlays.numbers[view.frame]];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
   for (const mesh of state.meshes) drawMesh(matrix, eye, mesh);
-  if (shown.size) drawLattice(matrix, eye);
-  drawBody(matrix, eye); // after what is seen through it
-  drawAxes(matrix, rows, shift);
+  drawBody(matrix, eye);
   for (const corners of state.glass) drawGlass(matrix, corners);
   for (const ball of state.balls) drawBall(matrix, ball, eye);
   gl.clear(gl.DEPTH_BUFFER_BIT); // arrows are in front of all

@@ -7,7 +7,6 @@ function showState() {
   const pace = frames > 1 && rate !== 1 ? (rate < 1 ? `   ${+(1 / rate).toPrecision(3)} times slower` : `   ${rate} times faster`) : "";
   byId("time").textContent = `t = ${data.times[view.frame].toFixed(3)} s${pace}`;
   slider.value = view.frame;
-  for (const name of offered) byId(`show-${name}`).checked = shown.has(name);
   play.textContent = view.playing ? "❚❚" : "▶";
   play.setAttribute("aria-label", view.playing ? "Pause" : "Play");
   const most = 160 / perMetre(), power = 10 ** Math.floor(Math.log10(most));
@@ -89,8 +88,6 @@ function readAddress() {
   const frame = given.has("frame") ? +given.get("frame") : 0;
   view.frame = Math.min(frames - 1, Math.max(0, Math.round(frame) || 0));
   view.playing = given.get("play") === "1" && frames > 1;
-  shown.clear();
-  for (const name of offered) if (!given.has("show") || given.get("show").split(",").includes(name)) shown.add(name);
   begun = null;
 }
 
@@ -100,7 +97,6 @@ function noteAddress() {
   if (view.zoom !== 1) parts.push(`zoom=${round(view.zoom)}`);
   if (view.right || view.up) parts.push(`move=${round(view.right)},${round(view.up)}`);
   if (view.playing) parts.push("play=1");
-  if (shown.size < offered.length) parts.push(`show=${[...shown].join(",") || "none"}`);
   try { history.replaceState(null, "", `#${parts.join("&")}`); } catch { /* a browser may forbid it to files */ }
 }
 
@@ -160,16 +156,37 @@ const KEYS = {
   "-": () => { nearer(1 / 1.2); changed(); },
   ArrowUp: () => { turn(0, 12); changed(); },
   ArrowDown: () => { turn(0, -12); changed(); },
-  c: () => setShown("cells", !shown.has("cells")),
-  s: () => setShown("springs", !shown.has("springs")),
   r: () => { Object.assign(view, { yaw: 0, pitch: 0, zoom: 1, right: 0, up: 0 }); changed(); },
 };
 addEventListener("keydown", (event) => {
   const act = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-  if (!act || event.ctrlKey || event.metaKey || event.altKey || event.target === speedChoice || (event.key === " " && event.target.type === "checkbox")) return;
+  if (!act || event.ctrlKey || event.metaKey || event.altKey || event.target === speedChoice) return;
   event.preventDefault();
   act();
 });
 addEventListener("resize", redraw);
 addEventListener("hashchange", () => { readAddress(); if (view.playing) setPlaying(true); redraw(); });
 dark.addEventListener("change", redraw);
+
+// The start of the page, when all of it is known.
+
+let extent;
+async function begin() {
+  const packed = (await inflated("triangles")).buffer;
+  triangles = new (points > 65535 ? Uint32Array : Uint16Array)(packed);
+  fixing = await inflated("fixed");
+  all = predicted(await inflated("positions"));
+  numbers = data.streams.colours ? summed(await inflated("colours")) : null;
+  extent = firstExtent();
+  start();
+  makeLegend();
+  makePlayer();
+  readAddress();
+  draw();
+  if (view.playing) setPlaying(true);
+  document.documentElement.dataset.ready = "1";
+}
+begin().catch((error) => {
+  byId("message").hidden = false;
+  byId("message").textContent = `This page cannot be shown: ${error.message}`;
+});

@@ -1,4 +1,4 @@
-"""Bodies and what stands beside them, drawn by VTK: one window off screen, one camera without perspective."""
+"""Rendering of bodies, obstacles and arrows by VTK, off screen, with one orthographic camera."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -10,11 +10,12 @@ import pyvista as pv
 from PIL import Image, ImageDraw
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
+from msmpetsc.backend.arrays import Array, Floats, Mask, Positions
 from msmpetsc.errors import InputError
 from msmpetsc.view.annotations import rounded, typeface
 from msmpetsc.view.colours import ARROW, BODY, BOX, FIXED, GLASS, GLASS_EDGE, GROUND, INK, SHADOW, SPRING, rgb
 from msmpetsc.view.composition import Composition, Still
-from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut
+from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, surface_of
 from msmpetsc.view.overlays import Ground, Overlays, corners_of
 
 GLASS_OPACITY = 0.22
@@ -24,13 +25,13 @@ LABEL_GAP = 8  # [px] between an edge and what is written at it
 
 
 class Renderer:
-    """A window off screen in which stills are drawn, one after the other. Used as a context, which closes it.
+    """An off-screen window in which stills are drawn; a context, which closes it.
 
     scale : [px/m]
     """
 
     def __init__(self, composition: Composition, stills: Sequence[Still], size: tuple[int, int]):
-        """Open a window of width and height [px] in which there is room for all stills."""
+        """Open a window of width and height [px] that has room for all stills."""
         self._composition, self._size = composition, np.array(size)
         low, high, self._depth = composition.room(stills)  # nothing reaches farther towards the eye
         self._centre = (low + high) / 2  # across the picture and upward [m]
@@ -50,7 +51,7 @@ class Renderer:
         with quiet_opengl():
             self._plotter.close()
 
-    def picture(self, still: Still) -> np.ndarray:
+    def picture(self, still: Still) -> Array:
         """Return the picture (height, width, 3) of a still. Raises InputError if the graphics library gives none."""
         has_axes = self._composition.style.axes
         with quiet_opengl():
@@ -68,19 +69,19 @@ class Renderer:
         return self._with_extents(picture) if has_axes else picture
 
     def _face(self) -> None:
-        """Look through the camera, without perspective."""
+        """Set the orthographic camera."""
         camera = self._composition.camera
         view, far = self._plotter.camera, 4 * self._depth
         across, upward = self._centre
         behind = self._composition.box.mean(axis=0) @ camera.to_eye
         middle = across * camera.right + upward * camera.upward + behind * camera.to_eye
         view.focal_point, view.position, view.up = middle, middle + far * camera.to_eye, camera.upward
-        view.enable_parallel_projection()
+        view.parallel_projection = True
         view.parallel_scale = self._size[1] / self.scale / 2
         view.clipping_range = (far / 100, 2 * far)
 
-    def _with_extents(self, picture: np.ndarray) -> np.ndarray:
-        """Return the picture with the coordinates that the box spans, each at the outermost edge along its axis."""
+    def _with_extents(self, picture: Array) -> Array:
+        """Return the picture with the coordinates of the box written at its outermost edges."""
         box, drawn = self._composition.box, Image.fromarray(picture)
         corners = (self._composition.camera.flat(corners_of(box)) - self._centre) * [
             1,
@@ -100,9 +101,9 @@ class Renderer:
         return np.array(drawn)
 
     def _draw(self, still: Still) -> None:
-        """Draw the body and what stands beside it."""
+        """Draw the bodies, obstacles and arrows of a still."""
         subject, colouring = self._composition.subject, self._composition.colouring
-        surface = pv.PolyData.from_regular_faces(subject.surface(still.index), subject.triangles)
+        surface = surface_of(subject.surface(still.index), subject.triangles)
         for ground in still.overlays.grounds:
             _draw_ground(self._plotter, ground, surface)
         shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
@@ -126,31 +127,31 @@ class Renderer:
             self._plotter.add_mesh(box, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
             self._plotter.add_mesh(box.extract_all_edges(), color=GLASS_EDGE, line_width=2, lighting=False)
         for ball in overlays.balls:
-            sphere = pv.Sphere(radius=ball.radius, center=ball.center, theta_resolution=96, phi_resolution=96)
+            sphere = pv.Sphere(radius=ball.radius, center=ball.center.tolist(), theta_resolution=96, phi_resolution=96)
             look: dict[str, Any] = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
             self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **look)
         for obstacle in overlays.meshes:
             solid = self._composition.subject.solids[obstacle.number]
-            mesh = pv.PolyData.from_regular_faces(solid.points + obstacle.by, solid.triangles)
+            mesh = surface_of(solid.points + obstacle.by, solid.triangles)
             look = dict(smooth_shading=True, split_sharp_edges=True, ambient=0.42, diffuse=0.62)
             self._plotter.add_mesh(mesh, color=GLASS, **look)
 
 
-def _faces(surface: pv.PolyData, chosen: np.ndarray) -> pv.PolyData:
+def _faces(surface: pv.PolyData, chosen: Mask) -> pv.PolyData:
     """Return a part of a surface, with its points' colours."""
-    part = pv.PolyData.from_regular_faces(surface.points, surface.regular_faces[chosen])
+    part = surface_of(surface.points, surface.regular_faces[chosen])
     part.point_data.update(surface.point_data)
     return part
 
 
-def _hexahedron(corners: np.ndarray) -> pv.StructuredGrid:
-    """Return the body of corners (8, 3) numbered 4i + 2j + k."""
+def _hexahedron(corners: Positions) -> pv.StructuredGrid:
+    """Return a hexahedron of corners (8, 3) numbered 4i + 2j + k."""
     grid = pv.StructuredGrid()
     grid.points, grid.dimensions = corners, (2, 2, 2)
     return grid
 
 
-def _draw_lattice(plotter: pv.Plotter, cut: Cut, nodes: np.ndarray) -> None:
+def _draw_lattice(plotter: pv.Plotter, cut: Cut, nodes: Positions) -> None:
     for kind, cells in cut.cells.items():
         grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, nodes).shrink(SHRUNK)
         plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
@@ -160,10 +161,10 @@ def _draw_lattice(plotter: pv.Plotter, cut: Cut, nodes: np.ndarray) -> None:
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None:
-    """Draw a disk that fades towards its rim, and the body's shadow on it, which shows how high the body is."""
+    """Draw a disk that fades towards its rim, and the body's shadow on it."""
     middle = ground.corners.mean(axis=0)
     radius = float(np.linalg.norm(ground.corners[1] - ground.corners[0])) / 2
-    disk = pv.Disc(center=middle, inner=0, outer=radius, normal=ground.normal, r_res=20, c_res=AROUND)
+    disk = pv.Disc(center=middle, inner=0, outer=radius, normal=ground.normal.tolist(), r_res=20, c_res=AROUND)
     share = np.linalg.norm(disk.points - middle, axis=1) / radius
     share = np.clip((1 - share) / (1 - FADING), 0, 1)
     opacity = 255 * share**2 * (3 - 2 * share)
@@ -175,16 +176,16 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     plotter.add_mesh(shadow, color=SHADOW, lighting=False)
 
 
-def _draw_arrow(plotter: pv.Plotter, tail: np.ndarray, along: np.ndarray) -> None:
+def _draw_arrow(plotter: pv.Plotter, tail: Floats, along: Floats) -> None:
     shape: dict[str, Any] = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045)
     shape |= dict(tip_resolution=40, shaft_resolution=40, scale=float(np.linalg.norm(along)))
-    arrow = pv.Arrow(start=tail, direction=along, **shape)
+    arrow = pv.Arrow(start=tail.tolist(), direction=along.tolist(), **shape)
     plotter.add_mesh(arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.7, diffuse=0.4)
 
 
 @contextmanager
 def quiet_opengl() -> Iterator[None]:
-    """Keep what the graphics libraries say on their own off the terminal; InputError if there is no OpenGL."""
+    """Keep messages of the graphics libraries off the terminal. Raises InputError without OpenGL."""
     terminal = os.dup(2)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 2)

@@ -1,4 +1,4 @@
-"""A contact sheet: some moments of a result in rows of one picture; or one of a scene or a mesh.
+"""Contact sheets: some moments of a result in rows of one picture, or a scene before its first step.
 
 All panels are seen by one camera without perspective, drawn one by one and pasted: so scale and height can be compared
 between them. Beside each body stand the obstacles and forces of its own time.
@@ -14,7 +14,6 @@ from PIL import Image
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage
-from msmpetsc.scene.schema import SceneFile
 from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
 from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style, composition_of
@@ -29,7 +28,7 @@ COUNT = 5  # moments, where nothing is said
 
 @dataclass(frozen=True)
 class Moment:
-    """One panel to be drawn: the number of its frame, two lines below it, and what is shown of the lattice."""
+    """One panel: number of its frame, a caption of two lines, and what is shown of the lattice."""
 
     index: int
     caption: tuple[str, str]
@@ -62,7 +61,7 @@ def contact_sheet(
 def draw_moments(
     subject: Drawable, path: Path, moments: Sequence[Moment], style: Style, reference: Result | None = None
 ) -> None:
-    """Draw a subject at some moments, in rows of panels with the legend below them.
+    """Draw bodies at some moments, in rows of panels above the legend.
 
     The panels are drawn one by one: a graphics library's own pictures end at some width, and beyond it they are black.
     """
@@ -88,10 +87,9 @@ def draw_moments(
 
 
 def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int | None) -> dict[int, str]:
-    """Return the frames to draw, each with its reason or ""."""
+    """Return the chosen frames, each with its reason or ""."""
     if frames:
         return dict.fromkeys(frames_of(subject.name, frames, len(subject.times)), "")
-    assert isinstance(subject.scene, SceneFile)
     if count is not None or not subject.scene.picture.times:
         return choose_moments(run, count or COUNT)
     nearest = {0, *(int(np.argmin(abs(subject.times - wanted))) for wanted in subject.scene.picture.times)}
@@ -99,7 +97,7 @@ def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int |
 
 
 def choose_moments(run: Result, count: int) -> dict[int, str]:
-    """Return at most `count` frames that tell the story, in order of time, each with its reason.
+    """Return at most `count` characteristic frames in order of time, each with its reason.
 
     In order of importance: the first and the last; the greatest elastic energy; before it the greatest kinetic
     energy (a falling body is fastest just before it touches the ground); after it the greatest potential energy

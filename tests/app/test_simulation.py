@@ -173,14 +173,6 @@ def test_scenes_and_frames_print_one_line(scene: Path):
     assert repr(last).startswith("Frame(2: t = ") and str(last.position.shape) in repr(last)
 
 
-def test_the_notebook_shows_a_result_and_no_markup_of_its_title(scene: Path, tmp_path: Path):
-    with msm.open(msm.run(scene, tmp_path / "x.h5", set={"title": "<b>a"}, quiet=True)) as result:
-        html = result._repr_html_()
-        assert "&lt;b&gt;a" in html and "4 frames" in html and f"{len(result.lattice.nodes)} nodes" in html
-        assert "0.03 s" in html
-    assert "closed" in result._repr_html_()
-
-
 ON_RANKS = """
 import sys
 import numpy as np

@@ -50,8 +50,6 @@ def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Pa
         assert np.array(mesh.GetExtentAttr().Get(code)) == pytest.approx(
             np.array([points.min(axis=0), points.max(axis=0)]), abs=1e-6
         )
-        displacement = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displacement")
-        assert np.array(displacement.Get(code)) == pytest.approx(np.full(len(POINTS), 0.01 * index), abs=1e-6)
         assert np.linalg.norm(np.array(mesh.GetNormalsAttr().Get(0)), axis=1) == pytest.approx(1, abs=1e-6)
 
 
@@ -61,8 +59,7 @@ def test_the_mesh_is_what_usd_asks_for(result: Path, tmp_path: Path):
     assert list(counts) == [3, 3] and np.array(corners).reshape(-1, 3).tolist() == TRIANGLES.tolist()
     assert UsdGeom.Mesh.ValidateTopology(corners, counts, len(POINTS)) == (True, "")
     assert mesh.GetSubdivisionSchemeAttr().Get() == "none" and len(mesh.GetDisplayColorAttr().Get()) == 1
-    displacement = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displacement")
-    assert displacement.GetInterpolation() == mesh.GetNormalsInterpolation() == "vertex"
+    assert mesh.GetNormalsInterpolation() == "vertex"
 
 
 def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):

@@ -170,7 +170,7 @@ ALLOWED = {
     "results/writer.py": "a result, which grows",
     "app/profile.py": "asks before a run whether it could write",
     "cli/commands/new.py": "under the name that the one way gave",
-    "export/gltf.py": "the same",
+    "export/formats.py": "the same",
     "backend/launcher.py": "a cache",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ball_result import BARE, HEIGHTS
+from surface_alone import drawable_of
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import toml_of
@@ -23,7 +23,7 @@ from msmpetsc.view.colours import (
     rgb,
     scaled,
 )
-from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_result, drawable_of_surface
+from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_result
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     moved = np.array([[0.0, 0, 0], [1.1, 0, 0], [1.9, 0, 0]])
     subject = replace(
-        drawable_of_surface("x.ply", Surface(points, np.array([[0, 1, 2]]))),
+        drawable_of(points, np.array([[0, 1, 2]])),
         nodes=lambda _: moved,
         array={"lattice/springs": np.array([[0, 1], [1, 2]]), "lattice/rest_length": np.ones(2)}.__getitem__,
     )
@@ -103,44 +103,3 @@ def test_ends_of_the_scale_have_a_fitting_unit(high, end):
 
 def test_the_scale_ends_where_its_colours_do():
     assert on_scale(np.array([-1.0, 0, 1, 7])) == pytest.approx(np.array([rgb(SCALE[k]) for k in (0, 0, -1, -1)]))
-
-
-def test_contact_is_the_gap_to_the_ground_where_that_is_small(subject):
-    """A ball of 0.2 m: gaps of up to 2 mm are told apart, and at its lowest it stands on the ground."""
-    contact = scaled(colouring_of(subject, "contact"), range(11))
-    assert contact.ends == ("2 or more", "gap to obstacles [mm]", "0")
-    height = subject.surface(3)[:, 2]
-    assert height.min() < 1e-6 and contact.values(3) == pytest.approx(np.maximum(0.002 - height, 0), abs=1e-9)
-    assert not contact.values(0).any() and contact.shares(3).max() == pytest.approx(1, abs=1e-3)
-
-
-def test_contact_counts_bodies_that_face_each_other_and_is_dark_wherever_it_touches(subject):
-    """The ground is 1 mm too high. Of two balls that rest on it the second is half a millimetre from the first."""
-    points, triangles, count = subject.rest.points, subject.triangles, len(subject.rest.points)
-    body = np.repeat([0, 1], count)
-    far = points + np.array([1.0, 0, 0])
-    rest = BodiesAtRest(np.concatenate([points, far]), subject.rest.cells, np.concatenate([points, far]), body, body)
-    lowest = subject.surface(3)
-    beside = lowest + np.array([np.ptp(lowest[:, 0]) + 5e-4, 0, 0])
-    plane = {"shape": "plane", "point": [0, 0, 0.001], "normal": [0, 0, 1], "response": "penalty"}
-    scene = toml_of(BARE) | {"obstacle": [plane], "self_contact": {}}
-    two = replace(
-        subject,
-        rest=rest,
-        triangles=np.concatenate([triangles, triangles + count]),
-        surface=lambda _: np.concatenate([lowest, beside]),
-        scene=SceneFile.model_validate(scene),
-    )
-    contact = scaled(colouring_of(two, "contact"), [3])
-    assert contact.ends == ("2 or more", "gap to obstacles and the surface itself [mm]", "0")
-    assert contact.shares(3).max() == 1, "what touches is dark, however deep an obstacle is entered elsewhere"
-    gaps = 0.002 - contact.values(3)
-    assert gaps[np.argmax(lowest[:, 0])] == pytest.approx(5e-4, abs=2e-5)
-    assert gaps[count + np.argmin(lowest[:, 0])] == pytest.approx(5e-4, abs=2e-5)
-    assert (gaps > 0.0019).sum() > 1.9 * count - 40  # nothing else is near
-
-
-def test_without_anything_to_touch_one_line_says_so(subject):
-    alone = replace(subject, scene=SceneFile.model_validate(toml_of(BARE)))
-    with pytest.raises(InputError, match="has neither obstacles nor self-contact"):
-        colouring_of(alone, "contact")

@@ -5,16 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from ball_result import BARE
 from scipy.sparse import csr_array
+from surface_alone import drawable_of
 
-from msmpetsc.geometry.surface import Surface
-from msmpetsc.scene.schema import SceneFile
-from msmpetsc.scene.toml import toml_of
 from msmpetsc.view.annotations import rounded
 from msmpetsc.view.colours import plain_colouring
 from msmpetsc.view.composition import Style, composition_of
-from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_surface
+from msmpetsc.view.drawable import BodiesAtRest, Drawable
 from msmpetsc.view.mesh import CORNERS, drawn, split_at_edges, subdivided
 from msmpetsc.view.renderer import Renderer
 
@@ -37,7 +34,7 @@ def block() -> Drawable:
     W = csr_array((np.linalg.norm(points[:, None] - nodes, axis=2) < 1e-9).astype(float))
     zeros = np.zeros(len(points), int)
     return replace(
-        drawable_of_surface("block.ply", Surface(points, triangles)),
+        drawable_of(points, triangles),
         rest=BodiesAtRest(nodes, cells, points, np.zeros(len(nodes), int), zeros),
         times=np.arange(2.0),
         nodes=lambda index: bent(nodes) if index else nodes,
@@ -90,8 +87,8 @@ def test_an_edge_is_sharp_from_thirty_degrees_on(degrees: float, points: int):
 def test_a_mesh_whose_triangles_share_no_points_is_drawn_smooth():
     """As an STL has them."""
     ball = trimesh.creation.icosphere(subdivisions=2)
-    loose = Surface(np.array(ball.triangles.reshape(-1, 3)), np.arange(3 * len(ball.faces)).reshape(-1, 3))
-    assert len(np.unique(drawn(drawable_of_surface("ball.stl", loose)).triangles)) == len(ball.vertices)
+    loose = np.array(ball.triangles.reshape(-1, 3)), np.arange(3 * len(ball.faces)).reshape(-1, 3)
+    assert len(np.unique(drawn(drawable_of(*loose)).triangles)) == len(ball.vertices)
 
 
 def test_pins_are_coloured_by_face():
@@ -101,8 +98,7 @@ def test_pins_are_coloured_by_face():
     triangles = np.array([t for k in range(0, 10, 2) for t in ((k, k + 2, k + 1), (k + 1, k + 2, k + 3))])
     share = np.where(points[:, 0] < 1.5, 1.0, 0.3)
     subject = replace(
-        drawable_of_surface("strip.ply", Surface(points, triangles)),
-        scene=SceneFile.model_validate(toml_of(BARE)), pinned=np.ones(12, bool), embedding=csr_array(np.diag(share)),
+        drawable_of(points, triangles), pinned=np.ones(12, bool), embedding=csr_array(np.diag(share)),
     )  # fmt: skip
     composition = composition_of(subject, [0], Style(eye=(0, 0, 1)))
     stills = composition.stills([0])

@@ -1,4 +1,4 @@
-"""Scenes and meshes drawn before anything is run."""
+"""Scenes drawn before anything is run."""
 
 from pathlib import Path
 
@@ -25,10 +25,6 @@ def drawn(*words: object) -> np.ndarray:
     return np.array(Image.open(words[-1]).convert("RGB")).astype(int)
 
 
-def near(picture: np.ndarray, colour: tuple[int, int, int], within: int = 12) -> int:
-    return int((abs(picture - colour).max(axis=2) <= within).sum())
-
-
 def sized(folder: Path, sides: tuple[float, float, float]) -> Path:
     """A block with the points of its west side painted, pinned by a file, and pulled at its east."""
     path = block_scene(folder, np.array(sides), **SCENE)
@@ -46,23 +42,19 @@ def test_a_scene_shows_pins_forces_and_cells(tmp_path):
         assert counts[1] > 300 and counts[1] > 2 * counts[0]
 
 
-def test_a_mesh_alone_shows_its_box(tmp_path, ball):
-    picture = drawn(ball, tmp_path / "x.png")
-    assert picture[..., 2].shape[0] > 400 and near(picture, (0x8A, 0x92, 0x9B), 40) > 500
-
-
 @pytest.mark.parametrize(
-    ("kind", "words", "line"),
+    ("words", "line"),
     [
-        ("scene", ["-o", "x.mp4"], "no motion to film"),
-        ("scene", ["--frames", "1"], "--frames is for results"),
-        ("scene", ["--colour", "part"], "has no part"),
-        ("mesh", ["--show", "cells"], "is a mesh without cells"),
-        ("mesh", ["--colour", "speed"], "is a mesh alone"),
-        ("mesh", ["--set", "cages.count=3"], "--set changes a scene"),
+        (["-o", "x.mp4"], "no motion to film"),
+        (["--frames", "1"], "--frames is for results"),
+        (["--colour", "part"], "has no part"),
     ],
 )
-def test_what_a_scene_or_a_mesh_has_not_got(tmp_path, ball, kind, words, line):
-    path = ball if kind == "mesh" else sized(tmp_path, (0.5, 0.5, 0.25))
+def test_what_a_scene_has_not_got(tmp_path, words, line):
     with pytest.raises(InputError, match=line):
-        command.run(parsed(["render", str(path), *words]))
+        command.run(parsed(["render", str(sized(tmp_path, (0.5, 0.5, 0.25))), *words]))
+
+
+def test_a_mesh_is_none_of_what_is_drawn(ball):
+    with pytest.raises(InputError, match=r"is named \*.h5 or \*.hdf5 or \*.toml"):
+        command.run(parsed(["render", str(ball)]))

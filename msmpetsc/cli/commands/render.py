@@ -1,4 +1,4 @@
-"""``msmpetsc render``: pictures, films and pages of a result, or of a scene or a mesh before anything is run."""
+"""``msmpetsc render``: pictures, films and pages of a result, or of a scene before anything is run."""
 
 import argparse
 import re
@@ -8,29 +8,28 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES, RESULT_NAMES, SCENE_NAMES, refuse_other_format
-from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.geometry.readers import read_surface
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style
-from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result, drawable_of_surface
+from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result
 from msmpetsc.view.film import playback_of, write_film
 from msmpetsc.view.mesh import SHOWN
 from msmpetsc.view.page import write_page
 from msmpetsc.view.sheet import Moment, contact_sheet, draw_moments
 
 SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
-STILL = (760, 900)  # [px]: a panel of a scene or a mesh
+STILL = (760, 900)  # [px]: a panel of a scene
 ONLY = {  # options by the endings of what they are for
     "count": PICTURE_NAMES,
     "size": (*PICTURE_NAMES, *MOVIE_NAMES),
-    "fps": MOVIE_NAMES,
     "speed": MOVIE_NAMES,
+    "show": (*PICTURE_NAMES, *MOVIE_NAMES),
+    "axes": (*PICTURE_NAMES, *MOVIE_NAMES),
 }
-FASTEST = {"fps": 240, "speed": 1e6}
+FASTEST = 1e6  # simulated seconds a second
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,10 +57,8 @@ def style_of(args: argparse.Namespace) -> Style:
     for name in shown:
         if name not in SHOWN:
             raise InputError(f"--show takes {' and '.join(SHOWN)}, not {name!r}{did_you_mean(name, SHOWN)}")
-    for option in ("fps", "speed"):
-        number = getattr(args, option)
-        if number is not None and not (0 < number <= FASTEST[option]):
-            raise InputError(f"--{option} must be above 0, and {FASTEST[option]:g} at most, not {number:g}")
+    if args.speed is not None and not (0 < args.speed <= FASTEST):
+        raise InputError(f"--speed must be above 0, and {FASTEST:g} at most, not {args.speed:g}")
     return Style(eye, args.colour, _size(args.size), args.axes, shown)
 
 
@@ -77,35 +74,30 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
         if path.suffix.lower() in PAGE_NAMES:
             write_page(subject, path, numbers, style, reference)
         else:
-            playback = playback_of(subject.times[numbers], args.fps, args.speed)
+            playback = playback_of(subject.times[numbers], args.speed)
             write_film(subject, path, numbers, style, playback, reference)
 
 
 def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
-    """Draw a scene or a mesh at rest."""
+    """Draw a scene as it lies before anything is run."""
+    refuse_other_format("render", args.subject, (*RESULT_NAMES, *SCENE_NAMES))
     for option in ("frames", "count", "speed", "reference"):
         if getattr(args, option) is not None:
             raise InputError(f"--{option} is for results, and {args.subject} is none")
     if path.suffix.lower() in MOVIE_NAMES:
         raise InputError(f"{args.subject} has no motion to film: *.html turns it around")
-    subject, about = drawable_of_file(args.subject, args.set)
+    subject, about = drawable_of_scene(args.subject, args.set)
     if path.suffix.lower() not in PICTURE_NAMES:
         write_page(subject, path, [0], style)
         return
     moments = [Moment(0, (subject.title, about[0]), style.shown)]
-    if len(subject.rest.cells) and not style.shown:
+    if not style.shown:
         moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
     draw_moments(subject, path, moments, replace(style, size=style.size or STILL, axes=True))
 
 
-def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
-    """Return a scene or a mesh to draw, with its size and cells in words. Raises InputError."""
-    if path.suffix.lower() not in SCENE_NAMES:
-        if changes:
-            raise InputError(f"--set changes a scene, and {path} is a mesh")
-        surface = read_surface(path)
-        counts = f"{len(surface.points)} points, {len(surface.triangles)} triangles"
-        return drawable_of_surface(path, surface), (f"{_sides(surface.points)} m, {counts}", "")
+def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
+    """Return what a scene shows, with size and cells in words. Raises InputError."""
     from mpi4py import MPI
 
     from msmpetsc.build import build_model  # compiled kernels, which drawing a result needs not
@@ -115,12 +107,8 @@ def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[st
     subject = drawable_of_model(path, scene, model)
     lattice = model.lattice
     cells = f"{len(lattice.cells)} cells of {lattice.cell_size:.4g} m, {lattice.owned} nodes"
-    return subject, (f"{_sides(subject.rest.points)} m", cells)
-
-
-def _sides(points: Floats) -> str:
-    """Return the sides of the box around points (v, 3): "0.3 x 0.2325 x 0.2974"."""
-    return " x ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
+    sides = " x ".join(f"{length:.4g}" for length in np.ptp(subject.rest.points, axis=0))
+    return subject, (f"{sides} m", cells)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

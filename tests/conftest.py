@@ -2,8 +2,10 @@
 
 import os
 import subprocess
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
@@ -71,6 +73,12 @@ def run(ranks: int, *arguments: object, timeout: float = 120, status: int | None
         done = run_ranks(ranks, words, ENVIRONMENT, timeout)
     assert status in (None, done.returncode), done.stdout + done.stderr
     return done
+
+
+def python(*words: object, env: Mapping[str, str] = ENVIRONMENT, **options: Any) -> subprocess.CompletedProcess:
+    """A Python that really starts, finished; a hang ends with the time of its test."""
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, env=env, capture_output=True, text=True, **options)
 
 
 def result_on(ranks: int, scene: Path, *words: object, timeout: float = 120) -> h5py.File:

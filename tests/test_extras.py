@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import small_result
 from ball_result import write_ball
-from conftest import ENVIRONMENT, ROOT
+from conftest import ROOT, python
 
 from msmpetsc.errors import EXTRAS
 
@@ -33,7 +33,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 def without(missing: tuple[str, ...], *arguments: object) -> subprocess.CompletedProcess:
     """Return the finished command of a Python that lacks these packages."""
     code = WITHOUT.format(missing=set(missing), arguments=list(map(str, arguments)))
-    return subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=100)
+    return python("-c", code)
 
 
 def name_of(requirement: str) -> str:

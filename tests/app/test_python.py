@@ -3,15 +3,13 @@
 import inspect
 import shlex
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene
-from conftest import ENVIRONMENT, run
+from conftest import run
 from one_process import input_error
 
 import msmpetsc
@@ -112,14 +110,6 @@ def test_help_shows_all_keywords_with_their_types():
     parameters = inspect.signature(msmpetsc.run).parameters
     assert list(parameters) == list(OPTIONS) and parameters["frames"].annotation == int | None
     assert all(f"{name} " in msmpetsc.run.__doc__ for name in OPTIONS)
-
-
-def test_neither_the_package_nor_a_run_imports_the_command_line(scene: Path, tmp_path: Path):
-    code = f"import sys, msmpetsc; msmpetsc.run({str(scene)!r}, {str(tmp_path / 'x.h5')!r}, frames=1); "
-    code += "print([name for name in sys.modules if name.startswith('msmpetsc.cli')])"
-    for line, last in ((code, "[]"), ("import sys, msmpetsc; msmpetsc.run; print('argparse' in sys.modules)", "False")):
-        done = subprocess.run([sys.executable, "-c", line], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-        assert done.stdout.splitlines()[-1] == last, done.stderr
 
 
 ON_RANKS = """

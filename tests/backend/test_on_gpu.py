@@ -7,7 +7,6 @@ import re
 import shutil
 import struct
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain
@@ -21,7 +20,7 @@ import numpy as np
 import pretend_gpu
 import pytest
 from block_scene import CELL, block_scene
-from conftest import ENVIRONMENT, WORKERS, run
+from conftest import WORKERS, python, run
 from mpi4py import MPI
 from petsc4py import PETSc
 from pretend_gpu import pretended
@@ -193,8 +192,7 @@ SIMULATED = {
 def test_kernels_do_the_same_as_threads(tmp_path: Path):
     """All of them, in numba's simulator."""
     paths = [block_scene(tmp_path, name=name, **{**case, **SMALLEST}) for name, case in SIMULATED.items()]
-    worker = [sys.executable, WORKERS / "simulator_worker.py", *paths]
-    ran, *last = subprocess.run(worker, env=ENVIRONMENT, capture_output=True, text=True, check=True).stdout.splitlines()
+    ran, *last = python(WORKERS / "simulator_worker.py", *paths, check=True).stdout.splitlines()
     assert set(ran.split()) == {body.__name__ for body in bodies()}
     for path, line in zip(paths, last, strict=True):
         accuracy = 1e-10 if path.stem == "multigrid" else 1e-12

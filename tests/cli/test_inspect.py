@@ -2,15 +2,13 @@
 
 import json
 import shutil
-import subprocess
-import sys
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 from block_scene import block_scene
-from conftest import ENVIRONMENT, ROOT, WORKERS, run
+from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
 
 from msmpetsc.build import build_model, fill_cages, read_bodies
@@ -119,8 +117,7 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
 def test_memory_is_that_of_the_process_not_of_its_parent():
     code = "from msmpetsc.app.profile import peak_memory; print(peak_memory())"
     large = np.ones(75_000_000)  # 600 MB
-    told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-    assert 2e7 < int(told.stdout) < large.nbytes
+    assert 2e7 < int(python("-c", code).stdout) < large.nbytes
 
 
 @pytest.fixture

@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 import tarfile
 import zipfile
 from pathlib import Path
@@ -12,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from conftest import ROOT
+from conftest import ROOT, python
 from one_process import command_error
 
 import msmpetsc
@@ -173,7 +171,7 @@ def packed(folder: Path, kind: str) -> set[str]:
         or name.endswith((".egg-info", ".png"))
     ])  # fmt: skip
     build = f"from setuptools import build_meta; build_meta.build_{kind}('..')"
-    done = subprocess.run([sys.executable, "-c", build], cwd=tree, capture_output=True, text=True)
+    done = python("-c", build, cwd=tree)
     assert done.returncode == 0, done.stderr
     if kind == "wheel":
         return set(zipfile.ZipFile(next(folder.glob("*.whl"))).namelist())

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from block_scene import block_scene
-from conftest import ENVIRONMENT
+from conftest import ENVIRONMENT, python
 
 from msmpetsc.cli.arguments import option_names, parsed
 from msmpetsc.cli.command_table import COMMANDS
@@ -130,9 +130,7 @@ def test_who_stops_reading_ends_the_command_quietly(command: str):
 
 @pytest.mark.timeout(200)
 def test_doctor_finds_a_sound_installation_sound():
-    done = subprocess.run(
-        [sys.executable, "-m", "msmpetsc", "doctor"], env=ENVIRONMENT, capture_output=True, text=True, timeout=180
-    )
+    done = python("-m", "msmpetsc", "doctor")
     states = {line[9:26].strip(): line[:8].strip() for line in done.stdout.splitlines()}
     assert done.returncode == 0, done.stdout + done.stderr
     assert {"PETSc", "MPI", "GPU", "HDF5", "kernels", "meshes"} <= set(states)
@@ -151,9 +149,7 @@ sys.meta_path.insert(0, Missing())
     (tmp_path / "sitecustomize.py").write_text(hook)  # of the processes that it starts, too
     (tmp_path / "tqdm.py").write_text('raise ImportError("libold.so: cannot open shared object file")')
     environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{ENVIRONMENT['PYTHONPATH']}"}
-    done = subprocess.run(
-        [sys.executable, "-m", "msmpetsc", "doctor"], env=environment, capture_output=True, text=True, timeout=100
-    )
+    done = python("-m", "msmpetsc", "doctor", env=environment)
     lines = {line[9:26].strip(): line for line in done.stdout.splitlines()}
     for name in ("PETSc", "kernels"):
         assert lines[name].startswith("missing") and "msmpetsc[run]" in lines[name], lines[name]

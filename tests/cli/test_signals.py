@@ -9,7 +9,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from conftest import ENVIRONMENT
+from conftest import ENVIRONMENT, python
 from stopped_runs import (  # noqa: F401  # a fixture
     EVERY,
     STEPS,
@@ -131,8 +131,7 @@ main.entry_point()
 
 
 def test_an_interrupt_after_the_end_changes_nothing():
-    command = [sys.executable, "-c", INTERRUPTED_AT_THE_END]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    done = python("-c", INTERRUPTED_AT_THE_END)
     assert done.returncode == 143 and done.stderr == ""
 
 

@@ -1,6 +1,5 @@
 """What a run says at its start: what takes which nodes, what has no effect, and a body of an odd size."""
 
-import json
 import logging
 import re
 from pathlib import Path
@@ -9,7 +8,7 @@ import pytest
 from block_scene import CELL, block_scene
 from conftest import run
 from mpi4py import MPI
-from one_process import IN_ONE_PROCESS
+from one_process import answers_on
 
 from msmpetsc.app.summary import log_model
 from msmpetsc.build import Model, build_model, read_bodies
@@ -196,8 +195,6 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
         + [word for key, value in given.items() for word in ("--set", f"{key}={toml_value(value)}")]
         for number, given in enumerate(tables.values())
     ]
-    done = run(2, "-c", IN_ONE_PROCESS, json.dumps(commands), status=0)
-    for words, status, line in zip(tables, (2, 2, 0), done.stdout.splitlines(), strict=True):
-        answers = json.loads(line)
+    for words, status, answers in zip(tables, (2, 2, 0), answers_on(2, commands), strict=True):
         assert [given for given, _ in answers] == [status] * 2 and answers[1][1] == "", answers
         assert answers[0][1].count(words) == 1

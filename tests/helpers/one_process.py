@@ -2,9 +2,11 @@
 
 import contextlib
 import io
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 
 import pytest
+from conftest import run
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
@@ -21,6 +23,25 @@ for arguments in json.loads(sys.argv[1]):
     if answers:
         print(json.dumps(answers), flush=True)
 """
+
+
+Answers = list[tuple[int, str]]  # status and what was told, of each rank
+
+
+def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers]:
+    """Return the answers to each of these commands, which one process a rank carries out."""
+    words = [[*map(str, command)] for command in commands]
+    done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(words), timeout=300, status=0)
+    assert done.stderr.strip() == "", "not even the C libraries speak"
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def refusal_in(answers: Answers) -> str:
+    """Return the one line, of one rank, with which all ranks refuse a command."""
+    assert all(status == 2 for status, _ in answers), answers
+    (line,) = (line for _, told in answers for line in told.splitlines() if "note:" not in line)
+    assert errors(answers[0][1]) == [line], answers
+    return line
 
 
 def errors(text: str) -> list[str]:

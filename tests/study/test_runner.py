@@ -155,12 +155,3 @@ def test_a_table_that_is_none_is_one_line(tmp_path: Path, stand_in):
     (tmp_path / "out" / "table.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="--restart begins anew"):
         carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
-
-
-def test_only_a_table_and_its_charts_load_what_they_need():
-    """A plan and the start of a study do without pandas, vl-convert and jinja2."""
-    modules = "msmpetsc.study.runner, msmpetsc.study.sizing.trials, msmpetsc.cli.main"
-    loaded = "sorted({'pandas', 'vl_convert', 'jinja2'} & set(sys.modules))"
-    words = [sys.executable, "-c", f"import sys, {modules}; print({loaded})"]
-    done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-    assert done.stdout == "[]\n", done.stderr

@@ -4,7 +4,6 @@
 import json
 import math
 import shutil
-import subprocess
 import sys
 import tomllib
 from dataclasses import replace
@@ -12,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from conftest import ENVIRONMENT, ROOT
+from conftest import ROOT, python
 from study_files import SCENE, own_log  # noqa: F401 (fixtures)
 
 from msmpetsc.cli.commands import plan as plan_command
@@ -360,8 +359,7 @@ def true_error(scene: Path, *, choice: list[str], finer: list[str], until: float
     results = [scene.with_name("choice.h5"), scene.with_name("finer.h5")]
     for result, changes in zip(results, (choice, fine), strict=True):
         own = [word for change in ("output.surface=true", *changes) for word in ("--set", change)]
-        command = [sys.executable, "-m", "msmpetsc", "run", str(scene), "-o", str(result), *own]
-        subprocess.run(command, env=ENVIRONMENT, check=True, timeout=300, capture_output=True)
+        python("-m", "msmpetsc", "run", scene, "-o", result, *own, check=True)
     return surface_error(*results, until=until)
 
 

@@ -1,15 +1,13 @@
 """Contact sheets: the moments, the axes, and a picture that shows what it should (never compared as an image)."""
 
 import os
-import subprocess
-import sys
 
 import h5py
 import numpy as np
 import pytest
 import trimesh
 from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
-from conftest import ROOT
+from conftest import ROOT, python
 from PIL import Image, ImageDraw
 
 from msmpetsc.errors import InputError
@@ -249,8 +247,7 @@ def test_without_opengl_one_line_names_the_package(falling_ball, tmp_path):
     draw = "import sys; from msmpetsc.view.sheet import contact_sheet; contact_sheet(*sys.argv[1:])"
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "PYTHONPATH": str(ROOT)}
-    order = [sys.executable, "-c", draw, str(falling_ball), str(tmp_path / "x.png")]
-    done = subprocess.run(order, env=environment, capture_output=True, text=True, timeout=40)
+    done = python("-c", draw, falling_ball, tmp_path / "x.png", env=environment)
     assert done.returncode == 1
     assert done.stderr.strip().endswith("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
     assert "WARN" not in done.stderr

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import block_scene, play
-from conftest import result_on
 from failing_steps import Failing
 from one_process import input_error
 
@@ -168,12 +167,3 @@ def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monk
 def test_what_has_no_meaning_is_refused_in_a_line(tmp_path: Path, more: dict, says: str):
     scene = load_scene(beam(tmp_path, **more))
     assert says in input_error(lambda: refuse_bad_options(scene, Probes()))
-
-
-def test_ranks_take_the_same_steps(tmp_path: Path):
-    scene = beam(tmp_path, error=3e-2, duration=0.4)
-    one, three = (result_on(ranks, scene)["frames"] for ranks in (1, 3))
-    assert np.array_equal(one["steps"], three["steps"])
-    apart = np.abs(one["position"][:] - three["position"][:]).max()
-    assert apart < 1e-3 * np.abs(np.diff(one["position"], axis=0)).max()
-    np.testing.assert_allclose(one["time_error"][1:], three["time_error"][1:], rtol=1e-2)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import block_scene, play
-from conftest import result_on
 
 from msmpetsc.cli.main import main
 from msmpetsc.results.reader import Result
@@ -92,9 +91,3 @@ def test_a_stopped_run_comes_to_rest_at_the_same_step(tmp_path: Path):
     assert main(["run", scene, "--resume", names[1], "--force"]) == 0
     with Result(names[0]) as whole, Result(names[1]) as parts:
         assert np.array_equal(whole.frames.position[:], parts.frames.position[:])
-
-
-@pytest.mark.slow
-def test_ranks_come_to_rest_together(tmp_path: Path):
-    scene = beam(tmp_path, DAMPED, **ASIDE)
-    assert len(result_on(3, scene)["frames/time"]) == len(play(scene)[1])

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import CELL, G, block_scene, play
-from conftest import result_on
 from lattices import block, cages_of, one_spring
 from mpi4py import MPI
 
@@ -250,28 +249,3 @@ def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
     expected = m * G * np.sin(TILT) * last.time - mu * (last.momentum[2] + m * G * np.cos(TILT) * last.time)
     assert last.momentum[0] == pytest.approx(expected, rel=1e-6)
     assert last.momentum[0] == pytest.approx(m * G * (np.sin(TILT) - mu * np.cos(TILT)) * last.time, rel=1e-6)
-
-
-# ---- ranks
-
-
-@pytest.mark.slow
-def test_two_ranks_give_the_same(tmp_path: Path):
-    """With pins, anchors that let go, both kinds of obstacle, friction, and a law that stiffens."""
-    floor = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0.1, 1], "response": "penalty", "friction": 0.4}
-    wall = {"shape": "plane", "point": [0.55, 0, 0], "normal": [-1, 0, 0], "path": [{"time": 0.1, "by": [-0.06, 0, 0]}]}
-    hold = {"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}, "path": [{"time": 0.1, "by": [0, 0, 0.05]}], "stop": 0.12}
-    scene = block_scene(
-        tmp_path,
-        time={"step": T, "duration": 12 * T} | EXPLICIT,
-        gravity={"acceleration": [3, 0, -G]},
-        obstacle=[floor, wall],
-        anchor=[hold],
-        material={"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
-    )
-    one, two = (result_on(ranks, scene, "-log_view") for ranks in (1, 2))  # no option of a solver
-    assert one["frames/contact"][:].max() > 0
-    np.testing.assert_array_equal(two["frames/iterations"], one["frames/iterations"])
-    np.testing.assert_allclose(two["frames/position"], one["frames/position"], atol=1e-9)
-    for name in ("step", "q", "q_previous"):
-        np.testing.assert_allclose(two[f"checkpoint/{name}"], one[f"checkpoint/{name}"], atol=1e-9)

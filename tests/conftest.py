@@ -107,7 +107,7 @@ def falling_ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result of a ball that falls and leaps, its surface stored; for reading only."""
     from ball_result import write_ball  # which wakes MPI
 
-    return write_ball(tmp_path_factory.mktemp("falling") / "ball.h5", surface=True)
+    return write_ball(tmp_path_factory.mktemp("falling") / "ball.h5")
 
 
 @pytest.fixture(scope="session")

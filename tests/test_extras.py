@@ -63,7 +63,7 @@ def test_drawing_exporting_and_comparing_need_neither_mpi_nor_petsc_nor_a_compil
     command: str, tmp_path: Path, ball: Path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    write_ball(tmp_path / "ball.h5", surface=True)
+    write_ball(tmp_path / "ball.h5")
     words = command.replace("ball.ply", str(ball)).format("ball.h5", "ball.h5").split()
     done = without(OF_RUNS, *words)
     assert done.returncode == 0, done.stderr
@@ -94,7 +94,7 @@ def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball:
     pip = (sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-compile")
     done = subprocess.run([*pip, f"{tmp_path / 'clone'}[render]"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    write_ball(tmp_path / "ball.h5", surface=True)
+    write_ball(tmp_path / "ball.h5")
     absent = f"from importlib.util import find_spec; print([name for name in {OF_RUNS} if find_spec(name)])"
     assert in_the_clean(python, "-c", absent, folder=tmp_path).stdout == "[]\n"
     for command in ("render ball.h5 -o x.png", "export ball.h5 -o x.glb --frames 0:9:3"):

@@ -56,7 +56,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with results to be drawn and exported."""
     folder = tmp_path_factory.mktemp("sources")
     small_result.write(folder / "bar.h5")
-    write_ball(folder / "ball.h5", True)
+    write_ball(folder / "ball.h5")
     return folder
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from surfaces import surface_of
 
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.obstacles import ObstacleTable
 from msmpetsc.view.gaps import SurfaceGaps, gaps_to_obstacles
 
@@ -45,8 +45,7 @@ def test_the_nearest_obstacle_counts_where_it_is_by_then():
 
 
 def test_the_gap_to_a_surface_is_that_to_what_it_encloses():
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    solid = Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    solid = surface_of(trimesh.creation.icosphere(subdivisions=4, radius=0.5))
     table = obstacle(shape="mesh", mesh={"source": "ball.ply"})
     points = np.random.default_rng(3).normal(size=(200, 3))
     points *= np.linspace(0.3, 0.7, 200)[:, None] / np.linalg.norm(points, axis=1)[:, None]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from block_scene import CELL, block_scene
-from browser import CHROMIUM, Browser
+from browser import Browser, in_browser
 from test_page import data_of, restored, stream
 
 from msmpetsc.cli.commands.render import drawable_of_file
@@ -17,7 +17,6 @@ from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.mesh import BOUNDARY, INTERIOR, cut_open
 from msmpetsc.view.page import write_page
 
-in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 FALL, EYE = 0.2, (0.0, -1.0, 0.0)  # [m] a frame
 TABLES = {"output": {"surface": True}, "time": {"step": 0.01, "duration": 0.1}}
 

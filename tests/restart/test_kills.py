@@ -19,7 +19,7 @@ from msmpetsc.solve.simulate import REMEMBERED
 from msmpetsc.study.forkserver import Forked
 from msmpetsc.study.process import ALONE
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def is_killed(ranks: int, arguments: list[str], wait: float, log: Path) -> bool:

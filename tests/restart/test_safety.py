@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, block_scene, play
+from block_scene import CELL, GRAVITY, block_scene, clamped_beam, play
 from failing_steps import Failing
 
 from msmpetsc.errors import StepFailed
@@ -17,14 +17,10 @@ from msmpetsc.solve.nonlinear.step import Stepper
 STEP, STEPS = 1 / 60, 6
 TIME = {"step": STEP, "duration": STEPS * STEP}
 CLAMPED = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
-GRAVITY = {"acceleration": [0, 0, -9.81]}
 
 
 def beam(folder: Path, **tables) -> Path:
-    """A clamped beam of 32 cells that begins to swing under its weight."""
-    return block_scene(
-        folder, np.array([1.0, 0.25, 0.25]), **{"time": TIME, "pin": CLAMPED, "gravity": GRAVITY} | tables
-    )
+    return clamped_beam(folder, **{"time": TIME} | tables)
 
 
 def of(frames: list[Frame], name: str) -> np.ndarray:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import CELL, G, block_scene, play
-from lattices import block, cages_of, one_spring
+from lattices import block, cages_of, dense_hessian, one_spring
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
@@ -122,14 +122,9 @@ def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_p
 
 def greatest(lattice: Lattice, q: np.ndarray, projected: bool = False) -> float:
     """Of M^(-1) (Hessian of E) over the free nodes, by numpy."""
-    elasticity, free = Elasticity(COMM, lattice), np.flatnonzero(~lattice.pinned)
-    H = np.empty((3 * len(free), 3 * len(free)))
-    for column in range(len(H)):
-        v, product = np.zeros_like(q), np.zeros_like(q)
-        v[free[column // 3], column % 3] = 1
-        elasticity.hessian_at(q, projected).add_product(v, product)
-        H[:, column] = product[free].ravel()
-    scale = 1 / np.sqrt(np.repeat(lattice.mass[free], 3))
+    free = np.repeat(~lattice.pinned, 3)
+    H = dense_hessian(Elasticity(COMM, lattice), q, projected)[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.repeat(lattice.mass, 3)[free])
     return np.linalg.eigvalsh(scale[:, None] * H * scale)[-1]
 
 

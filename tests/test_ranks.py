@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 import pytest
-from block_scene import block_scene
+from block_scene import CELL, GRAVITY, block_scene
 from one_process import answers_on
 
-GRAVITY = {"acceleration": [0, 0, -9.81]}
 BEAM = np.array([1.0, 0.25, 0.25])
 LEFT = {"box": [[-1, -1, -1], [0.01, 1, 1]]}
 RIGHT = {"box": [[0.99, -1, -1], [2, 1, 1]]}
@@ -54,7 +53,7 @@ CASES = {
     "start": Case({
         "start": {"scale": [1, 1, 0.5], "scatter": 0.5, "twist": {"axis": [1, 0, 1], "degrees": 40},
                   "velocity": [0, 0, 1], "spin": [2, 0, 1]},
-        "time": steps(2, 1 / 128),
+        "time": steps(2, 1 / 128), "output": {"surface": True},
     }),
     "clamp": Case({"cages": {"cell_size": 0.11}, "pin": [{"region": TILTED}], "time": steps(1, 0.01)}),
     "pressed, stiffening": pressed("stiffening"),
@@ -63,6 +62,10 @@ CASES = {
         "obstacle": [FLOOR, WALL], "anchor": LED, "material": SOFT | {"law": "stiffening"},
         "gravity": {"acceleration": [3, 0, -9.81]}, "time": steps(12, 1 / 60, "verlet"),
     }, equal=("iterations",)),
+    "multigrid": Case({
+        "sides": np.array([8, 3, 3]) * CELL, "start": {"velocity": [0.5, 0, -1.5]}, "obstacle": [FLOOR],
+        "gravity": GRAVITY, "solver": {"preset": "newton-multigrid", "error": 1e-6}, "time": steps(6, 0.01),
+    }, ("-pc_mg_levels", "3"), 1e-5),
     "until rest": Case({
         "sides": BEAM, "pin": [{"region": LEFT}], "gravity": {"acceleration": [0, 0, -1.0]},
         "solver": {"error": 1e-4}, "time": steps(200, 0.4, until="rest"),
@@ -124,5 +127,8 @@ def test_two_ranks_are_as_one(results: dict[str, list[h5py.File]], name: str):
     for field in {"kinetic", "elastic", "contact", "torque"} & set(expected):
         most = np.abs(expected[field]).max()
         np.testing.assert_allclose(frames[field], expected[field], rtol=0, atol=10 * CASES[name].accuracy * most)
+    if "embedding" in one:
+        np.testing.assert_allclose(two["embedding/weights"], one["embedding/weights"], rtol=1e-13)
+        np.testing.assert_allclose(frames["surface"], expected["surface"], rtol=0, atol=1e-6 * size)
     if name != "clamp":
         assert np.abs(expected["position"][-1] - one["lattice/nodes"]).max() > 1e-4 * size

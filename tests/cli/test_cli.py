@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import run
-from one_process import Answers, answers_on, errors, refusal_in
+from one_process import Answers, answers_on, assert_one_line, refusal_in
 
 from msmpetsc.cli.arguments import split_petsc_options
 from msmpetsc.results.reader import finished
@@ -33,7 +33,6 @@ region = { box = [[0, 0, 0.8], [1, 1, 1]], relative = true }
 surface = false
 """
 COMMAND = ("-m", "msmpetsc.cli.main", "run")
-NOISE = ("Traceback", "PETSC ERROR", "MPI_ABORT", "ORTE_ERROR", "Segmentation", "Warning")
 ball = trimesh.creation.icosphere(subdivisions=2, radius=1)
 
 
@@ -67,14 +66,6 @@ def scene(folder: Path) -> Path:
 
 def on(ranks: int, *arguments: object, status: int | None = None) -> subprocess.CompletedProcess:
     return run(ranks, *COMMAND, *arguments, timeout=60, status=status)
-
-
-def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
-    """It ended with this status, said why in one line that holds these words, and ended cleanly."""
-    assert done.returncode == status, done.stdout + done.stderr
-    assert len(errors(done.stderr)) == 1, done.stderr
-    assert all(word in errors(done.stderr)[0] for word in words), errors(done.stderr)
-    assert not [noise for noise in NOISE if noise in done.stdout + done.stderr], done.stdout + done.stderr
 
 
 # What it writes

@@ -91,15 +91,6 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     assemble(SELF, unknowns, 0.01).destroy()
 
 
-def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys):
-    found = counted(scene, 300, 3)
-    assert main(["inspect", str(scene), "--ranks", "3"]) == 0
-    told = {line[:36].strip(): line[36:].split() for line in capsys.readouterr().out.splitlines()}
-    assert told["nodes"] == [f"{found.nodes.sum()}", f"{found.nodes.mean():.1f}", f"{found.nodes.max()}"]
-    assert told["ghosts"][2] == str(found.ghosts.max()) and told["messages an exchange"][2] == "2"
-    assert 3 * 0.29 < float(told["memory [GB]"][0]) < 3 * 0.31
-
-
 def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, monkeypatch):
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", 1000)
     many = "cages={count = 800000, max_cells = 100000}"

@@ -12,17 +12,13 @@ import pytest
 import trimesh
 from conftest import ROOT, python
 from one_process import command_error
+from surfaces import surface_of
 
 import msmpetsc
 from msmpetsc.cli.main import main
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.new_scene import measured, unit_of
-
-
-def surface(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
 
 
 def chair(upwards: int, back: int) -> trimesh.Trimesh:
@@ -48,7 +44,7 @@ def table(upwards: int) -> trimesh.Trimesh:
 @pytest.mark.parametrize("axis", [1, 2])
 def test_furniture_stands_on_its_feet(axis: int):
     for mesh in (chair(axis, 1), chair(axis, -1), table(axis)):
-        assert measured(surface(mesh)).y_up == (axis == 1)
+        assert measured(surface_of(mesh)).y_up == (axis == 1)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -64,7 +60,7 @@ def test_new_says_which_axis_it_takes_for_upwards_and_what_changes_that(axis, tm
 
 
 def test_gltf_has_y_upwards_by_definition_and_a_ball_has_z():
-    ball = surface(trimesh.creation.icosphere(subdivisions=2))
+    ball = surface_of(trimesh.creation.icosphere(subdivisions=2))
     assert measured(ball, ".glb").y_up and not measured(ball, ".ply").y_up
 
 
@@ -77,8 +73,8 @@ def test_parts_are_measured_by_their_area_and_thickness_by_volume_and_area():
     two = trimesh.util.concatenate(
         [trimesh.creation.box([1, 1, 1]), trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0])]
     )
-    assert measured(surface(two)).parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
-    cube = surface(trimesh.creation.box([6, 6, 6]))
+    assert measured(surface_of(two)).parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
+    cube = surface_of(trimesh.creation.box([6, 6, 6]))
     assert measured(cube).thickness == pytest.approx(2)  # 2 V / A: a third
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import subprocess
 from collections.abc import Callable, Sequence
 
 import pytest
@@ -46,6 +47,17 @@ def refusal_in(answers: Answers) -> str:
 
 def errors(text: str) -> list[str]:
     return [line for line in text.splitlines() if line.startswith("msmpetsc: error:")]
+
+
+NOISE = ("Traceback", "PETSC ERROR", "MPI_ABORT", "ORTE_ERROR", "Segmentation", "SEGV", "Warning")
+
+
+def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
+    """It ended with this status, said why in one line that holds these words, and ended cleanly."""
+    told = done.stdout + done.stderr
+    (line,) = errors(done.stderr)
+    assert done.returncode == status and all(word in line for word in words), told
+    assert not [noise for noise in NOISE if noise in told], told
 
 
 def command_error(*arguments: object) -> str:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import block_scene, play
+from block_scene import GRAVITY, block_scene, clamped_beam, play
 from failing_steps import Failing
 from one_process import input_error
 
@@ -15,9 +15,6 @@ from msmpetsc.solve.integrators.adaptive import METHODS
 from msmpetsc.solve.simulate import refuse_bad_options
 
 STEP, DURATION = 0.01, 0.96
-SOFT = {"young_modulus": 1e5, "density": 1000.0}
-CLAMPED = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
-GRAVITY = {"acceleration": [0, 0, -9.81]}
 LOOSE = {"preset": "newton", "error": 1e-4}
 
 
@@ -25,8 +22,7 @@ def beam(folder: Path, integrator: str = "bdf2", step: float = STEP, duration: f
     """A clamped beam of 32 cells that swings under its weight, some periods in ``DURATION``."""
     more = {key: tables.pop(key) for key in ("error", "shortest", "longest") if key in tables}
     time = {"step": step, "duration": duration, "integrator": integrator} | more
-    scene = {"time": time, "pin": CLAMPED, "gravity": GRAVITY, "material": SOFT, "solver": LOOSE}
-    return block_scene(folder, np.array([1.0, 0.25, 0.25]), **scene | tables)
+    return clamped_beam(folder, **{"time": time, "solver": LOOSE} | tables)
 
 
 def error_of(model, frames: list[Frame], exact: list[Frame]) -> float:

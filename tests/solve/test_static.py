@@ -20,7 +20,6 @@ TOP = {"box": [[-9, -9, 1.99], [9, 9, 9]]}
 BOTTOM = {"box": [[-9, -9, -9], [9, 9, 0.01]]}
 STATE = {"step": 1.0, "duration": 1.0, "integrator": "static"}
 TIGHT = {"preset": "newton", "error": 1e-8}
-GRAVITY = {"acceleration": [0.0, 0.0, -G]}
 BEAM = {"pin": [{"region": BOTTOM}], "gravity": {"acceleration": [0.0, 1.0, -0.5]}}
 SWITCHED = [  # to one side, to the other, gone
     {"region": TOP, "total": [1.0, 0.0, 0.0], "stop": 3.0},

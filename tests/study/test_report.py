@@ -108,14 +108,6 @@ NOISY = [
 ]
 
 
-def test_the_cheapest_of_repeats_has_their_range():
-    rows = succeeded(typed(NOISY))
-    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
-    step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
-    assert "newton, 10 ms [9 ms to 21 ms] a frame" in step[1]
-    assert "newton, 1 s [900 ms to 2.1 s] a simulated second" in trajectory[0] and len(step) == 4
-
-
 def values(panel: Axes, column: str) -> list:
     """The values of all layers of a panel that have this column."""
     return [value for layer in panel.layers for value in layer["data"]["values"] if column in value]

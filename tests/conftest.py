@@ -2,8 +2,10 @@
 
 import os
 import subprocess
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
@@ -73,6 +75,12 @@ def run(ranks: int, *arguments: object, timeout: float = 120, status: int | None
     return done
 
 
+def python(*words: object, env: Mapping[str, str] = ENVIRONMENT, **options: Any) -> subprocess.CompletedProcess:
+    """A Python that really starts, finished; a hang ends with the time of its test."""
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, env=env, capture_output=True, text=True, **options)
+
+
 def result_on(ranks: int, scene: Path, *words: object, timeout: float = 120) -> h5py.File:
     """The result of a scene on so many ranks, which lies beside it."""
     path = scene.with_name(f"{scene.stem}_{ranks}.h5")
@@ -99,7 +107,7 @@ def falling_ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result of a ball that falls and leaps, its surface stored; for reading only."""
     from ball_result import write_ball  # which wakes MPI
 
-    return write_ball(tmp_path_factory.mktemp("falling") / "ball.h5", surface=True)
+    return write_ball(tmp_path_factory.mktemp("falling") / "ball.h5")
 
 
 @pytest.fixture(scope="session")

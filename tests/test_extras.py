@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import small_result
 from ball_result import write_ball
-from conftest import ENVIRONMENT, ROOT
+from conftest import ROOT, python
 
 from msmpetsc.errors import EXTRAS
 
@@ -33,7 +33,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 def without(missing: tuple[str, ...], *arguments: object) -> subprocess.CompletedProcess:
     """Return the finished command of a Python that lacks these packages."""
     code = WITHOUT.format(missing=set(missing), arguments=list(map(str, arguments)))
-    return subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=100)
+    return python("-c", code)
 
 
 def name_of(requirement: str) -> str:
@@ -93,7 +93,7 @@ def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball:
     pip = (sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-compile")
     done = subprocess.run([*pip, f"{tmp_path / 'clone'}[render]"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    write_ball(tmp_path / "ball.h5", surface=True)
+    write_ball(tmp_path / "ball.h5")
     absent = f"from importlib.util import find_spec; print([name for name in {OF_RUNS} if find_spec(name)])"
     assert in_the_clean(python, "-c", absent, folder=tmp_path).stdout == "[]\n"
     for command in ("render ball.h5 -o x.png", "export ball.h5 -o x.glb --frames 0:9:3"):

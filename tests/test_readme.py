@@ -8,7 +8,6 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 import tomllib
 from contextlib import chdir
 from functools import cache
@@ -17,7 +16,7 @@ from pathlib import Path
 import pytest
 import small_result
 import trimesh
-from conftest import ENVIRONMENT, ROOT, run
+from conftest import ROOT, python, run
 
 from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.cli.main import parsed
@@ -90,7 +89,7 @@ def test_links_and_files_exist(path: Path):
 @cache
 def help_of(script: Path) -> str:
     """Return what a script says of itself."""
-    return subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True).stdout
+    return python(script, "--help").stdout
 
 
 @pytest.mark.parametrize("command", ALL_COMMANDS)
@@ -118,7 +117,7 @@ def carried_out(command: str, folder: Path) -> subprocess.CompletedProcess:
     launcher, _, arguments = command.rpartition("msmpetsc ")
     words = [*PROGRAM, *shlex.split(arguments)]
     if arguments.startswith("plan "):  # whose runs are forked: no fork of a test's may do that
-        return subprocess.run([sys.executable, *words], cwd=folder, env=ENVIRONMENT, capture_output=True, text=True)
+        return python(*words, cwd=folder)
     with chdir(folder):
         return run(2 if launcher.startswith("mpirun -n 2 ") else 1, *words)
 
@@ -173,9 +172,7 @@ def test_python_runs(path: Path, tmp_path: Path):
     small_result.write(tmp_path / "out" / "bunny_fall.h5")
     write_own_scene(tmp_path)
     for block in blocks(path, "python"):
-        done = subprocess.run(
-            [sys.executable, "-c", block], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60
-        )
+        done = python("-c", block, cwd=tmp_path)
         assert done.returncode == 0, f"{block}\n{done.stderr}"
 
 

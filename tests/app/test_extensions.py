@@ -1,13 +1,12 @@
 """Forces and presets of the user's own: by their discrete formulas, in the energy balance, by name, installed."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from block_scene import block_scene
-from conftest import ENVIRONMENT
+from conftest import ENVIRONMENT, python
 from one_process import input_error
 
 import msmpetsc as msm
@@ -145,8 +144,7 @@ def test_a_scene_file_names_what_is_installed(tmp_path: Path):
     environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{ENVIRONMENT['PYTHONPATH']}"}
 
     def command(*words: object) -> subprocess.CompletedProcess:
-        arguments = [sys.executable, "-m", "msmpetsc", "run", scene, "-o", tmp_path / "x.h5", *words]
-        return subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=60)
+        return python("-m", "msmpetsc", "run", scene, "-o", tmp_path / "x.h5", *words, env=environment)
 
     assert (done := command()).returncode == 0, done.stderr
     with msm.open(tmp_path / "x.h5") as result:

@@ -3,16 +3,14 @@
 import inspect
 import shlex
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene
-from conftest import ENVIRONMENT, run
-from one_process import input_error
+from conftest import WORKERS, run
+from one_process import errors, input_error
 
 import msmpetsc
 from msmpetsc.app.request import OPTIONS, RunRequest
@@ -114,28 +112,19 @@ def test_help_shows_all_keywords_with_their_types():
     assert all(f"{name} " in msmpetsc.run.__doc__ for name in OPTIONS)
 
 
-def test_neither_the_package_nor_a_run_imports_the_command_line(scene: Path, tmp_path: Path):
-    code = f"import sys, msmpetsc; msmpetsc.run({str(scene)!r}, {str(tmp_path / 'x.h5')!r}, frames=1); "
-    code += "print([name for name in sys.modules if name.startswith('msmpetsc.cli')])"
-    bare = "import sys, msmpetsc; print([name for name in ('argparse', 'numba', 'petsc4py') if name in sys.modules])"
-    for line, last in ((code, "[]"), (bare, "[]")):
-        done = subprocess.run([sys.executable, "-c", line], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-        assert done.stdout.splitlines()[-1] == last, done.stderr
+FAILING_RANKS = [  # ranks that fail, where, and how
+    ("1", "step", "input"),
+    ("0", "model", "memory"),
+    ("1,2", "model", "input"),
+]
 
 
-ON_RANKS = """
-import sys, msmpetsc
-from msmpetsc.errors import InputError
-path = msmpetsc.run(sys.argv[1], sys.argv[2], frames=1, petsc_options={"info": ":/dev/null", "ksp_rtol": 1e-3})
-msmpetsc.run(sys.argv[1], sys.argv[2], frames=1, overwrite=True, quiet=True)
-try:
-    msmpetsc.run(sys.argv[1], sys.argv[2], quiet=True)
-except InputError as error:
-    print("refused:", str(error).partition(" exists")[1])
-"""
-
-
-def test_on_all_ranks(scene: Path, tmp_path: Path):
-    done = run(2, "-c", ON_RANKS, scene, tmp_path / "x.h5", timeout=60, status=0)
-    assert done.stdout.count("refused:") == done.stdout.count(" exists") == 2  # raised on both
-    assert done.stderr.count("frame 1/1") == 1
+@pytest.mark.parametrize(("ranks", "where", "what"), FAILING_RANKS)
+def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ranks, where, what):
+    """No other rank waits for them."""
+    scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.1})
+    worker = WORKERS / "alone_worker.py"
+    done = run(3, worker, ranks, where, what, "run", scene, "-o", tmp_path / "x.h5", timeout=40)
+    said = {"input": "it fails", "memory": "there is not enough memory (Unable"}[what]
+    (line,) = errors(done.stderr)
+    assert done.returncode == 2 and line.startswith(f"msmpetsc: error: {said}") and "Traceback" not in done.stderr

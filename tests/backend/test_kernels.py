@@ -3,11 +3,10 @@
 import os
 import runpy
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from conftest import python
 
 import msmpetsc
 from msmpetsc.backend.kernel import cache_is_empty
@@ -34,8 +33,7 @@ def test_the_users_own_folder_is_taken(tmp_path: Path):
     for given, seen in (({"NUMBA_CACHE_DIR": str(tmp_path)}, str(tmp_path)), ({}, str(PACKAGE))):
         environment = {name: x for name, x in os.environ.items() if name != "NUMBA_CACHE_DIR"} | given
         code = "import msmpetsc, numba; print(numba.config.CACHE_DIR)"
-        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-        assert done.stdout.startswith(seen)
+        assert python("-c", code, env=environment).stdout.startswith(seen)
 
 
 def test_an_empty_cache_is_told_from_a_filled_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

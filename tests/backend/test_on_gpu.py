@@ -7,7 +7,6 @@ import re
 import shutil
 import struct
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain
@@ -20,24 +19,23 @@ import numba
 import numpy as np
 import pretend_gpu
 import pytest
-from block_scene import CELL, block_scene
-from conftest import ENVIRONMENT, WORKERS, run
+from block_scene import CELL, GRAVITY, block_scene
+from conftest import WORKERS, python, run
 from mpi4py import MPI
 from petsc4py import PETSc
 from pretend_gpu import pretended
+from stopped_runs import assert_goes_on_exactly
 
 import msmpetsc
 from msmpetsc.build import build_model
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.simulate import TimeLoop
 
 PACKAGE = Path(msmpetsc.__file__).parent
 T = 0.01
-GRAVITY = {"acceleration": [0, 0, -9.81]}
 FALL = {"time": {"step": T, "duration": 8 * T}, "gravity": GRAVITY, "start": {"velocity": [0.1, 0, -1.0]}}
 FLOOR = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1]}
 PLATE = {
@@ -155,21 +153,9 @@ def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_ca
 
 
 @pytest.mark.parametrize("case", ["held, led and let go", "pressed, rubbed and stiffening", "bdf2", "verlet"])
-def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case: str, monkeypatch):
-    monkeypatch.setattr(simulate, "REMEMBERED", 4)
-    scene = load_scene(block_scene(tmp_path, **CASES[case]))
-    model = build_model(MPI.COMM_SELF, scene)
+def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case: str):
     with pretended():
-        with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
-            frames = simulation.frames()
-            for _ in range(5):  # of them one at the start
-                next(frames)
-            saved = simulation.saved()
-            assert all(isinstance(rows, np.ndarray) for rows in saved.rows.values())
-            whole = [frame.position for frame in frames]
-        with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
-            simulation.restore(saved)
-            np.testing.assert_array_equal([frame.position for frame in simulation.frames()], whole)
+        assert_goes_on_exactly(block_scene(tmp_path, **CASES[case]), every=4)
 
 
 SMALLEST = {
@@ -193,8 +179,7 @@ SIMULATED = {
 def test_kernels_do_the_same_as_threads(tmp_path: Path):
     """All of them, in numba's simulator."""
     paths = [block_scene(tmp_path, name=name, **{**case, **SMALLEST}) for name, case in SIMULATED.items()]
-    worker = [sys.executable, WORKERS / "simulator_worker.py", *paths]
-    ran, *last = subprocess.run(worker, env=ENVIRONMENT, capture_output=True, text=True, check=True).stdout.splitlines()
+    ran, *last = python(WORKERS / "simulator_worker.py", *paths, check=True).stdout.splitlines()
     assert set(ran.split()) == {body.__name__ for body in bodies()}
     for path, line in zip(paths, last, strict=True):
         accuracy = 1e-10 if path.stem == "multigrid" else 1e-12
@@ -262,12 +247,22 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
             assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said
 
 
+ON_GPUS = """
+import sys, petsc4py
+petsc4py.init([])
+from pretend_gpu import pretended
+from msmpetsc.cli.main import main
+with pretended():
+    sys.exit(main(sys.argv[1:]))
+"""
+
+
 @pytest.mark.slow
 def test_ranks_agree_on_gpus_too(tmp_path: Path):
     """And a run of the command line: three ranks with ghosts, against one on the CPU."""
     path = block_scene(tmp_path, **CASES["pressed, rubbed and stiffening"])
     files, devices = [], []
-    for ranks, worker in ((1, ["-m", "msmpetsc"]), (3, [WORKERS / "gpu_worker.py"])):
+    for ranks, worker in ((1, ["-m", "msmpetsc"]), (3, ["-c", ON_GPUS])):
         files.append(tmp_path / f"{ranks}.h5")
         cost = files[-1].with_suffix(".json")
         run(ranks, *worker, "run", path, "-o", files[-1], "--measure", cost, status=0)

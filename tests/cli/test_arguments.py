@@ -1,7 +1,6 @@
 """Paths on the command line that lead nowhere, or to what is no file, or bear the name of another format: one line, and
 status 2. Commands for one process say so under mpiexec."""
 
-import json
 import os
 from pathlib import Path
 
@@ -9,8 +8,7 @@ import pytest
 import small_result
 from bad_input import limits
 from block_scene import block_scene
-from conftest import run
-from one_process import IN_ONE_PROCESS, command_error, errors
+from one_process import answers_on, command_error, refusal_in
 
 from msmpetsc.cli.main import main
 
@@ -84,13 +82,11 @@ TOO_MUCH = {
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("what", TOO_MUCH)
-def test_what_no_machine_holds_is_refused_before_it_is_made(folder, monkeypatch, capsys, what):
+def test_what_no_machine_holds_is_refused_before_it_is_made(folder, monkeypatch, what):
     monkeypatch.chdir(folder)
     command, words = TOO_MUCH[what]
     with limits():
-        assert main(command) == 2
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1 and words in told[0]
+        assert words in command_error(*command)
 
 
 RESULT, PICTURE, JSON = "is named *.h5 or *.hdf5", "is named *.png", "is named *.json"
@@ -113,19 +109,12 @@ def test_no_format_is_written_under_the_name_of_another(folder, monkeypatch, arg
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 
-ALONE = {
-    "compare": (["good.h5", "good.h5"], "compare is for one process: start it without mpiexec"),
-    "plan": (["scene.toml", "--surface-error", "0.1"], "plan is for one process: start it without mpiexec"),
-}
+ALONE = [["compare", "good.h5", "good.h5"], ["plan", "scene.toml", "--surface-error", "0.1"]]
 
 
 def test_what_is_for_one_process_says_why_under_mpiexec(folder, monkeypatch):
     monkeypatch.chdir(folder)
     before = sorted(folder.iterdir())
-    done = run(2, "-c", IN_ONE_PROCESS, json.dumps([[name, *rest] for name, (rest, _) in ALONE.items()]), status=0)
-    for (_, words), line in zip(ALONE.values(), done.stdout.splitlines(), strict=True):
-        answers = json.loads(line)
-        assert [status for status, _ in answers] == [2, 2] and answers[1][1] == ""
-        (error,) = errors(answers[0][1])
-        assert words in error
+    for answers in answers_on(2, ALONE):
+        assert "is for one process: start it without mpiexec" in refusal_in(answers)
     assert sorted(folder.iterdir()) == before

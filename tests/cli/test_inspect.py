@@ -2,15 +2,13 @@
 
 import json
 import shutil
-import subprocess
-import sys
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 from block_scene import block_scene
-from conftest import ENVIRONMENT, ROOT, WORKERS, run
+from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
 
 from msmpetsc.build import build_model, fill_cages, read_bodies
@@ -94,15 +92,6 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     assemble(SELF, unknowns, 0.01).destroy()
 
 
-def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys):
-    found = counted(scene, 300, 3)
-    assert main(["inspect", str(scene), "--ranks", "3"]) == 0
-    told = {line[:36].strip(): line[36:].split() for line in capsys.readouterr().out.splitlines()}
-    assert told["nodes"] == [f"{found.nodes.sum()}", f"{found.nodes.mean():.1f}", f"{found.nodes.max()}"]
-    assert told["ghosts"][2] == str(found.ghosts.max()) and told["messages an exchange"][2] == "2"
-    assert 3 * 0.29 < float(told["memory [GB]"][0]) < 3 * 0.31
-
-
 def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, monkeypatch):
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", 1000)
     many = "cages={count = 800000, max_cells = 100000}"
@@ -120,8 +109,7 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
 def test_memory_is_that_of_the_process_not_of_its_parent():
     code = "from msmpetsc.backend.machine import peak_memory; print(peak_memory())"
     large = np.ones(75_000_000)  # 600 MB
-    told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-    assert 1e7 < int(told.stdout) < large.nbytes
+    assert 1e7 < int(python("-c", code).stdout) < large.nbytes
 
 
 @pytest.fixture

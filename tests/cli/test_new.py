@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 import tarfile
 import zipfile
 from pathlib import Path
@@ -12,19 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from conftest import ROOT
+from conftest import ROOT, python
 from one_process import command_error
+from surfaces import surface_of
 
 import msmpetsc
 from msmpetsc.cli.commands.new import SURER, measured, unit_of, uprightness
 from msmpetsc.cli.main import main
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import load_scene
-
-
-def surface(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
 
 
 def chair(upwards: int, back: int) -> trimesh.Trimesh:
@@ -50,7 +44,7 @@ def table(upwards: int) -> trimesh.Trimesh:
 @pytest.mark.parametrize("axis", [1, 2])
 def test_furniture_stands_on_its_feet(axis: int):
     for mesh in (chair(axis, 1), chair(axis, -1), table(axis)):
-        assert (uprightness(surface(mesh), 1) > uprightness(surface(mesh), 2) + SURER) == (axis == 1)
+        assert (uprightness(surface_of(mesh), 1) > uprightness(surface_of(mesh), 2) + SURER) == (axis == 1)
 
 
 @pytest.mark.parametrize(("suffix", "words", "up"), [("stl", [], "z"), ("stl", ["--up", "y"], "y"), ("glb", [], "y")])
@@ -74,8 +68,8 @@ def test_parts_are_measured_by_their_area_and_thickness_by_volume_and_area():
     two = trimesh.util.concatenate(
         [trimesh.creation.box([1, 1, 1]), trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0])]
     )
-    assert measured(surface(two)).parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
-    cube = surface(trimesh.creation.box([6, 6, 6]))
+    assert measured(surface_of(two)).parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
+    cube = surface_of(trimesh.creation.box([6, 6, 6]))
     assert measured(cube).thickness == pytest.approx(2)  # 2 V / A: a third
 
 
@@ -168,7 +162,7 @@ def packed(folder: Path, kind: str) -> set[str]:
         or name.endswith((".egg-info", ".png"))
     ])  # fmt: skip
     build = f"from setuptools import build_meta; build_meta.build_{kind}('..')"
-    done = subprocess.run([sys.executable, "-c", build], cwd=tree, capture_output=True, text=True)
+    done = python("-c", build, cwd=tree)
     assert done.returncode == 0, done.stderr
     if kind == "wheel":
         return set(zipfile.ZipFile(next(folder.glob("*.whl"))).namelist())

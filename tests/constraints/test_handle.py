@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 from block_scene import SIDES, block_scene, play
-from conftest import run
 
 from msmpetsc.errors import InputError
-from msmpetsc.results.reader import Result
 
 T = 0.01
 SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3}
@@ -89,18 +87,6 @@ def test_forces_and_torques_of_a_body_in_balance_add_up(tmp_path: Path):
     moment = frame.torque.sum(axis=0) + np.cross(points, frame.reaction).sum(axis=0) + np.cross(q, pull).sum(axis=0)
     assert moment == pytest.approx(0, abs=1e-6 * np.abs(frame.torque).max())
     assert frame.reaction.sum(axis=0) + pull.sum(axis=0) == pytest.approx(0, abs=1e-6 * np.abs(frame.reaction).max())
-
-
-def test_ranks_agree_and_the_file_has_the_torque(tmp_path: Path):
-    scene = bar(tmp_path, 4, 30.0)
-    results = []
-    for ranks in (1, 3):
-        output = tmp_path / f"{ranks}.h5"
-        assert run(ranks, "msmpetsc", "run", scene, "-o", output).returncode == 0
-        with Result(output) as result:
-            results.append(result.frames["torque"][1])
-    assert results[0].shape == (2, 3)
-    np.testing.assert_allclose(results[1], results[0], rtol=1e-8, atol=1e-8 * np.abs(results[0]).max())
 
 
 def test_what_is_no_turn_is_told_by_its_key(tmp_path: Path):

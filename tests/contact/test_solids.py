@@ -11,6 +11,7 @@ from conftest import result_on
 from mpi4py import MPI
 from obstacles import sphere
 from one_process import input_error
+from surfaces import surface_of
 
 import msmpetsc as msm
 from msmpetsc.build import build_model
@@ -19,7 +20,6 @@ from msmpetsc.contact.obstacles.mesh_solid import MeshSolid
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
 from msmpetsc.contact.obstacles.solids import Solid
 from msmpetsc.extensions import OBSTACLES
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
 
 TORUS = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
@@ -47,7 +47,7 @@ def registered():
 
 
 def solid_of(mesh: trimesh.Trimesh) -> MeshSolid:
-    return MeshSolid(Surface(np.array(mesh.vertices), np.array(mesh.faces)))
+    return MeshSolid(surface_of(mesh))
 
 
 @pytest.mark.parametrize("mesh", [TORUS, STAR, CUT, trimesh.creation.icosphere(3)])

@@ -1,12 +1,10 @@
 """Cells that resist being turned inside out, and the stiffening law as a whole."""
 
 from dataclasses import replace
-from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
-from block_scene import CELL, YOUNG, block_scene
+from block_scene import YOUNG
 from lattices import block, cages_of
 from mpi4py import MPI
 
@@ -247,25 +245,3 @@ def test_every_preset_steps_the_stiffening_law_to_the_error_it_declares(preset: 
 def test_beyond_that_the_plain_presets_fail_and_say_so(preset: str):
     with pytest.raises(StepFailed, match=r"did not converge: .* try .*another preset"):
         squeezed_step(preset, 0.45, 1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("law", "least"), [("stiffening", ONSET), ("neo-hookean", 0.8)])
-def test_two_ranks_press_a_block_as_one(law: str, least: float, msmpetsc, tmp_path: Path):
-    """To two fifths of its height, so that cells resist."""
-    sides = np.array([0.5, 0.5, 0.25])
-    ground = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty"}
-    path = [{"time": 0.1, "by": [0, 0, -0.15]}]
-    plate = {"shape": "box", "box": [[-1, -1, 0.25], [2, 2, 0.6]], "path": path, "response": "penalty"}
-    material = {"young_modulus": YOUNG, "density": DENSITY, "law": law}
-    time = {"step": 0.01, "duration": 0.12}
-    scene = block_scene(tmp_path, sides, material=material, obstacle=[ground, plate], time=time)
-    files = {}
-    for ranks in (1, 2):
-        msmpetsc(ranks, "run", scene, "-o", tmp_path / f"{ranks}.h5", "--error", "1e-10", timeout=60, status=0)
-        files[ranks] = h5py.File(tmp_path / f"{ranks}.h5")
-    one, two = (file["frames/position"][:] for file in files.values())
-    assert np.linalg.norm(two - one) < 1e-8 * np.linalg.norm(one - one[0])
-    np.testing.assert_allclose(files[2]["frames/elastic"][:], files[1]["frames/elastic"][:], rtol=1e-7, atol=1e-12)
-    volumes = least_volumes(one[-1], files[1]["lattice/cells"][:].astype(np.int64))
-    assert 0 < volumes.min() < least * CELL**3

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lattices import COMM, block, cages_of
+from lattices import COMM, block, cages_of, dense_hessian
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.elasticity.cell_volume import least_volumes
@@ -46,17 +46,6 @@ def gradient(elastic: Elasticity, q: np.ndarray) -> np.ndarray:
     g = np.zeros_like(q)
     elastic.add_gradient(q, g)
     return g
-
-
-def hessian(elastic: Elasticity, q: np.ndarray, projected: bool = False) -> np.ndarray:
-    """The dense Hessian at q."""
-    product, columns = elastic.hessian_at(q, projected), []
-    for i in range(q.size):
-        v, column = np.zeros_like(q), np.zeros_like(q)
-        v.flat[i] = 1
-        product.add_product(v, column)
-        columns.append(column.ravel())
-    return np.array(columns)
 
 
 cases = pytest.mark.parametrize(("poisson", "cut"), [(0.25, False), (0.0, True), (0.45, True), (0.49, False)])
@@ -106,12 +95,12 @@ def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_
     for f in (np.eye(3), *shapes, *RNG.normal(size=(8, 3, 3))):
         for noise in (0.0, 0.3):
             q = lattice.nodes @ f.T + noise * H * RNG.standard_normal(lattice.nodes.shape)
-            size = np.abs(hessian(elastic, q)).max()
-            assert np.linalg.eigvalsh(hessian(elastic, q, projected=True)).min() > -1e-12 * size
+            size = np.abs(dense_hessian(elastic, q)).max()
+            assert np.linalg.eigvalsh(dense_hessian(elastic, q, projected=True)).min() > -1e-12 * size
             concavity = np.repeat(elastic.concavity(q), 3)
-            lowest = np.linalg.eigvalsh(hessian(elastic, q) + np.diag(concavity)).min()
+            lowest = np.linalg.eigvalsh(dense_hessian(elastic, q) + np.diag(concavity)).min()
             assert lowest > -1e-12 * size
-            worst = max(worst, -np.linalg.eigvalsh(hessian(elastic, q)).min())
+            worst = max(worst, -np.linalg.eigvalsh(dense_hessian(elastic, q)).min())
     assert worst > 0.1 * YOUNG * H * lattice.solid.volume.mean() / H**3  # there was something to bound
     assert elastic.concavity(lattice.nodes).max() < 1e-9 * YOUNG * H
 
@@ -132,7 +121,7 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
         for i in range(0, count, 250):
             cells = SolidCells(forms[i : i + 1], volume[i : i + 1] * H**3, np.array([shear]), np.array([lame]))
             one = Elasticity(Lattice(**(vars(lattice) | {"solid": cells})))
-            h = hessian(one, lattice.nodes)
+            h = dense_hessian(one, lattice.nodes)
             assert np.linalg.eigvalsh(h).min() > -1e-13 * np.abs(h).max()
 
 
@@ -151,7 +140,7 @@ def test_the_constant_laplacian_is_no_less_than_the_hessian_at_rest(poisson: flo
     for (a, b), k in zip(lattice.springs, lattice.stiffness, strict=True):
         laplacian[[a, b], [a, b]] += k
         laplacian[[a, b], [b, a]] -= k
-    h = hessian(Elasticity(lattice), lattice.nodes)
+    h = dense_hessian(Elasticity(lattice), lattice.nodes)
     assert np.linalg.eigvalsh(np.kron(laplacian, np.eye(3)) - h).min() > -1e-12 * np.abs(h).max()
 
 
@@ -160,7 +149,7 @@ def test_below_the_onset_the_volume_energy_goes_on_smoothly():
     elastic = Elasticity(lattice)
     above, below = (lattice.nodes * [1, 1, ONSET + e] for e in (1e-9, -1e-9))
     np.testing.assert_allclose(gradient(elastic, above), gradient(elastic, below), rtol=1e-6, atol=1e-6 * YOUNG * H**2)
-    np.testing.assert_allclose(hessian(elastic, above), hessian(elastic, below), atol=1e-6 * YOUNG * H)
+    np.testing.assert_allclose(dense_hessian(elastic, above), dense_hessian(elastic, below), atol=1e-6 * YOUNG * H)
 
 
 def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():

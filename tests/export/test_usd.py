@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import small_result
 from small_result import DT, FRAMES, POINTS
+from test_export import surface
 
 from msmpetsc.export.formats import export
 
@@ -21,10 +22,6 @@ TRIANGLES = np.array([[0, 1, 2], [1, 2, 3]])
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     return small_result.write(tmp_path / "x.h5")
-
-
-def surface(index: float) -> np.ndarray:
-    return POINTS + 0.01 * index * small_result.X
 
 
 def opened(path: Path) -> tuple[Usd.Stage, list[UsdGeom.Mesh]]:

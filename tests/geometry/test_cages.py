@@ -18,12 +18,11 @@ from conftest import WORKERS, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from mpi4py import MPI
+from surfaces import body_of
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.geometry.surface import Surface, compact, examine
 from msmpetsc.geometry.touched_cells import touched_cells
 
 WORKER = WORKERS / "cages_worker.py"
@@ -82,14 +81,6 @@ def test_cells_outside_the_limits_are_left_out():
 
 
 # --- interior cells ---
-
-
-def body_of(mesh: trimesh.Trimesh | Surface) -> BodySurface:
-    if isinstance(mesh, trimesh.Trimesh):
-        mesh = Surface(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
-    surface = compact(mesh.points, mesh.triangles)
-    bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
-    return BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)
 
 
 def dense(cages: Cages, kind: int) -> np.ndarray:

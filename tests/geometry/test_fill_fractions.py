@@ -5,11 +5,10 @@ import logging
 import numpy as np
 import pytest
 import trimesh
-from mpi4py import MPI
+from surfaces import body_of
 
-from msmpetsc.geometry.cages import BOUNDARY, LEAST_SHARE, BodySurface, Cages, fill
+from msmpetsc.geometry.cages import BOUNDARY, LEAST_SHARE, Cages, fill
 from msmpetsc.geometry.fill_fractions import Columns
-from msmpetsc.geometry.surface import Surface, examine
 
 TURN = trimesh.transformations.rotation_matrix(1.1, [3, 2, 1])
 BODIES = {
@@ -72,11 +71,6 @@ def test_corners_of_an_oblique_cell_are_those_of_many_samples():
 
 
 # ---- cages
-
-
-def body_of(mesh: trimesh.Trimesh) -> BodySurface:
-    surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
-    return BodySurface(MPI.COMM_SELF, surface, examine(surface), np.array(mesh.bounds))
 
 
 def volume(cages: Cages) -> float:

@@ -8,16 +8,13 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from surfaces import surface_of
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry import prepare as steps
 from msmpetsc.geometry.prepare import cached, prepare
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, examine, joined
-
-
-def surface_of(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
 
 
 def box(middle=(0, 0, 0), side=1.0) -> Surface:

@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from mpi4py import MPI
 from scipy.sparse import csr_array
+from study_stand_in import blank_frame
 
-from msmpetsc.fields import Frame
 from msmpetsc.results.writer import Begin, ResultFile
 
 BARE = """
@@ -35,30 +35,24 @@ KINETIC = [0, 1, 4, 8, 4, 0, 5, 3, 0, 2, 0]
 ELASTIC = [0, 0, 0, 0, 5, 9, 3, 0.1, 0.1, 0.1, 0]
 
 
-def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
-    """The points of the ball are the nodes, too. Without surface: twice the ball, and an embedding that halves it.
-
-    Nodes are pinned where the scene has EAST_HELD.
-    """
+def write_ball(path: Path, scene: str = SCENE) -> Path:
+    """The points of the ball are the nodes, too, which are pinned where the scene has EAST_HELD."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     rows = len(ball.vertices)
-    factor = 1 if surface else 2
-    embedding = csr_array(np.eye(rows) / factor)
+    embedding = csr_array(np.eye(rows))
     with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, Begin.OVERWRITE) as file:
         file.write("surface/triangles", np.array(ball.faces))
         file.write("surface/points", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         file.write("lattice/cells", np.zeros((1, 8), int))
-        file.write("lattice/nodes", factor * (ball.vertices + np.array([0, 0, HEIGHTS[0]])))
+        file.write("lattice/nodes", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         if EAST_HELD in scene:
             file.write("lattice/pinned", np.flatnonzero(ball.vertices[:, 0] >= 0.02))
         for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
             file.write(f"embedding/{name}", part)
-        file.start_frames(len(HEIGHTS), rows, {"surface": rows} if surface else {})
+        file.start_frames(len(HEIGHTS), rows, {"surface": rows})
         for index, height in enumerate(HEIGHTS):
             points = ball.vertices * [1, 1, min(1, height / 0.1)] + [0, 0, height]
             energies = dict(kinetic=KINETIC[index], elastic=ELASTIC[index], potential=height)
-            numbers = dict(contact=0.0, step_error=0.0, iterations=1, ksp_its=1, momentum=np.zeros(3), wall_time=0.0)
-            drawn = points if surface else None
-            place = dict(time=index / 10, position=factor * points, surface=drawn)
-            file.append(Frame(index=index, **place, **energies, **numbers))
+            place = dict(time=index / 10, position=points, surface=points)
+            file.append(blank_frame(index=index, **place, **energies))
     return path

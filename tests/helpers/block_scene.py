@@ -15,6 +15,7 @@ from msmpetsc.solve.simulate import TimeLoop
 CELL = 1 / 8  # [m]: a binary fraction, so that the block is a whole number of cells long
 SIDES = np.array([0.5, 0.5, 0.25])
 YOUNG, DENSITY, G = 1e5, 1000.0, 9.81
+GRAVITY = {"acceleration": [0, 0, -G]}
 STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (lattice.material)
 
 
@@ -31,6 +32,13 @@ def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **
     path = folder / f"{name}.toml"
     path.write_text(tomli_w.dumps(scene | tables))
     return path
+
+
+def clamped_beam(folder: Path, **tables) -> Path:
+    """A beam of 1 m and 32 cells, clamped at x = 0, that swings under its weight."""
+    clamp = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
+    swings = {"pin": clamp, "gravity": GRAVITY}
+    return block_scene(folder, np.array([1.0, 0.25, 0.25]), **swings | tables)
 
 
 def play(path: Path, *overrides: str) -> tuple[Model, list[Frame]]:

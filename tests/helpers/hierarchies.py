@@ -84,7 +84,6 @@ LATTICES: dict[str, np.ndarray] = {
 def build(
     comm: MPI.Comm,
     cells: np.ndarray,
-    young: float = YOUNG,
     density: float = DENSITY,
     contrast: float = 1.0,
     stiffening: float = 0.0,
@@ -100,12 +99,12 @@ def build(
     middle = cells[:, 0].mean()
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:
-        uniform = CellMaterial(*(np.full(len(ijk), value) for value in (density, young, poisson or 0.25)))
-        return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * young)
+        uniform = CellMaterial(*(np.full(len(ijk), value) for value in (density, YOUNG, poisson or 0.25)))
+        return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * YOUNG)
 
     more = {"stiffening": stiffening, "poisson": poisson}
     lattice = build_lattice(
-        cages, LatticeMaterial(density, young, of_cells=of_cells if contrast != 1 else None, **more)
+        cages, LatticeMaterial(density, YOUNG, of_cells=of_cells if contrast != 1 else None, **more)
     )
     low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
     return lattice.pin(lattice.nodes[:, 0] < low + 0.01 * CELL) if pins else lattice

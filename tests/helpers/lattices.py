@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import SortedKeys
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
@@ -30,9 +31,9 @@ def block(*sides: int) -> np.ndarray:
     return np.array(list(product(*(range(n) for n in sides))))
 
 
-def beam(young_modulus: float = 2e5) -> Lattice:
+def beam() -> Lattice:
     """8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
-    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), LatticeMaterial(1000.0, young_modulus=young_modulus))
+    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), LatticeMaterial(1000.0, young_modulus=2e5))
     return lattice.pin(lattice.nodes[:, 0] < 1.01)
 
 
@@ -54,6 +55,15 @@ def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -
     finally:
         stepper.destroy()
     return results
+
+
+def dense_hessian(elasticity: Elasticity, q: np.ndarray, projected: bool = False) -> np.ndarray:
+    """The Hessian (3n, 3n) of an elastic energy at q (n, 3), by its products."""
+    hessian, columns = elasticity.hessian_at(q, projected), []
+    for unit in np.eye(q.size):
+        columns.append(np.zeros_like(q))
+        hessian.add_product(unit.reshape(q.shape), columns[-1])
+    return np.array(columns).reshape(q.size, q.size)
 
 
 def one_spring(m: float, k: float, r: float) -> Lattice:

@@ -2,9 +2,12 @@
 
 import contextlib
 import io
-from collections.abc import Callable
+import json
+import subprocess
+from collections.abc import Callable, Sequence
 
 import pytest
+from conftest import run
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
@@ -23,8 +26,38 @@ for arguments in json.loads(sys.argv[1]):
 """
 
 
+Answers = list[tuple[int, str]]  # status and what was told, of each rank
+
+
+def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers]:
+    """Return the answers to each of these commands, which one process a rank carries out."""
+    words = [[*map(str, command)] for command in commands]
+    done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(words), timeout=300, status=0)
+    assert done.stderr.strip() == "", "not even the C libraries speak"
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def refusal_in(answers: Answers) -> str:
+    """Return the one line, of one rank, with which all ranks refuse a command."""
+    assert all(status == 2 for status, _ in answers), answers
+    (line,) = (line for _, told in answers for line in told.splitlines() if "note:" not in line)
+    assert errors(answers[0][1]) == [line], answers
+    return line
+
+
 def errors(text: str) -> list[str]:
     return [line for line in text.splitlines() if line.startswith("msmpetsc: error:")]
+
+
+NOISE = ("Traceback", "PETSC ERROR", "MPI_ABORT", "ORTE_ERROR", "Segmentation", "SEGV", "Warning")
+
+
+def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
+    """It ended with this status, said why in one line that holds these words, and ended cleanly."""
+    told = done.stdout + done.stderr
+    (line,) = errors(done.stderr)
+    assert done.returncode == status and all(word in line for word in words), told
+    assert not [noise for noise in NOISE if noise in told], told
 
 
 def command_error(*arguments: object) -> str:

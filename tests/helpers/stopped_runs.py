@@ -1,5 +1,6 @@
 """Runs to be stopped: a hanging block, signals at a step, the ranks of an mpiexec; whether two results are the same."""
 
+import copy
 import os
 import signal
 import subprocess
@@ -10,8 +11,12 @@ import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene
+from mpi4py import MPI
 
+from msmpetsc.build import build_model
+from msmpetsc.fields import Frame
 from msmpetsc.results.reader import finished
+from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -77,6 +82,33 @@ def assert_equal(found: dict, expected: dict) -> None:
     assert found.keys() == expected.keys()
     for name in expected.keys() - {"wall_time", "Effort.work.wall_time"}:
         assert expected[name] is None or np.array_equal(found[name], expected[name], equal_nan=True), name
+
+
+def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
+    """Take two steps from some checkpoints of a run, which are every so many steps: frames and checkpoints are the same
+    to the last bit. Returns the frames of the whole run, None where a step has none."""
+    scene, comm = load_scene(path), MPI.COMM_SELF
+    model, frames, saved = build_model(comm, scene), [], []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "REMEMBERED", every)
+        with TimeLoop(comm, scene, model) as simulation:
+            for frame in simulation.advance():
+                frames.append(frame)
+                saved.append(copy.deepcopy(simulation.saved()))
+        count = len(saved)
+        begins = {every, 2 * every, 4 * every, count // 2 // every * every, (count - 2) // every * every}
+        for begin in begins & {*range(1, count - 1)}:
+            with TimeLoop(comm, scene, model) as simulation:
+                simulation.restore(saved[begin])
+                for frame, index in zip(simulation.advance(), range(begin + 1, begin + 3), strict=False):
+                    after = simulation.saved()
+                    assert after.step == saved[index].step == index // every * every
+                    assert_equal(after.rows, saved[index].rows)
+                    assert_equal(after.numbers, saved[index].numbers)
+                    assert (frame is None) == (frames[index] is None)
+                    if frame is not None:
+                        assert_equal(vars(frame), vars(frames[index]))
+    return frames
 
 
 def ranks_of(mpiexec: subprocess.Popen) -> list[int]:

@@ -93,9 +93,9 @@ def row_of(label: str, **given) -> dict[str, str]:
     return {name: str(value) for name, value in row.items()}
 
 
-def write_rows(folder: Path, rows: list[dict[str, str]], columns: tuple[str, ...] = TEXT + NUMBERS) -> Path:
+def write_rows(folder: Path, rows: list[dict[str, str]]) -> Path:
     with (folder / "table.csv").open("w", newline="") as stream:
-        table = csv.DictWriter(stream, columns, extrasaction="ignore")
+        table = csv.DictWriter(stream, TEXT + NUMBERS, extrasaction="ignore")
         table.writeheader()
         table.writerows(rows)
     return folder

@@ -8,6 +8,7 @@ wall time counts up with the runs of the folder, its motion is off by the time s
 """
 
 import json
+import os
 import subprocess
 import sys
 import tomllib
@@ -15,11 +16,30 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from time import sleep
 
-import numpy as np
-from mpi4py import MPI
+CALLS = "calls.txt"
 
-from msmpetsc.fields import Frame
-from msmpetsc.results.writer import Begin, ResultFile
+
+def begin(words: list[str]) -> None:
+    """Say that it was called, and start and do what is to be stopped: before imports, which take long on busy cores."""
+    folder = Path(words[words.index("-o") + 1]).parent.parent
+    if os.environ.get("OMPI_COMM_WORLD_RANK", "0") == "0":
+        with open(folder / CALLS, "a") as file:
+            file.write(" ".join(words) + "\n")
+    if "-ksp_children" in words:
+        child = subprocess.Popen(["sleep", "60"])
+        (folder / "child").write_text(str(child.pid))
+    if "-ksp_hang" in words:
+        sleep(60)
+
+
+if __name__ == "__main__":
+    begin(sys.argv[1:])
+
+import numpy as np  # noqa: E402
+from mpi4py import MPI  # noqa: E402
+
+from msmpetsc.fields import Frame  # noqa: E402
+from msmpetsc.results.writer import Begin, ResultFile  # noqa: E402
 
 NODES = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 MASS = np.arange(1.0, 9.0)
@@ -31,16 +51,7 @@ def main() -> None:
     changes = [words[n + 1].partition("=") for n, word in enumerate(words) if word == "--set"]
     tables = {key: tomllib.loads(f"v = {value}")["v"] for key, _, value in changes if value.startswith("{")}
     comm = MPI.COMM_WORLD
-    calls = out.parent.parent / "calls.txt"
-    if comm.rank == 0:
-        with open(calls, "a") as file:
-            file.write(" ".join(words) + "\n")
-    count = len(calls.read_text().splitlines()) if calls.exists() else 0
-    if "-ksp_children" in words:
-        child = subprocess.Popen(["sleep", "60"])
-        (out.parent.parent / "child").write_text(str(child.pid))
-    if "-ksp_hang" in words:
-        sleep(60)
+    count = len((out.parent.parent / CALLS).read_text().splitlines()) if comm.rank == 0 else 0
     if "-ksp_fail" in words:
         sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
     write(comm, out, tables["time"], int(dict((k, v) for k, _, v in changes).get("output.every", 1)), count)

@@ -8,12 +8,11 @@ import material_study as study
 import numpy as np
 import pytest
 import trimesh
-from mpi4py import MPI
 from strains import uniform_strains
+from surfaces import body_of
 
 from msmpetsc.build import nearest_of_body
-from msmpetsc.geometry.cages import BodySurface, fill
-from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.geometry.cages import fill
 from msmpetsc.lattice.cell_fractions import CORNERS, shares_of_mass, shares_of_pairs
 from msmpetsc.lattice.lattice import LatticeMaterial, build_lattice
 
@@ -86,8 +85,7 @@ def test_a_ball_rings_as_lambs():
 
 
 def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_does():
-    surface = Surface(*(np.array(part) for part in (BALL.vertices, BALL.faces)))
-    body = BodySurface(MPI.COMM_SELF, surface, examine(surface), np.array(BALL.bounds))
+    body = body_of(BALL)
     cages = fill([body], 0.2)
     lattice = build_lattice(cages, LatticeMaterial(DENSITY, E))
     outside = np.linalg.norm(lattice.nodes - nearest_of_body([body], cages, lattice), axis=1)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import CELL, DENSITY, SIDES, block_scene, play
-from conftest import result_on
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
@@ -123,14 +122,3 @@ def test_what_is_held_stays_where_it_is(tmp_path: Path, what: str):
     assert (q[~near] != nodes[~near]).any(axis=1).all() and (velocity[~near] != 0).any(axis=1).all()
     moved = 0 if what == "pin" else T * np.array([0, 0, 1.0])
     np.testing.assert_allclose(frames[1].position[near], nodes[near] + moved, atol=1e-15)
-
-
-def test_any_number_of_ranks_starts_the_same(tmp_path: Path):
-    start = {"scale": [1, 1, 0.5], "scatter": 0.5, "twist": {"axis": [1, 0, 1], "degrees": 40}}
-    start |= {"velocity": [0, 0, 1], "spin": [2, 0, 1]}
-    scene = block_scene(tmp_path, time={"step": T, "duration": 2 * T}, start=start)
-    _, frames = play(scene)
-    two = result_on(2, scene)["frames"]
-    np.testing.assert_array_equal(two["position"][0], frames[0].position)
-    assert two["kinetic"][0] == pytest.approx(frames[0].kinetic, rel=1e-12)
-    np.testing.assert_allclose(two["position"][-1], frames[-1].position, atol=1e-7)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import CELL, DENSITY, SIDES, YOUNG, block_scene, play
-from conftest import result_on
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
@@ -134,25 +133,6 @@ def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp
     np.testing.assert_allclose(frames[0].momentum, [0, 0, mass.sum()], rtol=1e-12, atol=1e-3)
     fallen = 2.0 - 0.5 * 2.0 * (2.0 + 0.1)  # implicit Euler's: n (n + 1) / 2 steps
     np.testing.assert_allclose(last.position - model.lattice.nodes, np.tile([0, 0, fallen], (len(mass), 1)), atol=1e-6)
-
-
-def test_any_number_of_ranks_has_the_same_parts(tmp_path: Path):
-    """Masses and springs to the last bit, ghosts' included; two parts, one of them painted."""
-    parts = [
-        {"region": FAR, "density": 777.7, "young_modulus": 1 / 3 * YOUNG},
-        {"region": {"painted": [3]}, "density": 9e3},
-    ]
-    pin = [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}]
-    gravity = {"acceleration": [0, 0, -9.81]}
-    scene = block_scene(tmp_path, part=parts, time={"step": T, "duration": 3 * T}, pin=pin, gravity=gravity)
-    model, frames = play(scene)
-    file = result_on(2, scene)
-    springs, stiffness = file["lattice/springs"][:], file["lattice/stiffness"][:]
-    np.testing.assert_array_equal(file["lattice/mass"], model.lattice.mass)
-    one, two = (np.lexsort(ends.T) for ends in (model.lattice.springs, springs))
-    np.testing.assert_array_equal(springs[two], model.lattice.springs[one])
-    np.testing.assert_array_equal(stiffness[two], model.lattice.stiffness[one])
-    np.testing.assert_allclose(file["frames/position"][-1], frames[-1].position, atol=1e-8)
 
 
 # ---- mistakes

@@ -9,7 +9,7 @@ import pytest
 import solid_study as study
 import trimesh
 from block_scene import CELL, block_scene
-from conftest import ROOT, result_on
+from conftest import ROOT
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
@@ -114,14 +114,3 @@ def test_a_spring_that_a_clamp_cuts_is_as_stiff_as_what_of_it_is_free(tmp_path, 
     free = np.where(held.any(axis=1) & ~held.all(axis=1), (x.max(axis=1) - edge) / CELL, 1.0)
     assert free.min() == pytest.approx(2 - edge / CELL)
     np.testing.assert_allclose(lattice.stiffness / uncut.stiffness, 1 / np.maximum(free, LEAST), rtol=1e-4)
-
-
-def test_any_number_of_ranks_has_the_same_clamp(tmp_path):
-    """Of a tilted half space through a block that sticks out of its cells."""
-    region = {"half_space": {"point": [0.1, 0, 0], "normal": [-1, 0.3, 0.2]}}
-    path = block_scene(tmp_path, time=TIME, cages={"cell_size": 0.11}, pin=[{"region": region}])
-    one, three = (result_on(ranks, path, "--frames", "1") for ranks in (1, 3))
-    np.testing.assert_array_equal(one["lattice/pinned"], three["lattice/pinned"])
-    by_ends = [np.lexsort(np.sort(run["lattice/springs"][:], axis=1).T) for run in (one, three)]
-    stiffness = [run["lattice/stiffness"][:][order] for run, order in zip((one, three), by_ends, strict=True)]
-    np.testing.assert_allclose(*stiffness, rtol=1e-12)

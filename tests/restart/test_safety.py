@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, block_scene, play
-from conftest import result_on
+from block_scene import CELL, GRAVITY, block_scene, clamped_beam, play
 from failing_steps import Failing
 
 from msmpetsc.errors import StepFailed
@@ -18,14 +17,10 @@ from msmpetsc.solve.nonlinear.step import Stepper
 STEP, STEPS = 1 / 60, 6
 TIME = {"step": STEP, "duration": STEPS * STEP}
 CLAMPED = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
-GRAVITY = {"acceleration": [0, 0, -9.81]}
 
 
 def beam(folder: Path, **tables) -> Path:
-    """A clamped beam of 32 cells that begins to swing under its weight."""
-    return block_scene(
-        folder, np.array([1.0, 0.25, 0.25]), **{"time": TIME, "pin": CLAMPED, "gravity": GRAVITY} | tables
-    )
+    return clamped_beam(folder, **{"time": TIME} | tables)
 
 
 def of(frames: list[Frame], name: str) -> np.ndarray:
@@ -187,12 +182,3 @@ def test_a_rescued_explicit_or_bdf2_step_goes_on(tmp_path: Path, monkeypatch: py
     assert of(frames, "substeps").sum() == 2
     moved = np.abs(usual[-1].position - usual[0].position).max()
     assert 1e-6 * moved < np.abs(frames[-1].position - usual[-1].position).max() < 0.1 * moved
-
-
-def test_two_ranks_rescue_as_one(tmp_path: Path):
-    """As a user starts it; the file says what was done. One iteration is not enough for the usual solver."""
-    scene = beam(tmp_path, time={"step": 0.1, "duration": 0.3})
-    words = ["--set", "safety.on_failure=fallback", "-snes_max_it", "1", "-fallback_ksp_rtol", "1e-3"]
-    one, two = (result_on(ranks, scene, *words)["frames"] for ranks in (1, 2))
-    assert one["fallbacks"][:].tolist() == two["fallbacks"][:].tolist() == [0, 1, 1, 1]
-    np.testing.assert_allclose(one["position"][-1], two["position"][-1], atol=1e-6)

@@ -7,6 +7,7 @@ from itertools import count
 
 import numpy as np
 import pytest
+from study_stand_in import blank_frame
 
 from msmpetsc.comm import log
 from msmpetsc.fields import Frame
@@ -15,10 +16,7 @@ from msmpetsc.results.progress_bar import Progress
 
 
 def frame(index: int) -> Frame:
-    numbers = dict(
-        step_error=8.1e-4, iterations=5, ksp_its=45, kinetic=0.0, elastic=0.0, potential=0.0, contact=0.0, wall_time=0.0
-    )
-    return Frame(index=index, time=index / 60, position=np.zeros((0, 3)), surface=None, momentum=np.zeros(3), **numbers)
+    return blank_frame(index=index, time=index / 60, position=np.zeros((0, 3)), step_error=8.1e-4, ksp_its=45)
 
 
 class Terminal(io.StringIO):

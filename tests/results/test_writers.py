@@ -54,7 +54,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with results to be drawn and exported."""
     folder = tmp_path_factory.mktemp("sources")
     small_result.write(folder / "bar.h5")
-    write_ball(folder / "ball.h5", True)
+    write_ball(folder / "ball.h5")
     return folder
 
 
@@ -110,7 +110,7 @@ def writers(sources: Path) -> dict[str, Writer]:
 NUMBERS = check.Numbers(run=check.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={})
 NAMES = [*writers(Path())]
 # what never ends a run, and what needs one to be called: these too write by the one way, and nothing else
-NOT_TRIED = {"app/profile.py", "cli/commands/export.py"}
+NOT_TRIED = {"app/summary.py", "cli/commands/export.py"}
 
 
 @contextmanager
@@ -168,7 +168,7 @@ BY_HAND = re.compile(r"\.write_text\(|\.write_bytes\(|os\.replace\(|\.savefig\(|
 ALLOWED = {
     "results/disk.py": "the one way",
     "results/writer.py": "a result, which grows",
-    "app/profile.py": "asks before a run whether it could write",
+    "app/summary.py": "asks before a run whether it could write",
     "cli/commands/new.py": "under the name that the one way gave",
     "export/formats.py": "the same",
     "backend/launcher.py": "a cache",

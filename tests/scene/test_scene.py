@@ -92,26 +92,6 @@ def changed(old: str, new: str) -> str:
 # --- what a scene says
 
 
-def test_the_example_means_what_it_says(tmp_path):
-    scene = load(tmp_path)
-    assert scene.title == "Bunny falls and leaps"
-    assert scene.mesh.source == "bunny" and scene.mesh.size == 0.3 and scene.mesh.base is None
-    rotate = {"rotate": {"axis": (0, 0, 2), "degrees": 90}}
-    assert scene.mesh.prepare == ("repair", "orient", {"simplify": 5000}, rotate)
-    assert scene.cages.count == 9946 and scene.cages.cell_size is None
-    assert scene.material.young_modulus == 5e4 and scene.material.stiffness is None
-    assert scene.time.steps == 120  # 2 s of 1/60 s
-    assert scene.gravity.acceleration == (0, 0, -9.81)
-    assert scene.obstacle[0].normal == pytest.approx((0, 0.6, 0.8), abs=1e-15)  # 3-4-5 triangle
-    assert scene.pin[0].region.box == ((0, 0, 0.9), (1, 1, 1)) and scene.pin[0].region.relative
-    assert scene.pin[1].region.sphere.radius == 0.5 and not scene.pin[1].region.relative
-    assert scene.force[0].region.half_space.normal == (0, 0, 1)
-    assert (scene.force[0].total, scene.force[0].start, scene.force[0].stop) == ((1, 0, 0), 0, 0.5)
-    assert (scene.solver.preset, scene.solver.error, scene.solver.max_iterations) == ("anderson", 1e-3, None)
-    assert not scene.output.surface
-    assert (scene.text, scene.folder) == (EXAMPLE, tmp_path)
-
-
 def test_defaults(tmp_path):
     scene = load(tmp_path, SMALLEST)
     assert scene.title == "" and scene.mesh.prepare == () and scene.mesh.size is None

@@ -1,11 +1,15 @@
-"""The scripts run from a clone as their README writes them, whatever Python is found first."""
+"""The scripts run from a clone as their README writes them, whatever Python is found first; scripts/setup and
+scripts/build_petsc_cuda, with stand-ins for what they call."""
 
+import os
+import shutil
 import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+import regression
 from conftest import AS_ROOT, ROOT
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem not in ("clone", "lab"))
@@ -16,7 +20,7 @@ SYSTEM_PYTHON = sys._base_executable  # what the clone's .venv was made with
 @pytest.mark.skipif(not (ROOT / ".venv").exists(), reason="the clone has no .venv")
 def test_a_script_finds_its_python():
     script = ROOT / "scripts" / "house.py"
-    done = subprocess.run([SYSTEM_PYTHON, script, "--help"], env=HOME, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([SYSTEM_PYTHON, script, "--help"], env=HOME, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.startswith("usage: "), done.stderr
 
 
@@ -35,5 +39,149 @@ def test_a_clone_that_is_not_set_up_says_so(tmp_path: Path):
         (scripts / name).write_text((ROOT / "scripts" / name).read_text())
     code = "import sys; sys.path.insert(0, sys.argv[1]); import lab"
     command = [SYSTEM_PYTHON, "-S", "-c", code, scripts]  # -S: without site-packages
-    done = subprocess.run(command, env=HOME, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, env=HOME, capture_output=True, text=True)
     assert done.returncode == 1 and "run scripts/setup first" in done.stderr, done.stderr
+
+
+def program(folder: Path, name: str, text: str) -> None:
+    (folder / name).write_text(f"#!/usr/bin/env bash\n{text}\n")
+    (folder / name).chmod(0o755)
+
+
+# ---- scripts/setup
+
+# what scripts/setup asks of a Python: petsc4py is there, a venv gets a copy, pip talks
+PYTHON = """case "$*" in
+"-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
+*sysconfig*) echo .venv ;;
+"-m pip"*) echo pip >>pip.log; echo "Collecting packages"; echo "a warning" >&2; exit "${PIP_STATUS:-0}" ;;
+*) cat >/dev/null ;;
+esac
+"""
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    (tmp_path / "scripts").mkdir()
+    shutil.copy(ROOT / "scripts" / "setup", tmp_path / "scripts")
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    (tmp_path / "bin").mkdir()
+    program(tmp_path / "bin", "python", PYTHON)
+    program(tmp_path / "bin", "ldconfig", "echo libEGL_mesa")
+    return tmp_path
+
+
+def set_up(clone: Path, *extras: str, **variables: str) -> subprocess.CompletedProcess:
+    environment = {
+        "PATH": f"{clone / 'bin'}:{os.environ['PATH']}",
+        "PYTHON": str(clone / "bin" / "python"),
+        **variables,
+    }
+    command = [clone / "scripts" / "setup", *extras]
+    return subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+
+
+def test_pip_is_silent_and_not_asked_twice(clone: Path):
+    done = set_up(clone)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "setting up .venv\n", "")
+    asked = (clone / "pip.log").read_text()
+    again = set_up(clone)
+    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
+    assert (clone / "pip.log").read_text() == asked
+    assert set_up(clone, "test").stdout == "setting up .venv\n"  # more is wanted
+    (clone / "bin" / "python").rename(clone / "bin" / "python3.99")
+    (clone / "bin" / "python").symlink_to("python3.99")
+    assert set_up(clone).stdout == "setting up .venv\n"  # it is another Python
+    assert set_up(clone).stdout == ""
+
+
+def test_what_pip_says_is_shown_where_it_fails_and_the_next_start_tries_again(clone: Path):
+    done = set_up(clone, PIP_STATUS="3")
+    assert done.returncode == 1 and "Collecting packages\na warning\n" in done.stderr
+    assert "this failed: .venv/bin/python -m pip install" in done.stderr
+    assert set_up(clone).stdout == "setting up .venv\n"
+
+
+# ---- scripts/build_petsc_cuda, before it makes anything
+
+BUILD = ROOT / "scripts" / "build_petsc_cuda"
+TOOLS = ("bash", "cat", "dirname", "env", "ls", "mkdir", "nproc", "paste", "realpath", "sort")
+
+
+@pytest.fixture
+def bare(tmp_path: Path) -> Path:
+    """A folder of a PATH without apt-get, compilers and GPUs."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for tool in TOOLS:
+        (folder / tool).symlink_to(shutil.which(tool))
+    return folder
+
+
+def build(path: Path, prefix: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess:
+    """The script with this PATH and prefix."""
+    command = ["bash", BUILD, "--prefix", prefix, *arguments]
+    clean = {"PATH": str(path), "HOME": str(prefix), **variables}
+    return subprocess.run(command, env=clean, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (("--arch",), "needs a value"),
+        (("--arch", "sm_90"), "sm_90"),
+        (("--arch", "90", "--jobs", "0"), "--jobs 0"),
+        (("--march", "90"), "unknown option --march"),
+        (("--arch", "90", "--", "--with-mumps=1"), "no C++ compiler"),
+    ],
+)
+def test_what_is_missing_is_one_line(bare: Path, tmp_path: Path, arguments: tuple, said: str) -> None:
+    done = build(bare, tmp_path / "petsc", *arguments)
+    assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1, done
+    assert done.stdout == "" and not (tmp_path / "petsc").exists()
+
+
+def test_who_may_not_install_is_told_what_to_ask_for(bare: Path, tmp_path: Path) -> None:
+    program(bare, "apt-get", "exit 1")
+    program(bare, "dpkg-query", '[ "${@: -1}" = g++ ] && echo installed')
+    program(bare, "id", "echo 1000")
+    done = build(bare, tmp_path / "petsc", "--arch", "90")
+    assert done.returncode == 2 and "libmumps-dev" in done.stderr and "g++" not in done.stderr, done
+    assert done.stderr.count("\n") == 1 and not (tmp_path / "petsc").exists()
+
+
+def test_a_folder_of_others_is_left_alone(bare: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("keep")
+    done = build(bare, tmp_path, "--arch", "90")
+    assert done.returncode == 2 and "holds something else" in done.stderr and (tmp_path / "mine").exists()
+
+
+def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
+    """Two cards of one kind and one of another name the build; the same call then only prints what to export."""
+    program(bare, "nvidia-smi", "printf '9.0\\n8.0\\n9.0\\n'")
+    prefix = tmp_path / "petsc"
+    prefix.mkdir()
+    (prefix / ".key").write_text("petsc 3.26.1, sm 80,90, options --with-x=1\n")
+    (prefix / ".made").touch()
+    (prefix / "env").write_text("export PETSC_DIR=there\n")
+    done = build(bare, prefix, "--", "--with-x=1")
+    assert (done.returncode, done.stdout) == (0, "export PETSC_DIR=there\n"), done
+    assert build(bare, prefix, "--", "--with-x=2").returncode == 2  # another build: goes on to look for compilers
+
+
+# ---- scripts/regression.py: two quick scenes are as stored
+
+
+@pytest.mark.timeout(200)
+@pytest.mark.parametrize("scene", ["heart_tissue", "armadillo_leg"])
+def test_quick_scenes_are_as_stored(scene: str, capsys):
+    outcome = regression.check(scene, 1, False)
+    if outcome is None:
+        pytest.skip(capsys.readouterr().out)
+    assert outcome == []
+
+
+def test_every_scene_is_stored():
+    assert {path.stem for path in (ROOT / "scenes").glob("*.toml")} == {
+        p.stem for p in regression.STORED.glob("*.json")
+    }

@@ -75,18 +75,19 @@ class Job:
 
     def stopped(self, ranks: int) -> str:
         """What it says, stopped by Slurm once so many ranks run."""
-        process, deadline = self.start(), time.monotonic() + 30
-        while len(list(self.folder.glob("ready-*"))) < ranks and time.monotonic() < deadline:
+        process = self.start()
+        while len(list(self.folder.glob("ready-*"))) < ranks:
+            assert process.poll() is None, process.communicate()[0]
             time.sleep(0.02)
         process.send_signal(signal.SIGUSR1)
-        output, _ = process.communicate(timeout=30)
+        output, _ = process.communicate()
         assert process.returncode == 0, output
         return output
 
     def status(self) -> int:
         """Its status, started again."""
         process = self.start()
-        process.communicate(timeout=30)
+        process.communicate()
         return process.returncode
 
     def told(self) -> list[str]:

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import block_scene, play
-from conftest import result_on
+from block_scene import GRAVITY, block_scene, clamped_beam, play
 from failing_steps import Failing
 from one_process import input_error
 
@@ -16,9 +15,6 @@ from msmpetsc.solve.integrators.adaptive import METHODS
 from msmpetsc.solve.simulate import refuse_bad_options
 
 STEP, DURATION = 0.01, 0.96
-SOFT = {"young_modulus": 1e5, "density": 1000.0}
-CLAMPED = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
-GRAVITY = {"acceleration": [0, 0, -9.81]}
 LOOSE = {"preset": "newton", "error": 1e-4}
 
 
@@ -26,8 +22,7 @@ def beam(folder: Path, integrator: str = "bdf2", step: float = STEP, duration: f
     """A clamped beam of 32 cells that swings under its weight, some periods in ``DURATION``."""
     more = {key: tables.pop(key) for key in ("error", "shortest", "longest") if key in tables}
     time = {"step": step, "duration": duration, "integrator": integrator} | more
-    scene = {"time": time, "pin": CLAMPED, "gravity": GRAVITY, "material": SOFT, "solver": LOOSE}
-    return block_scene(folder, np.array([1.0, 0.25, 0.25]), **scene | tables)
+    return clamped_beam(folder, **{"time": time, "solver": LOOSE} | tables)
 
 
 def error_of(model, frames: list[Frame], exact: list[Frame]) -> float:
@@ -168,12 +163,3 @@ def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monk
 def test_what_has_no_meaning_is_refused_in_a_line(tmp_path: Path, more: dict, says: str):
     scene = load_scene(beam(tmp_path, **more))
     assert says in input_error(lambda: refuse_bad_options(scene, Probes()))
-
-
-def test_ranks_take_the_same_steps(tmp_path: Path):
-    scene = beam(tmp_path, error=3e-2, duration=0.4)
-    one, three = (result_on(ranks, scene)["frames"] for ranks in (1, 3))
-    assert np.array_equal(one["steps"], three["steps"])
-    apart = np.abs(one["position"][:] - three["position"][:]).max()
-    assert apart < 1e-3 * np.abs(np.diff(one["position"], axis=0)).max()
-    np.testing.assert_allclose(one["time_error"][1:], three["time_error"][1:], rtol=1e-2)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import block_scene, play
-from conftest import result_on
 
 from msmpetsc.cli.main import main
 from msmpetsc.results.reader import Result
@@ -82,19 +81,3 @@ def test_a_run_at_rest_is_whole(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert main(["run", "--resume", path, "--set", 'time.until="duration"', "--force"]) == 0
     with Result(path) as result:
         assert len(result.frames.time) == 1 + -(-200 // 7)
-
-
-def test_a_stopped_run_comes_to_rest_at_the_same_step(tmp_path: Path):
-    names = [str(tmp_path / name) for name in ("whole.h5", "parts.h5")]
-    scene = str(beam(tmp_path, DAMPED, **ASIDE))
-    assert main(["run", scene, "-o", names[0]]) == 0
-    assert main(["run", scene, "-o", names[1], "--frames", "9"]) == 0
-    assert main(["run", scene, "--resume", names[1], "--force"]) == 0
-    with Result(names[0]) as whole, Result(names[1]) as parts:
-        assert np.array_equal(whole.frames.position[:], parts.frames.position[:])
-
-
-@pytest.mark.slow
-def test_ranks_come_to_rest_together(tmp_path: Path):
-    scene = beam(tmp_path, DAMPED, **ASIDE)
-    assert len(result_on(3, scene)["frames/time"]) == len(play(scene)[1])

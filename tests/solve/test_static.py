@@ -8,9 +8,7 @@ from block_scene import DENSITY, YOUNG, G, block_scene, play
 from lattices import COMM, one_spring
 from one_process import input_error
 
-from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.results.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.static import LoadPath, LoadSteps
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -22,7 +20,6 @@ TOP = {"box": [[-9, -9, 1.99], [9, 9, 9]]}
 BOTTOM = {"box": [[-9, -9, -9], [9, 9, 0.01]]}
 STATE = {"step": 1.0, "duration": 1.0, "integrator": "static"}
 TIGHT = {"preset": "newton", "error": 1e-8}
-GRAVITY = {"acceleration": [0.0, 0.0, -G]}
 BEAM = {"pin": [{"region": BOTTOM}], "gravity": {"acceleration": [0.0, 1.0, -0.5]}}
 SWITCHED = [  # to one side, to the other, gone
     {"region": TOP, "total": [1.0, 0.0, 0.0], "stop": 3.0},
@@ -174,17 +171,3 @@ def test_a_state_that_fails_is_found_another_way(tmp_path: Path, monkeypatch: py
     assert (frames[-1].fallbacks if on_failure == "fallback" else frames[-1].substeps) > 0
     assert np.abs(frames[-1].position - usual[-1].position).max() < 1e-7
     assert frames[-1].kinetic == 0
-
-
-def test_ranks_and_resuming(tmp_path: Path, msmpetsc):
-    """Three ranks come to the same states as one, and a run that was stopped goes on to the same bits."""
-    states = {"step": 1.0, "duration": 4.0, "integrator": "static"}
-    scene = column(tmp_path, states, pin=[{"region": BOTTOM}], force=SWITCHED)
-    names = [str(tmp_path / name) for name in ("one.h5", "three.h5", "two.h5")]
-    assert main(["run", str(scene), "-o", names[0]]) == 0
-    assert msmpetsc(3, "run", scene, "-o", names[1]).returncode == 0
-    assert main(["run", str(scene), "-o", names[2], "--frames", "2"]) == 0
-    assert main(["run", str(scene), "--resume", names[2], "--force"]) == 0
-    with Result(names[0]) as one, Result(names[1]) as three, Result(names[2]) as two:
-        assert np.abs(one.frames.position[:] - three.frames.position[:]).max() < 1e-7
-        assert np.array_equal(one.frames.position[:], two.frames.position[:])

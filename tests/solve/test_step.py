@@ -115,6 +115,7 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
     ("preset", "options"),
     [
         ("newton", {"ksp_type": "preonly", "pc_type": "cholesky"}),  # which takes no start for its solves
+        ("newton", {"ksp_type": "chebyshev"}),  # which tries the Hessian when it is set up
         ("anderson", {"snes_type": "newtonls"}),  # which solves without an NPC
         ("anderson", {"snes_type": "newtontr"}),
     ],

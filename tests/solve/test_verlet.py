@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import CELL, G, block_scene, play
-from conftest import result_on
-from lattices import block, cages_of, one_spring
+from lattices import block, cages_of, dense_hessian, one_spring
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
@@ -123,14 +122,9 @@ def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_p
 
 def greatest(lattice: Lattice, q: np.ndarray, projected: bool = False) -> float:
     """Of M^(-1) (Hessian of E) over the free nodes, by numpy."""
-    elasticity, free = Elasticity(lattice), np.flatnonzero(~lattice.pinned)
-    H = np.empty((3 * len(free), 3 * len(free)))
-    for column in range(len(H)):
-        v, product = np.zeros_like(q), np.zeros_like(q)
-        v[free[column // 3], column % 3] = 1
-        elasticity.hessian_at(q, projected).add_product(v, product)
-        H[:, column] = product[free].ravel()
-    scale = 1 / np.sqrt(np.repeat(lattice.mass[free], 3))
+    free = np.repeat(~lattice.pinned, 3)
+    H = dense_hessian(Elasticity(lattice), q, projected)[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.repeat(lattice.mass, 3)[free])
     return np.linalg.eigvalsh(scale[:, None] * H * scale)[-1]
 
 
@@ -250,28 +244,3 @@ def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
     expected = m * G * np.sin(TILT) * last.time - mu * (last.momentum[2] + m * G * np.cos(TILT) * last.time)
     assert last.momentum[0] == pytest.approx(expected, rel=1e-6)
     assert last.momentum[0] == pytest.approx(m * G * (np.sin(TILT) - mu * np.cos(TILT)) * last.time, rel=1e-6)
-
-
-# ---- ranks
-
-
-@pytest.mark.slow
-def test_two_ranks_give_the_same(tmp_path: Path):
-    """With pins, anchors that let go, both kinds of obstacle, friction, and a law that stiffens."""
-    floor = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0.1, 1], "response": "penalty", "friction": 0.4}
-    wall = {"shape": "plane", "point": [0.55, 0, 0], "normal": [-1, 0, 0], "path": [{"time": 0.1, "by": [-0.06, 0, 0]}]}
-    hold = {"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}, "path": [{"time": 0.1, "by": [0, 0, 0.05]}], "stop": 0.12}
-    scene = block_scene(
-        tmp_path,
-        time={"step": T, "duration": 12 * T} | EXPLICIT,
-        gravity={"acceleration": [3, 0, -G]},
-        obstacle=[floor, wall],
-        anchor=[hold],
-        material={"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
-    )
-    one, two = (result_on(ranks, scene, "-log_view") for ranks in (1, 2))  # no option of a solver
-    assert one["frames/contact"][:].max() > 0
-    np.testing.assert_array_equal(two["frames/iterations"], one["frames/iterations"])
-    np.testing.assert_allclose(two["frames/position"], one["frames/position"], atol=1e-9)
-    for name in ("step", "q", "q_previous"):
-        np.testing.assert_allclose(two[f"checkpoint/{name}"], one[f"checkpoint/{name}"], atol=1e-9)

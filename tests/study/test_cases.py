@@ -139,6 +139,8 @@ def test_the_studies_shipped_are_sound():
         path = ROOT / "scenes" / "studies" / f"{name}.toml"
         few, many = (study_cases(load_study(path), path.parent, full) for full in (False, True))
         assert 10 < len(few) < 130 and len(few) < len(many)
-    path = ROOT / "scenes" / "studies" / "size.toml"
-    sizes = study_cases(load_study(path), path.parent, False)
+    sizes, atlas = (
+        study_cases(load_study(path.with_name(f"{name}.toml")), path.parent, False) for name in ("size", "stability")
+    )
+    assert 500 < len(atlas) < 1200 and {one.point.map for one in atlas if one.point} >= {"beam", "press", "cases"}
     assert len({case.scene for case in sizes}) == 4 and all(case.stores_surface for case in sizes)

@@ -4,7 +4,6 @@
 import json
 import math
 import shutil
-import subprocess
 import sys
 import tomllib
 from dataclasses import replace
@@ -12,7 +11,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from conftest import ENVIRONMENT, ROOT
+from conftest import ROOT, python
+from one_process import command_error
 from study_files import SCENE, own_log  # noqa: F401 (fixtures)
 
 from msmpetsc.cli.commands import plan as plan_command
@@ -123,10 +123,6 @@ def test_explicit_substeps_shorten_with_the_cells():
         model = replace(MODEL, steppings=[stepping("verlet", 0.01, 1e-4, 3.0)], explicit=explicit)
         costs = [model.choice(model.steppings[0], SOLVINGS[2], cells).cost for cells in (1000, 8000)]
         assert costs[1] / costs[0] == pytest.approx(factor)
-
-
-def test_the_parts_of_an_error_add_up():
-    assert Budget(0.1, 0.2, 0.3).total == pytest.approx(0.6)
 
 
 def test_cost_grows_with_cells_as_measured():
@@ -350,8 +346,7 @@ def true_error(scene: Path, *, choice: list[str], finer: list[str]) -> float:
     results = [scene.with_name("choice.h5"), scene.with_name("finer.h5")]
     for result, changes in zip(results, (choice, fine), strict=True):
         own = [word for change in ("output.surface=true", *changes) for word in ("--set", change)]
-        command = [sys.executable, "-m", "msmpetsc", "run", str(scene), "-o", str(result), *own]
-        subprocess.run(command, env=ENVIRONMENT, check=True, timeout=300, capture_output=True)
+        python("-m", "msmpetsc", "run", scene, "-o", result, *own, check=True)
     return surface_error(*results)
 
 
@@ -475,7 +470,5 @@ def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path
         (["--surface-error", "0.1"], "no such scene"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(tmp_path: Path, capsys, own_log, options: list[str], words: str):
-    assert main(["plan", str(tmp_path / "gone.toml"), *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line
+def test_what_makes_no_sense_is_refused_in_one_line(tmp_path: Path, own_log, options: list[str], words: str):
+    assert words in command_error("plan", tmp_path / "gone.toml", *options)

@@ -4,30 +4,24 @@ import base64
 import json
 import logging
 import re
-import subprocess
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
-from browser import CHROMIUM
+from ball_result import BARE, HEIGHTS, write_ball
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from PIL import Image
+from test_film import render
 
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.commands import render as command
 from msmpetsc.results.reader import Result
 from msmpetsc.view import page
 
-in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-
 
 def written_page(folder: Path, *words: str, scene: str | None = None) -> Path:
-    result = write_ball(folder / "x.h5", surface=True, **({} if scene is None else {"scene": scene}))
-    assert command.run(parsed(["render", str(result), "-o", str(folder / "x.html"), *words])) == 0
+    result = write_ball(folder / "x.h5", **({} if scene is None else {"scene": scene}))
+    render(result, "-o", folder / "x.html", *words)
     return folder / "x.html"
 
 
@@ -106,25 +100,3 @@ def test_anchored_points_are_free_after_their_stop(tmp_path):
     assert data["fixed"] == [0] * 5 + [1] * 6
     first, second = stream(data, "fixed").reshape(2, -1)
     assert set(first) == {0, 255} and not second.any()
-
-
-def seen(path: Path, address: str) -> np.ndarray:
-    """What a browser shows of a page at an address, (h, w, 3)."""
-    picture = path.with_suffix(".seen.png")
-    words = [CHROMIUM, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    words += ["--hide-scrollbars", "--window-size=600,700", "--virtual-time-budget=4000", f"--screenshot={picture}"]
-    subprocess.run([*words, f"{path.as_uri()}#{address}"], capture_output=True, timeout=50, check=True)
-    return np.array(Image.open(picture).convert("RGB")).astype(int)[60:-120]  # between header and player
-
-
-@in_browser
-@pytest.mark.timeout(120)
-def test_an_address_is_a_frame_and_a_turn(tmp_path):
-    """The ball falls between two frames, and its dark side turns away."""
-    path = written_page(tmp_path, "--eye", "1,0,0", scene=BARE + EAST_HELD)
-    start, fallen, turned = (seen(path, address) for address in ("frame=0", "frame=3", "frame=0&turn=180,0"))
-    rows = [np.flatnonzero(picture.min(axis=2).min(axis=1) < 200) for picture in (start, fallen)]
-    metre = np.ptp(rows[0]) / 0.2  # pixels, of the ball's 0.2 m
-    assert rows[1].mean() - rows[0].mean() == pytest.approx(0.4 * metre, rel=0.05)
-    dark = [(picture[..., 0] < 58).sum() for picture in (start, turned)]
-    assert dark[0] > 1000 and dark[1] < 0.05 * dark[0]

@@ -1,28 +1,24 @@
 """The page of a result in a browser, driven by mouse and keys: it turns, comes nearer, plays, goes to a frame."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from ball_result import BARE, EAST_HELD, write_ball
-from browser import CHROMIUM, Browser
+from browser import Browser, in_browser
+from test_film import render
 
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.commands import render as command
-
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.timeout(120),
-]
+pytestmark = [in_browser, pytest.mark.timeout(120)]
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball that is dark on its east, seen from there."""
     folder = tmp_path_factory.mktemp("page")
-    result = write_ball(folder / "x.h5", surface=True, scene=BARE + EAST_HELD)
-    assert command.run(parsed(["render", str(result), "-o", str(folder / "x.html"), "--eye", "1,0,0"])) == 0
+    result = write_ball(folder / "x.h5", scene=BARE + EAST_HELD)
+    render(result, "-o", folder / "x.html", "--eye", "1,0,0")
     return folder / "x.html"
 
 
@@ -61,6 +57,12 @@ def test_dragging_turns_the_body(browser: Browser):
     assert browser.value("view.yaw") == pytest.approx(0) and dark(browser) == pytest.approx(before, rel=0.01)
     browser.drag(middle, (0, 100))
     assert browser.value("view.pitch") == pytest.approx(40)  # 0.4 degrees a pixel
+
+
+def test_an_address_is_a_frame_and_a_turn(path: Path, browser: Browser, tmp_path: Path):
+    with Browser(Path(shutil.copy(path, tmp_path)), address="frame=3&turn=180,0") as other:
+        assert other.value("[view.frame, view.yaw]") == [3, 180]
+        assert dark(other) < 0.05 * dark(browser)
 
 
 def test_the_wheel_comes_nearer_and_goes_away(browser: Browser):

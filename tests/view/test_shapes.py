@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 from ball_result import BARE, write_ball
+from browser import Browser, in_browser
 from PIL import Image
-from test_page import data_of, in_browser, seen
+from test_film import render
+from test_page import data_of
 
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
 from msmpetsc.view.composition import Style, composition_of
@@ -36,7 +36,7 @@ LOW, HIGH = np.array([0.15, -0.05, 0.45]), np.array([0.25, 0.05, 0.55])  # to th
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     """The ball, and beside it a cube that sinks with it, slower."""
-    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + STATUE)
+    path = write_ball(tmp_path / "x.h5", scene=BARE + STATUE)
     cube = trimesh.creation.box(bounds=[LOW, HIGH])
     with h5py.File(path, "r+", libver="earliest") as file:
         file["obstacle/points"], file["obstacle/triangles"] = cube.vertices, cube.faces
@@ -72,15 +72,17 @@ def test_a_sheet_has_it_where_it_is_and_none_when_it_is_gone(result: Path):
 @pytest.mark.timeout(120)
 def test_a_page_has_it_once_and_moves_it(result: Path):
     path = result.with_suffix(".html")
-    assert command.run(parsed(["render", str(result), "-o", str(path), "--eye", "0,-1,0"])) == 0
+    render(result, "-o", path, "--eye", "0,-1,0")
     data = data_of(path)
     assert len(data["solids"]["1"]["corners"]) == 9 * 12
     assert [len(state["meshes"]) for state in data["overlays"]["states"]] == [1] * 10 + [0]
-    rows, columns, metre = right_of_the_ball(seen(path, "frame=0"))
+    with Browser(path) as browser:
+        pictures = [browser.picture() for frame in (0, 5) if not browser.value(f"goTo({frame})")]
+    rows, columns, metre = right_of_the_ball(pictures[0])
     assert np.ptp(rows) == pytest.approx(0.1 * metre, rel=0.1) and np.ptp(columns) == pytest.approx(
         0.1 * metre, rel=0.1
     )
-    sunk = right_of_the_ball(seen(path, "frame=5"))[0]
+    sunk = right_of_the_ball(pictures[1])[0]
     assert sunk.mean() - rows.mean() == pytest.approx(0.2 * metre, rel=0.1)
 
 

@@ -1,15 +1,13 @@
 """Contact sheets: the moments, the axes, and a picture that shows what it should (never compared as an image)."""
 
 import os
-import subprocess
-import sys
 
 import h5py
 import numpy as np
 import pytest
 import trimesh
 from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
-from conftest import ROOT
+from conftest import ROOT, python
 from PIL import Image, ImageDraw
 
 from msmpetsc.errors import InputError
@@ -40,7 +38,7 @@ def stills(tmp_path):
     """stills(scene tables, frames, eye) of a sheet that is not drawn."""
 
     def stills_of(tables: str, frames: list[int], eye: tuple[float, ...] | None = None) -> list[Still]:
-        path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + tables)
+        path = write_ball(tmp_path / "x.h5", scene=BARE + tables)
         with Result(path) as run:
             return composition_of(drawable_of_result(run), frames, Style(eye=eye)).stills(frames)
 
@@ -48,7 +46,7 @@ def stills(tmp_path):
 
 
 def test_moments_of_the_scene(tmp_path):
-    path = write_ball(tmp_path / "x.h5", surface=True, scene=f"{BARE}picture.times = [0.72, 99.0, 0.26, 0.3]")
+    path = write_ball(tmp_path / "x.h5", scene=f"{BARE}picture.times = [0.72, 99.0, 0.26, 0.3]")
     sheet.contact_sheet(path, tmp_path / "x.png")
     sheet.contact_sheet(path, tmp_path / "y.png", frames=[0, 3, 7, 10])
     one, other = (np.array(Image.open(tmp_path / name))[: -sheet.CAPTION] for name in ("x.png", "y.png"))
@@ -90,7 +88,7 @@ region.painted = "spots.txt"
 def test_held_parts(tmp_path):
     fixed = {}
     for name, tables in {"east": EAST_HELD, "led": LED}.items():
-        with Result(write_ball(tmp_path / f"{name}.h5", surface=True, scene=BARE + tables)) as run:
+        with Result(write_ball(tmp_path / f"{name}.h5", scene=BARE + tables)) as run:
             subject = drawable_of_result(run)
             fixed[name] = [subject.fixed(index) for index in (0, 4, 5)]
             points = subject.surface(0)
@@ -192,7 +190,7 @@ def test_spheres_are_shown_where_they_are_and_large_ones_cut(stills):
 
 def test_glass_is_seen_at_its_place_and_through(tmp_path):
     level = "picture.eye = [0, -1, 0]"
-    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + level + PLATE)
+    path = write_ball(tmp_path / "x.h5", scene=BARE + level + PLATE)
     picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0, 1, 8])))[: -sheet.CAPTION]
     panels = np.split(picture, 3, axis=1)
     across = np.flatnonzero(is_body(panels[2]).any(axis=0))
@@ -236,7 +234,7 @@ def test_heights_sizes_and_captions_are_seen(falling_ball, tmp_path, capfd):
 
 
 def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
-    path = write_ball(tmp_path / "x.h5", surface=True)
+    path = write_ball(tmp_path / "x.h5")
     for key, told in ("embedding", "no surface to draw"), ("scene", "another version"):
         with h5py.File(path, "r+") as file:
             del (file.attrs if key == "scene" else file)[key]
@@ -249,8 +247,7 @@ def test_without_opengl_one_line_names_the_package(falling_ball, tmp_path):
     draw = "import sys; from msmpetsc.view.sheet import contact_sheet; contact_sheet(*sys.argv[1:])"
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "PYTHONPATH": str(ROOT)}
-    order = [sys.executable, "-c", draw, str(falling_ball), str(tmp_path / "x.png")]
-    done = subprocess.run(order, env=environment, capture_output=True, text=True, timeout=40)
+    done = python("-c", draw, falling_ball, tmp_path / "x.png", env=environment)
     assert done.returncode == 1
     assert done.stderr.strip().endswith("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
     assert "WARN" not in done.stderr

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from block_scene import block_scene
 from PIL import Image
+from test_film import render
 
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 
 SCENE = {
@@ -21,7 +20,7 @@ SCENE = {
 
 def drawn(*words: object) -> np.ndarray:
     """The picture that a command draws; its path is the last word."""
-    assert command.run(parsed(["render", *map(str, words[:-1]), "-o", str(words[-1])])) == 0
+    render(*words[:-1], "-o", words[-1])
     return np.array(Image.open(words[-1]).convert("RGB")).astype(int)
 
 
@@ -52,9 +51,9 @@ def test_a_scene_shows_pins_forces_and_cells(tmp_path):
 )
 def test_what_a_scene_has_not_got(tmp_path, words, line):
     with pytest.raises(InputError, match=line):
-        command.run(parsed(["render", str(sized(tmp_path, (0.5, 0.5, 0.25))), *words]))
+        render(sized(tmp_path, (0.5, 0.5, 0.25)), *words)
 
 
 def test_a_mesh_is_none_of_what_is_drawn(ball):
     with pytest.raises(InputError, match=r"is named \*.h5 or \*.hdf5 or \*.toml"):
-        command.run(parsed(["render", str(ball)]))
+        render(ball)

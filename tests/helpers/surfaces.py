@@ -1,0 +1,18 @@
+"""Surfaces and bodies of trimesh's meshes."""
+
+import numpy as np
+import trimesh
+from mpi4py import MPI
+
+from msmpetsc.geometry.cages import BodySurface
+from msmpetsc.geometry.surface import Surface, examine
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
+
+
+def body_of(mesh: trimesh.Trimesh | Surface) -> BodySurface:
+    surface = mesh if isinstance(mesh, Surface) else surface_of(mesh)
+    bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
+    return BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)

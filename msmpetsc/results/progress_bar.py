@@ -16,7 +16,7 @@ LINE_EVERY = 10.0  # [s] at the least between two lines of a log
 LINE = "frame {n_fmt}/{total_fmt}  {rate_fmt}  {remaining} left{postfix}"
 
 
-class Lines:
+class BatchLog:
     """Standard error of a batch job, where each state of a bar is a line."""
 
     def write(self, text: str) -> None:
@@ -36,7 +36,7 @@ class Progress:
         self._is_terminal = sys.stderr.isatty()
         style: dict[str, Any] = dict(dynamic_ncols=True, smoothing=0.1)
         if not self._is_terminal:
-            style = dict(bar_format=LINE, file=Lines(), mininterval=LINE_EVERY)
+            style = dict(bar_format=LINE, file=BatchLog(), mininterval=LINE_EVERY)
         self._style = style | dict(total=total, unit="frame", miniters=1)
         self._shown = ExitStack()  # the bar, with log lines above it
         self._bar: tqdm | None = None

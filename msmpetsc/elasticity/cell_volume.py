@@ -126,13 +126,18 @@ def least_volume(q: Positions, c: Indices) -> float:
 
 
 @kernel
-def _least_volume_of(first, count, step, q, cells, least):
+def _least_volume_of(
+    first: int, count: int, step: int, q: Positions, cells: Indices, least: Floats,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         least[i] = least_volume(q, cells[i])
 
 
 @kernel
-def _energy_of(first, count, step, q, cells, resistance, least, parts):
+def _energy_of(
+    first: int, count: int, step: int, q: Positions, cells: Indices, resistance: Floats,
+    least: float, parts: Floats,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         energy = 0.0
         for frame in range(8):
@@ -143,7 +148,10 @@ def _energy_of(first, count, step, q, cells, resistance, least, parts):
 
 
 @kernel
-def _change_of(first, count, step, q, base, moved, cells, stiffness, least, parts):
+def _change_of(
+    first: int, count: int, step: int, q: Positions, base: Positions, moved: Rows, cells: Indices,
+    stiffness: Floats, least: float, parts: Floats,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         change = 0.0
         if min(least_volume(q, cells[i]), least_volume(base, cells[i])) < least:  # of few; it reads each edge once
@@ -205,7 +213,10 @@ def vector_of(role: int, vectors: Frame) -> Vector:
 
 
 @kernel
-def _add_gradient(first, count, step, q, cells, stiffness, volume, at, gradient):
+def _add_gradient(
+    first: int, count: int, step: int, q: Positions, cells: Indices, stiffness: Floats,
+    volume: float, at: Indices, gradient: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         for frame in range(8):
             e = edges(q, cells[i], frame)
@@ -216,7 +227,10 @@ def _add_gradient(first, count, step, q, cells, stiffness, volume, at, gradient)
 
 
 @kernel
-def _add_product(first, count, step, q, cells, stiffness, volume, at, projected, v, product):
+def _add_product(
+    first: int, count: int, step: int, q: Positions, cells: Indices, stiffness: Floats,
+    volume: float, at: Indices, projected: bool, v: Rows, product: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         for frame in range(8):
             e = edges(q, cells[i], frame)
@@ -227,7 +241,10 @@ def _add_product(first, count, step, q, cells, stiffness, volume, at, projected,
 
 
 @kernel
-def _add_bound(first, count, step, q, cells, stiffness, volume, at, blocks):
+def _add_bound(
+    first: int, count: int, step: int, q: Positions, cells: Indices, stiffness: Floats,
+    volume: float, at: Indices, blocks: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         for frame in range(8):
             e = edges(q, cells[i], frame)

@@ -128,7 +128,10 @@ def between(q: Positions, a: int, b: int) -> Vector:
 
 
 @kernel
-def _elastic_energy(first, count, step, q, ends, rest_length, stiffness, stiffening, sums):
+def _elastic_energy(
+    first: int, count: int, step: int, q: Positions, ends: Indices, rest_length: Floats,
+    stiffness: Floats, stiffening: float, sums: Floats,
+) -> None:  # fmt: skip
     energy = 0.0
     for s in range(first, count, step):
         energy += spring_energy(between(q, ends[s, 1], ends[s, 0]), rest_length[s], stiffness[s], stiffening)
@@ -137,7 +140,10 @@ def _elastic_energy(first, count, step, q, ends, rest_length, stiffness, stiffen
 
 
 @kernel
-def _elastic_change(first, count, step, base, moved, ends, rest_length, stiffness, stiffening, sums):
+def _elastic_change(
+    first: int, count: int, step: int, base: Positions, moved: Rows, ends: Indices,
+    rest_length: Floats, stiffness: Floats, stiffening: float, sums: Floats,
+) -> None:  # fmt: skip
     change = 0.0
     for s in range(first, count, step):
         before = between(base, ends[s, 1], ends[s, 0])
@@ -356,7 +362,10 @@ class SpringGather(OwnedSprings):
 
 
 @kernel
-def _gradient_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, gradient):
+def _gradient_around(
+    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
+    stiffness: Floats, lengths: Floats, stiffening: float, gradient: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         gx, gy, gz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):
@@ -374,7 +383,10 @@ def _gradient_around(first, count, step, q, neighbour, kind, stiffness, lengths,
 
 
 @kernel
-def _concavity_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, concavity):
+def _concavity_around(
+    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
+    stiffness: Floats, lengths: Floats, stiffening: float, concavity: Floats,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         total = 0.0
         for s in range(neighbour.shape[0]):
@@ -386,7 +398,11 @@ def _concavity_around(first, count, step, q, neighbour, kind, stiffness, lengths
 
 
 @kernel
-def _product_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, projected, v, product):
+def _product_around(
+    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
+    stiffness: Floats, lengths: Floats, stiffening: float, projected: bool, v: Rows,
+    product: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         px, py, pz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):
@@ -405,7 +421,10 @@ def _product_around(first, count, step, q, neighbour, kind, stiffness, lengths, 
 
 
 @kernel
-def _diagonal_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, blocks):
+def _diagonal_around(
+    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
+    stiffness: Floats, lengths: Floats, stiffening: float, blocks: Rows,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         for s in range(neighbour.shape[0]):
             j = neighbour[s, i]

@@ -107,6 +107,6 @@ def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) ->
     arrays = BYTES @ np.array([partition.cells, nodes, springs]) + nodes * BYTES_OF_NODE
     arrays += assembly_bytes(nodes, springs, partition.nonzeros)
     points = sum(len(surface.points) for surface in surfaces)
-    needed = np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / len(nodes))
-    needed[0] = max(needed[0], mesh)
-    return PROGRAM + needed
+    needed: Floats = PROGRAM + np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / len(nodes))
+    needed[0] = max(needed[0], PROGRAM + mesh)
+    return needed

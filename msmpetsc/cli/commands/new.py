@@ -191,13 +191,13 @@ def stands(surface: Surface, axis: int, way: int) -> float:
         hull, ground = ConvexHull(plan[used[low[used]]]), ConvexHull(plan[used])
     except QhullError:  # an edge or a corner
         return 0.0
-    areas = trimesh.triangles.area(surface.points[surface.triangles])
+    areas = trimesh.Trimesh(surface.points, surface.triangles, process=False).area_faces
     centre = areas @ plan[surface.triangles].mean(axis=1) / areas.sum()
     if not (hull.equations[:, :2] @ centre + hull.equations[:, 2] <= 0).all():
         return 0.0
     lowest = surface.triangles[low[surface.triangles].all(axis=1)]
     flat = np.insert(plan, 2, 0.0, axis=1)
-    face = trimesh.triangles.area(flat[lowest]).sum() / hull.volume  # in two dimensions the volume is an area
+    face = trimesh.Trimesh(flat, lowest, process=False).area / hull.volume  # in two dimensions the volume is an area
     return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
 
 

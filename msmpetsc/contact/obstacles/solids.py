@@ -123,13 +123,19 @@ def side_of(q: Positions, end: Positions, i: int, points: Positions, normals: Ro
 
 
 @kernel
-def _depths_of(first, count, step, q, points, normals, sides, depths, face):
+def _depths_of(
+    first: int, count: int, step: int, q: Positions, points: Positions, normals: Rows,
+    sides: Indices, depths: Floats, face: Indices,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         depths[i], face[i] = depth(q, i, points, normals, sides[i])
 
 
 @kernel
-def _sides_of(first, count, step, q, end, points, normals, before, sides):
+def _sides_of(
+    first: int, count: int, step: int, q: Positions, end: Positions, points: Positions,
+    normals: Rows, before: Indices, sides: Indices,
+) -> None:  # fmt: skip
     for i in range(first, count, step):
         sides[i] = side_of(q, end, i, points, normals, before[i])
 

@@ -3,7 +3,7 @@
 Springs, and cells of a solid, that the edge of a clamp cuts: a pin holds nodes, but its region ends between them. Of a
 spring from a free node to a held one a part theta is free, and only that gives: it is 1 / theta as stiff. Where the
 held node sticks out of the body, as at a clamped face, the spring has been made of what is inside, a part sigma of its
-length (cell_fractions), and is 1 / (sigma theta) as stiff. Along a row of cells both are exact, and a clamp askew in
+length (cut_cells), and is 1 / (sigma theta) as stiff. Along a row of cells both are exact, and a clamp askew in
 the grid is where it should be to second order, as Gibou, Fedkiw, Cheng and Kang (2002) have it for the Poisson
 equation. A cell of a solid takes the mean of sigma theta over its pairs of a free and a held corner: along the clamp,
 where that is too much, nothing strains.

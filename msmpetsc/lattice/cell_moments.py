@@ -24,7 +24,7 @@ It is three sums like (h_xy, h_xz) [C_yy C_yz; C_yz C_zz] (h_xy, h_xz)^T, and so
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Rows
-from msmpetsc.lattice.cell_fractions import CORNERS
+from msmpetsc.lattice.cut_cells import CORNERS
 
 FORM = 13  # numbers of a cell's form: 2 c (3), 4 <xy>, <xz>, <yz>, then the modes' form of ``forms_of``
 SIGNS = 2.0 * CORNERS - 1

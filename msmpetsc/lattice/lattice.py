@@ -16,9 +16,9 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Row
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
-from msmpetsc.lattice.cell_fractions import CORNERS as CORNERS
-from msmpetsc.lattice.cell_fractions import shares_of_mass, shares_of_pairs
 from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
+from msmpetsc.lattice.cut_cells import CORNERS as CORNERS
+from msmpetsc.lattice.cut_cells import shares_of_mass, shares_of_pairs
 from msmpetsc.lattice.material import CellMaterial, calibrated_stiffness, edge_stiffness, lame_constants
 
 # the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a

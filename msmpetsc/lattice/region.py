@@ -20,7 +20,7 @@ from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
 from msmpetsc.geometry.nearest import nearest_in_bodies
-from msmpetsc.lattice.cell_fractions import CORNERS
+from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.scene.bodies import OfBody

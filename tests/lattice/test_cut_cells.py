@@ -13,7 +13,7 @@ from surfaces import body_of
 
 from msmpetsc.build import nearest_of_body
 from msmpetsc.geometry.cages import fill
-from msmpetsc.lattice.cell_fractions import CORNERS, shares_of_mass, shares_of_pairs
+from msmpetsc.lattice.cut_cells import CORNERS, shares_of_mass, shares_of_pairs
 from msmpetsc.lattice.lattice import LatticeMaterial, build_lattice
 
 E, DENSITY = study.E, study.DENSITY

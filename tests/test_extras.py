@@ -62,7 +62,7 @@ def test_drawing_exporting_and_comparing_need_neither_mpi_nor_petsc_nor_a_compil
     command: str, tmp_path: Path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    write_ball(tmp_path / "ball.h5", surface=True)
+    write_ball(tmp_path / "ball.h5")
     words = command.format("ball.h5").split()
     done = without(OF_RUNS, *words)
     assert done.returncode == 0, done.stderr

@@ -267,7 +267,6 @@ COMMANDS = {
         ),
         description="Write as CSV, for each frame, energies, momentum, loads, the reaction of each pin and anchor, the "
         "push of each obstacle and of contacts on each body, and where the scene's probes are.",
-        module="export",
     ),
     "check": Command(
         "store a scene's numbers; say whether they still hold",

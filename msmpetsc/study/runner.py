@@ -142,13 +142,16 @@ class StudyResults:
     order: Sequence[str]
     rows: dict[str, Row] = field(default_factory=dict)
     traces: dict[str, dict[str, Any]] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
 
     def add(self, result: CaseResult) -> None:
+        """Add the result of a case and write all, of several threads one after the other."""
         case = result.row["case"]
-        self.rows[case] = result.row
-        if result.trace:
-            self.traces[case] = result.trace
-        self.write()
+        with self._lock:
+            self.rows[case] = result.row
+            if result.trace:
+                self.traces[case] = result.trace
+            self.write()
 
     def write(self) -> None:
         """Write table and traces, each replaced whole."""
@@ -227,10 +230,9 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
     pool = ThreadPoolExecutor(jobs)
     try:
         with bar:
-            futures = [pool.submit(bench.measure, case) for case in todo]
+            futures = [pool.submit(_carry_out_one, bench, case, results) for case in todo]
             for count, future in enumerate(as_completed(futures), done + 1):
                 result = future.result()
-                results.add(result)
                 bar.write(f"case {count}/{bar.total}  {described(result.row)}", file=sys.stderr)
                 bar.update()
     finally:  # what ends this early ends the runs under way
@@ -238,6 +240,14 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
         pool.shutdown(cancel_futures=True)
         with suppress(OSError):  # logs of cases that failed are in it
             (bench.folder / "runs").rmdir()
+
+
+def _carry_out_one(bench: Bench, case: Case, results: StudyResults) -> CaseResult:
+    """Run a case and add its result, so that its row is in the file when the next one begins."""
+    result = bench.measure(case)
+    if not bench.processes.stopped:
+        results.add(result)
+    return result
 
 
 def described(row: Row) -> str:

@@ -1,74 +1,13 @@
-"""``msmpetsc export``, ``msmpetsc series``: frames of a result in another format, and its series as CSV."""
+"""``msmpetsc export``: frames of a result in the format of another program."""
 
 import argparse
-import csv
-import io
-import sys
-from collections.abc import Iterator
 
-from msmpetsc.backend.arrays import Floats
-from msmpetsc.errors import InputError
 from msmpetsc.export.formats import export
-from msmpetsc.results.disk import write_whole
-from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
-from msmpetsc.scene.bodies import held_by
-from msmpetsc.scene.schema import SceneFile
-from msmpetsc.view.drawable import read_scene
-
-SERIES = (
-    "kinetic", "elastic", "potential", "contact", "self_contact", "momentum", "load", "reaction", "torque", "push",
-    "contact_push", "probe",
-)  # fmt: skip
+from msmpetsc.results.reader import refuse_deadly
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write frames or the series of a result; return the exit status."""
+    """Export the result and print the path of what was written; return the exit status."""
     refuse_deadly(args.result)
-    if args.command == "export":
-        print(export(args.result, args.output, args.mesh, args.frames))
-        return 0
-    if args.output and args.output.exists() and not args.overwrite:
-        raise InputError(f"{args.output} exists already: --overwrite replaces it")
-    with plain_damage(args.result), Result(args.result) as result:
-        text = series_text(result, read_scene(result))
-    if args.output is None:
-        sys.stdout.write(text)
-        return 0
-    write_whole(args.output, text)
-    print(args.output)
+    print(export(args.result, args.output, args.mesh, args.frames))
     return 0
-
-
-def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
-    """Yield the columns of the series, the time first: a name with unit, and values (T,).
-
-    Raises InputError where they are not those of the scene.
-    """
-    yield "time [s]", run.frames.time[:]
-    names = {
-        "reaction": [table.key for table in held_by(scene)],
-        "torque": [table.key for table in held_by(scene)],
-        "push": [f"obstacle.{number}" for number in range(len(scene.obstacle))],
-        "contact_push": [f"body.{number}" for number in range(max(1, len(scene.body)))],
-        "probe": [probe.name for probe in scene.output.probe],
-    }
-    for name in filter(run.frames.__contains__, SERIES):
-        array = run.frames[name]
-        of_rows = names.get(name, [""])
-        if array.ndim == 3 and array.shape[1] != len(of_rows):
-            raise InputError(f"{run.path} is damaged: {array.name} has {array.shape[1]} rows for {len(of_rows)} tables")
-        axes = ("x", "y", "z") if array.ndim > 1 else ("",)
-        values = array[:].reshape(len(array), len(of_rows), len(axes))
-        for row, whose in enumerate(of_rows):
-            for axis, letter in enumerate(axes):
-                words = " ".join(filter(None, [name, whose, letter]))
-                yield f"{words} [{array.unit}]", values[:, row, axis]
-
-
-def series_text(run: Result, scene: SceneFile) -> str:
-    """Return the series as CSV, with a header and one line for each frame. Raises InputError."""
-    columns, text = dict(columns_of(run, scene)), io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
-    return text.getvalue()

@@ -166,9 +166,7 @@ class Multigrid:
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation)
-            restriction = PETSc.Mat().createTranspose(level.interpolation)  # a square P would be taken for it as it is
-            self.owned.callback(restriction.destroy)
-            pc.setMGRestriction(top - i, restriction)
+            pc.setMGRestriction(top - i, self._restriction(level.interpolation))
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
@@ -176,6 +174,15 @@ class Multigrid:
         finest.setOperators(self.operator, self.operator)
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
+
+    def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
+        """P^T by itself: of a square P PETSc cannot tell by its shape, nor PETSc 3.22 of a MATTRANSPOSE of one."""
+        fine, coarse = interpolation.getSizes()
+        restriction = PETSc.Mat().createPython((coarse, fine), Restriction(interpolation), comm=interpolation.comm)
+        restriction.setVecType(self.unknowns.memory.vec_type)
+        restriction.setUp()
+        self.owned.callback(restriction.destroy)
+        return restriction
 
     def _read_options(self) -> None:
         """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG."""
@@ -208,6 +215,18 @@ def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlock
     for owned in (ksp, x, b):
         owned.destroy()
     return greatest
+
+
+class Restriction:
+    """P^T whichever way it is applied (a context of MATPYTHON)."""
+
+    def __init__(self, interpolation: PETSc.Mat):
+        self.interpolation = interpolation
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.interpolation.multTranspose(x, y)
+
+    multTranspose = mult
 
 
 class ProjectedHessian:

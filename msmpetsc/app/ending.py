@@ -69,18 +69,20 @@ def ending_together(comm: "MPI.Comm", extra: str = "run") -> Iterator[None]:
 
 def _failing_ranks(meeting: "MPI.Comm") -> set[int]:
     """Return the ranks that fail, this one among them: as soon as all do, or when patience ends."""
-    others = set(range(meeting.size)) - {meeting.rank}
-    sent = [meeting.isend(None, rank) for rank in others]
-    failed: set[int] = set()
-    until = time.monotonic() + PATIENCE
-    while failed < others and time.monotonic() < until:
-        failed |= {rank for rank in others - failed if meeting.iprobe(source=rank)}
-        time.sleep(0.01)
-    if failed == others:
-        for rank, request in zip(others, sent, strict=True):
-            meeting.recv(source=rank)
-            request.wait()
-    return failed | {meeting.rank}
+    from mpi4py import MPI
+
+    failed, until = {meeting.rank}, time.monotonic() + PATIENCE
+    sent = [meeting.isend(None, rank) for rank in range(meeting.size) if rank != meeting.rank]
+    while len(failed) < meeting.size and time.monotonic() < until:
+        status = MPI.Status()
+        if meeting.iprobe(status=status):
+            meeting.recv(source=status.source)
+            failed.add(status.source)
+        else:
+            time.sleep(0.01)
+    if len(failed) == meeting.size:
+        MPI.Request.waitall(sent)
+    return failed
 
 
 def _end_all(comm: "MPI.Comm", line: str, status: int) -> None:

@@ -228,6 +228,4 @@ def test_a_mode_that_stiffens_hides_no_lower_one():
     """A step said 0.13 of its error while the search for curvature followed the mode of the step before (1.57, when the
     lowest was 0.29): on the way to its solution the Hessian had negative curvatures."""
     said = shares_said(28, 11, 'solver.preset="newton-projected"')
-    assert [share > 0.85 for share in said] == 3 * [
-        True
-    ]  # 0.997, 0.98, 1.18 with PETSc 3.18; 0.998, 0.896, 1.31 with 3.22
+    assert len(said) == 3 and min(said) > 0.85  # 0.98 with PETSc 3.18, 0.896 with 3.22

@@ -35,7 +35,7 @@ OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that ma
 
 
 def earlier_run(comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool) -> Earlier | None:
-    """Return the run that is to be resumed, None to run from the start (collective). Raises InputErr
+    """Return the run to go on from, None to run from the start (collective). Raises InputError.
 
     may_start : whether there is a scene to start from, where there is no such file yet
     """

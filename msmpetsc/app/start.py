@@ -28,7 +28,6 @@ from msmpetsc.solve.petsc.words import words_of
 P = ParamSpec("P")
 T = TypeVar("T")
 Source = str | PathLike[str] | Mapping[str, Any] | Scene  # a scene file, its tables, or a scene
-ON_A_GPU = ("-mat_type", "aijcusparse")
 
 
 def asked_by(request: Callable[P, object]) -> Callable[[Callable[..., T]], Callable[P, T]]:
@@ -173,9 +172,9 @@ class Simulation:
         """Build what the run needs, or keep it, and return its steps (collective)."""
         start_for_runs(self.comm, self._words)
         from msmpetsc.solve import instrumentation, presets, refused_options, simulate
-        from msmpetsc.solve.petsc.device import choose
+        from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
 
-        words = [*self._words, *(ON_A_GPU if self.device == "cuda" else ())]
+        words = [*self._words, f"-{OPTION}", AIJCUSPARSE] if self.device == "cuda" else self._words
         alone = not +presets.in_use  # no other simulation is begun
         if words and not alone:
             raise InputError("another simulation is under way: end it before one that has PETSc options or a device")

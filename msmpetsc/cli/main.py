@@ -7,7 +7,6 @@ import signal
 import sys
 import traceback
 from importlib import import_module
-from types import ModuleType
 
 from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
 from msmpetsc.cli.arguments import parsed
@@ -34,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
             with ending_together(comm, "render" if args.command in DRAWING else "run"):
                 if refused is not None:
                     raise refused
-                return int(module_of(args.command, comm.size).run(args))
+                return carry_out(args, comm.size)
         except MsmpetscError as error:
             if comm.rank == 0:
                 if args.verbose:
@@ -51,14 +50,15 @@ def main(arguments: list[str] | None = None) -> int:
             return STATUS_BUG
 
 
-def module_of(name: str, ranks: int) -> ModuleType:
-    """Return the module of a command. Raises InputError on several ranks for a command of one process."""
-    command = COMMANDS[name]
-    if ranks > 1 and name != "run":
-        raise InputError(f"{name} is for one process: start it without mpiexec")
+def carry_out(args: argparse.Namespace, ranks: int) -> int:
+    """Carry out a command on so many ranks; return its exit status. Raises InputError where it is for one."""
+    command = COMMANDS[args.command]
+    if ranks > 1 and args.command != "run":
+        raise InputError(f"{args.command} is for one process: start it without mpiexec")
     if command.starts_runs:  # SIGTERM ends those, too, as Ctrl-C does
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return import_module(f"msmpetsc.cli.commands.{command.module or name}")
+    status: int = import_module(f"msmpetsc.cli.commands.{command.module or args.command}").run(args)
+    return status
 
 
 def entry_point() -> None:

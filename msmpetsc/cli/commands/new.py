@@ -1,6 +1,6 @@
 """``msmpetsc new``: a first scene for a mesh of one's own, or a copy of one that comes with msmpetsc.
 
-The mesh is measured; its unit is guessed, its faults and parts counted. The body either falls on
+The mesh is measured; its unit and its upward axis are guessed, its faults and parts counted. The body either falls on
 the ground or, long and lying, is clamped at one end and bends under its weight. Young's modulus follows from the size,
 so that any body deforms visibly; the step from the period of its slowest motion.
 """
@@ -80,8 +80,8 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     """
     source = str(mesh) if str(mesh) in MODELS else path_from(scene, mesh)
     surface = load(source, scene.parent)
-    warnings = check_encloses(surface, examine(surface))
     measures = measured(surface)
+    warnings = check_encloses(surface, measures.report)
     count, state = len(measures.parts), "closed" if measures.report.closed else "open"
     parts = f"{count} parts, the largest of {measures.parts[0]:.0%} of the area" if count > 1 else "1 part"
     log.info("%s: %d triangles, %s, %s", mesh, measures.triangles, state, parts)
@@ -89,8 +89,9 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
         log.warning("%s: %s", mesh, warning)
     if warnings or count > 1:
         log.info("what the scene does about that stands in its comments")
-    stands_on_y = uprightness(surface, 1) > uprightness(surface, 2) + SURER
-    up = up or ("y" if mesh.suffix.lower() in Y_BY_DEFINITION or stands_on_y else "z")
+    if up is None:
+        is_y = mesh.suffix.lower() in Y_BY_DEFINITION or uprightness(surface, 1) > uprightness(surface, 2) + SURER
+        up = "y" if is_y else "z"
     log.info("%s is taken for upwards: --up says another axis", up)
     return draft(source, scene.stem, measures, up)
 

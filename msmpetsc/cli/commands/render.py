@@ -33,7 +33,7 @@ FASTEST = 1e6  # simulated seconds a second
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw a result, a scene or a mesh and print the path; return the exit status."""
+    """Draw a result or a scene and print the path; return the exit status."""
     refuse_other_format("-o", args.output, (*PICTURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES))
     path = args.output or args.subject.with_suffix(".png")
     ending = path.suffix.lower()

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -83,6 +84,13 @@ def start(*arguments: object, ranks: int = 1) -> subprocess.Popen:
     raise AssertionError("it never began")
 
 
+def wait_until(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks: int):
     """The step would take 100,000 iterations; a rank that gets the signal takes the other one along."""
@@ -108,9 +116,10 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
     """Both come within one linear solve, which these settings would not end for minutes."""
     path = tmp_path / "x.h5"
     scene = hanging(tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9})
-    process = start(scene, "-o", path, "-ksp_rtol", "0", "-ksp_atol", "0", "-ksp_max_it", "10000000")
+    endless, seen = ["-ksp_rtol", "0", "-ksp_atol", "0", "-ksp_max_it", "10000000"], tmp_path / "iterations"
+    process = start(scene, "-o", path, *endless, "-ksp_monitor", f"ascii:{seen}")
     with process:
-        time.sleep(0.5)  # before the step begins, the first interrupt alone would end the run
+        wait_until(lambda: seen.exists() and seen.stat().st_size)  # before it, the first interrupt would end the run
         for _ in range(20):
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)

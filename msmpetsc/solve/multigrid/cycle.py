@@ -37,6 +37,7 @@ COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish 
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
 SAFETY = 1.1  # times it where no bound is known, as some iterations of CG know it
 ITERATIONS = 10  # of these
+TRANSPOSES_SQUARE = (3, 19)  # PETSc from here on restricts by the transpose of a square matrix
 
 
 @dataclass(frozen=True)
@@ -176,9 +177,14 @@ class Multigrid:
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
 
     def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
-        """P^T by itself: of a square P PETSc cannot tell by its shape, nor PETSc 3.22 of a MATTRANSPOSE of one."""
+        """P^T by itself: of a square P PETSc cannot tell by its shape, nor PETSc 3.22 of a MATTRANSPOSE of one.
+
+        To restrict by a square matrix, PETSc 3.22 multiplies by its transpose, 3.18 by itself.
+        """
         fine, coarse = interpolation.getSizes()
-        restriction = PETSc.Mat().createPython((coarse, fine), Restriction(interpolation), comm=interpolation.comm)
+        is_transposed = fine[1] == coarse[1] and PETSc.Sys.getVersion() >= TRANSPOSES_SQUARE
+        shape = (fine, coarse) if is_transposed else (coarse, fine)
+        restriction = PETSc.Mat().createPython(shape, Restriction(interpolation), comm=interpolation.comm)
         restriction.setVecType(self.unknowns.memory.vec_type)
         restriction.setUp()
         self.owned.callback(restriction.destroy)

@@ -112,7 +112,7 @@ class Stepper:
         try:
             with petsc_errors("PETSc refuses its options"):
                 self.jacobian = Jacobian(self.functional, self.preset, self.options, self.touches, self.owned)
-                self.x, self.work = (self._keep(self.jacobian.operator.createVecRight()) for _ in range(2))
+                self.x, self.f, self.work = (self._keep(self.jacobian.operator.createVecRight()) for _ in range(3))
                 self.has_npc = self.options.is_given("npc_snes_type")  # a plain iteration that preconditions SNES
                 self.snes, self.ksp = self._create_solvers()
                 self.control, self.minimum = self._create_control()
@@ -131,11 +131,11 @@ class Stepper:
         inner = self._keep(snes.getNPC()) if self.has_npc else snes
         ksp = self._keep(inner.getKSP())
         ksp.setOptionsPrefix(prefix)
-        pc = ksp.getPC()
+        pc = self._keep(ksp.getPC())
         pc.setOptionsPrefix(f"{prefix}three_columns_")  # leaves the bare -pc_ to the preconditioner of A
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
-        snes.setFunction(self._residual, self._keep(self.x.duplicate()))
+        snes.setFunction(self._residual, self.f)
         snes.setJacobian(self._linearise, self.jacobian.operator)
         snes.setObjective(self._objective)
         if self.touches:
@@ -352,7 +352,7 @@ class Stepper:
             z = snes.getSolutionUpdate()
             self.jacobian.operator.mult(x, z)
             z.aypx(-1.0, x)
-            z.axpy(1.0, snes.getFunction()[0])
+            z.axpy(1.0, self.f)
 
     def _start_from_estimate(self, snes: PETSc.SNES, known: bool) -> None:
         """Start CG from the correction that an estimate at this x found, if there is any."""
@@ -397,7 +397,7 @@ class Stepper:
         x = snes.getSolution()
         if self.has_npc:
             return self._evaluate(x)
-        return Iterate(self.functional.positions(x), snes.getFunction()[0])
+        return Iterate(self.functional.positions(x), self.f)
 
     def _adapt(self) -> None:
         """Let the next linear solve leave what the step can do with; a tolerance of the user's own is left alone."""

@@ -72,13 +72,15 @@ SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}
 
 
 def test_contact_that_joins_nodes_takes_a_part_of_the_iterations_to_the_same_frames(tmp_path: Path, monkeypatch):
-    tables = {"material": SOLID, "time": {"step": 0.01, "duration": 0.08}}
+    """In its first two steps: where more is pressed at once, a step to 1e-10 ends elsewhere than one to 1e-8, too."""
+    tables = {"material": SOLID, "time": {"step": 0.002, "duration": 0.068}}
     its, positions = [], []
     for many in (10**9, 5):
         monkeypatch.setattr(preconditioning, "MANY", many)
         _, frames = play(pinch_scene(tmp_path, solver={"preset": "newton-multigrid", "error": 1e-8}, **tables))
-        assert frames[-1].self_contacts > 0
-        its.append(sum(frame.ksp_its for frame in frames))
+        touching = [frame for frame in frames if frame.self_contacts > 0]
+        assert len(touching) == 2
+        its.append(sum(frame.ksp_its for frame in touching))
         positions.append(frames[-1].position)
     assert its[1] < 0.75 * its[0]
-    np.testing.assert_allclose(positions[1], positions[0], atol=1e-4 * np.ptp(positions[0]))
+    np.testing.assert_allclose(positions[1], positions[0], atol=1e-7 * np.ptp(positions[0]))

@@ -48,7 +48,7 @@ def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
 
 
 def test_a_process_alone_takes_no_folder_from_others(tmp_path: Path, processes: Processes, monkeypatch):
-    """One that ended robbed one that began of a folder of both: a case in 300 failed. Open MPI 5 leaves such folders."""
+    """One that ended robbed one that began of a folder of both: a case in 300 failed. Open MPI 5 leaves them."""
     (tmp_path / "shared").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "shared"))
     look = "import os; from mpi4py import MPI; print(*os.listdir(os.environ['TMPDIR']))"

@@ -36,7 +36,7 @@ from msmpetsc.solve.work import Work
 SLENDER = 10.0  # times as slow as sound passes the body: where tau is looked for first
 LOWEST = 10.0  # eigenvalue of M^(-1) tau^2 (Hessian of E) at rest
 WILL_DO = 1.0, 1e3  # eigenvalues for which no other tau is taken, for that takes another solver
-SOON = 100  # iterations of a load step that may still be halved
+SOON = 200  # iterations of a load step that may still be halved
 SMALLEST = 2.0**-10  # of the load: the smallest load step
 MOST_FAILURES = 50  # of the load steps of one state
 SMALL = 2.0**-4  # of the load: a step no larger is not refused for what a smaller one may avoid

@@ -135,6 +135,7 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
         ended.cost.write(request.measured, request.command, ended.failure)
     left = write_companions(comm, request, whole=not ended.signal and ended.failure is None)
     on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, ended.cost.setup, left))
+    ended.cost.log_hardest()
     if ended.failure:
         raise ended.failure
     if ended.signal:

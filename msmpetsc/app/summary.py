@@ -31,6 +31,8 @@ from msmpetsc.solve.integrators.verlet import explicit_limit
 from msmpetsc.solve.petsc.events import FILES, OUTPUT
 from msmpetsc.solve.simulate import TimeLoop
 
+HARD = 20  # times the products of the median frame: a frame that takes more is named at the end
+
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
     """Log size, volume and mass of each body, counts, and the nodes that anchors and forces take (collective)."""
@@ -105,12 +107,13 @@ class Cost:
     setup    : seconds until the first step
     output   : seconds in which frames and checkpoints are written
     stepping : seconds of the steps
-    products : with the Hessian
+    products : with the Hessian, by frame
     """
 
     def __init__(self, comm: MPI.Comm, simulation: TimeLoop, setup: float):
         self.comm, self.simulation, self.setup = comm, simulation, setup
-        self.output, self.stepping, self.products = 0.0, 0.0, 0
+        self.output, self.stepping = 0.0, 0.0
+        self.products: dict[int, int] = {}
         model = simulation.model
         free = int((~simulation.environment.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())
         own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, free
@@ -127,7 +130,18 @@ class Cost:
     def count(self, frame: Frame) -> None:
         """Count the steps since the frame before."""
         self.stepping += frame.wall_time
-        self.products += frame.products
+        self.products[frame.index] = frame.products
+
+    def log_hardest(self) -> None:
+        """Log which frame took the most products, where these are many times those of the median one."""
+        working = [products for products in self.products.values() if products]
+        hardest = max(self.products, key=lambda index: self.products[index], default=0)
+        ratio = max(working, default=0) / np.median(working or [1])
+        if ratio > HARD:
+            log.info(
+                "frame %d took %d products with the Hessian, %.0f times those of the median frame",
+                hardest, max(working), ratio,
+            )  # fmt: skip
 
     def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""
@@ -140,7 +154,7 @@ class Cost:
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
             **self.counts,
             "time": time,
-            "products": self.products,
+            "products": sum(self.products.values()),
             "memory": comm.allreduce(peak_memory()),
             "trace": simulation.true_errors.trace,
             "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),

@@ -76,8 +76,12 @@ def volume_ratios(forms: Rows, corners: Rows, cell_size: float) -> Floats:
 
     corners : (c, 8, 3) positions [m]
     """
-    slopes, _ = slopes_and_modes(forms)
-    ratios: Floats = np.linalg.det(slopes @ corners / (4 * cell_size))
+    (cx, cy, cz), (xy, xz, yz) = forms[:, :3, None].transpose(1, 0, 2), forms[:, 3:6, None].transpose(1, 0, 2)
+    sums = (SUMS @ corners.transpose(1, 0, 2).reshape(8, -1)).reshape(7, -1, 3)
+    along_x = sums[0] + cy * sums[3] + cz * sums[4] + yz * sums[6]
+    along_y = sums[1] + cx * sums[3] + cz * sums[5] + xz * sums[6]
+    along_z = sums[2] + cx * sums[4] + cy * sums[5] + xy * sums[6]
+    ratios: Floats = (along_x * np.cross(along_y, along_z)).sum(axis=1) / (4 * cell_size) ** 3
     return ratios
 
 

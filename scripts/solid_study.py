@@ -188,8 +188,8 @@ def rod_rows() -> lab.Rows:
     yield from scan_rows(trimesh.load(folder / "rod_cut.ply", process=False), np.load(folder / "rod_fem.npz")["U"])
 
 
-def bunny_rows() -> lab.Rows:
-    """Rows of the upper part of the bunny, clamped at the cut."""
+def bunny() -> trimesh.Trimesh:
+    """Return the upper part of the bunny, cut at z = 0."""
     whole = prepare(load("bunny", lab.SCENES), [{"simplify": 4000}])
     low, high = whole.points[:, 2].min(), whole.points[:, 2].max()
     base = low + CUT * (high - low)
@@ -197,6 +197,11 @@ def bunny_rows() -> lab.Rows:
     cut = solid.trim_by_plane((0, 0, 1), base).simplify(1e-4).to_mesh()
     surface = trimesh.Trimesh(cut.vert_properties[:, :3] - np.array([0, 0, base]), cut.tri_verts, process=False)
     surface.vertices[np.abs(surface.vertices[:, 2]) < 1e-6, 2] = 0
+    return surface
+
+
+def bunny_rows() -> lab.Rows:
+    surface = bunny()
     yield from scan_rows(surface, fem_surface(surface, SCAN_E, 0.25, DENSITY * np.array(PUSH)))
 
 

@@ -27,7 +27,7 @@ from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
-from msmpetsc.solve.multigrid.galerkin import RAISED, CoarseOperator, GalerkinSum, set_block_size
+from msmpetsc.solve.multigrid.galerkin import CoarseOperator, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.events import FINE, count_flops
@@ -35,8 +35,8 @@ from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-SAFETY = 1.1  # times it where no bound is known, as some iterations of CG know it
-ITERATIONS = 10  # of these
+SAFETY = 1.1  # times it where no bound is known, as ten iterations of CG know it
+RAISED = 1e-8, 1e-5  # of themselves: coarse diagonals, where all bodies are held and where not
 TRANSPOSES_SQUARE = (3, 19)  # PETSc from here on restricts by the transpose of a square matrix
 
 
@@ -103,8 +103,10 @@ class Multigrid:
         self.fine.update(q, contact, joined)
         self.operator.assemble()
         self.sum.update(q, contact + joined.blocks if joined else contact)
+        self._raise_diagonal(self.sum.matrix)
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
+            self._raise_diagonal(level.matrix)
         is_new = self.pc.getType() is None
         if is_new and self.unknowns.memory is not device.CUDA:
             self.coarse = [CoarseOperator(level.matrix) for level in self.levels[:-1]]
@@ -137,7 +139,7 @@ class Multigrid:
         return SAFETY * greatest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
 
     def _galerkin_product(self, finer: Level, level: Level) -> None:
-        """P^T H P, its diagonal raised as that of the first one is."""
+        """P^T H P."""
         is_new = not level.matrix
         with ExitStack() as options:
             for name, value in self._product_options(finer.matrix) if is_new else ():
@@ -146,9 +148,16 @@ class Multigrid:
         if is_new:
             set_block_size(level.matrix)
             level.matrix.setOption(PETSc.Mat.Option.SPD, True)
-        diagonal = level.matrix.getDiagonal()
-        diagonal.scale(RAISED)
-        level.matrix.setDiagonal(diagonal)
+
+    def _raise_diagonal(self, matrix: PETSc.Mat) -> None:
+        """Few fine nodes in a coarse cell leave its columns linearly dependent.
+
+        What is added holds coarse nodes to the ground, and a slender body resists its load by no more than that. A free
+        one without mass needs it: a load moves it so far that single precision has no digits for its shape.
+        """
+        diagonal = matrix.getDiagonal()
+        diagonal.scale(1 + RAISED[int(self.bodies.free.any())])
+        matrix.setDiagonal(diagonal)
         diagonal.destroy()
 
     def _product_options(self, matrix: PETSc.Mat) -> Iterator[tuple[str, str]]:
@@ -215,7 +224,7 @@ def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlock
     if blocks:
         ksp.getPC().setPythonContext(blocks)
     ksp.setComputeEigenvalues(True)
-    ksp.setTolerances(max_it=ITERATIONS, rtol=np.finfo(float).eps)
+    ksp.setTolerances(max_it=10, rtol=np.finfo(float).eps)
     ksp.solve(b, x)
     greatest = float(ksp.computeExtremeSingularValues()[0])
     for owned in (ksp, x, b):

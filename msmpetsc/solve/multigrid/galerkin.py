@@ -26,7 +26,6 @@ from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
 HELD = 27  # code of an end that is no unknown; others are 9 i + 3 j + k of where they are in their coarse cell
-RAISED = 1 + 1e-5  # diagonals: few fine nodes in a coarse cell leave its columns linearly dependent
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])  # of corners: the upper triangle of a cell's matrix
 
 
@@ -99,9 +98,8 @@ class GalerkinSum:
         self.weights, self.full = (like(lattice.nodes, a) for a in (WEIGHTS, SYMMETRIC))
         first, second, places = self._pairs(grid, keys)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
-        diagonal = np.flatnonzero((first == second) & (first >= 0))
         upper = np.flatnonzero(first != second)
-        self.diagonal, self.upper = (like(lattice.nodes, a) for a in (diagonal, upper))
+        self.upper = like(lattice.nodes, upper)
         self.matrix = self._create_matrix(grid, first, second, upper)
 
     def _pairs(self, grid: CoarseGrid, keys: Indices) -> tuple[Indices, Indices, Indices]:
@@ -148,7 +146,6 @@ class GalerkinSum:
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
-        values[self.diagonal[:, None], [[0, 4, 8]]] *= RAISED
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 
 

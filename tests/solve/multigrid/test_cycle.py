@@ -3,7 +3,7 @@ Hessian takes few iterations with it, whatever the time step, and no more on a f
 
 import numpy as np
 import pytest
-from hierarchies import COMM, LATTICES, SHAPES, Case, block, build, figure, heavier, hierarchy
+from hierarchies import COMM, LATTICES, SHAPES, Case, at, block, build, figure, heavier, hierarchy
 from scipy.linalg import eigh
 
 SYMMETRIC = 1e-6  # of the greatest number: single precision has 6e-8
@@ -109,3 +109,15 @@ def test_few_iterations_at_any_step_and_fineness(name: str, shape: str):
     print(name, shape, *(each.T.tolist() for each in found))
     assert np.max(found) <= MOST[name]
     assert (found[-1] - found[0]).max() <= GROWTH
+
+
+BENT = np.concatenate([block(30, 4, 4), at(block(4, 30, 4), 30, 0, 0), at(block(4, 4, 30), 30, 30, 0)])
+STATIC = 1e3  # [s]: a step so long that mass counts for nothing
+AT_REST = {None: 3, 0.25: 3, 0.45: 4, 0.49: 8, 0.499: 20}  # by Poisson's ratio, None of springs
+
+
+@pytest.mark.parametrize("poisson", AT_REST)
+def test_few_iterations_of_a_slender_body_at_rest(poisson: float | None):
+    """Coarse diagonals that are raised by 1e-5 hold it to the ground: 5, 5, 8, 18 and 59 iterations."""
+    with hierarchy(COMM, build(COMM, BENT, pins=True, poisson=poisson), SHAPES["rest"], STATIC) as case:
+        assert max(case.iterations(TOLERANCE, rough) for rough in (False, True)) <= AT_REST[poisson]

@@ -1,0 +1,15 @@
+#!/usr/bin/env python3
+"""A GPU beside the CPU of the same machine: bench.py with --gpu, under a name of its own for batch jobs."""
+
+import sys
+
+import bench
+
+
+def main() -> int:
+    sys.argv.insert(1, "--gpu")
+    return bench.main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

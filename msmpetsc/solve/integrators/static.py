@@ -215,7 +215,8 @@ class Static(ImplicitEuler):
                     if not path.displaced:
                         steps.halve(failure)
                         continue
-                    log.info("t = %.6g s: begun at the rest shape: it %s", path.time, failure)
+                    reason = str(failure).split("; try ")[0]
+                    log.info("t = %.6g s: begun at the rest shape: it %s", path.time, reason)
                     path = replace(path, state=State(rest, rest))
         finally:
             snes.setTolerances(max_it=most)

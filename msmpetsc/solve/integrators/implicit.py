@@ -16,12 +16,13 @@ Euler's difference of two positions is that of the turn half way between; BDF2's
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
-from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
@@ -111,6 +112,7 @@ class ImplicitEuler(Integrator):
 
     SHARE = 1.0  # tau / t
     STATIC = False  # M is no part of F
+    state: ClassVar[dict[str, Range]] = {}
 
     def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, prefix: str):
         self.comm, self.environment, self.solver, self.prefix = comm, environment, solver, prefix
@@ -214,11 +216,13 @@ class ImplicitEuler(Integrator):
     def save(self, checkpoint: Checkpoint) -> None:
         if checkpoint.step:  # before the first there is nothing to forget
             self.stepper.forget(modes=False)
+        checkpoint.keep_counts(self)
         self.stepper.minimum.curvature.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         self._let_go(time)
         self.stepper.forget()
+        checkpoint.restore_counts(self)
         self.stepper.minimum.curvature.restore(checkpoint)
 
     def forget(self) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Positions, Rows, to_host
-from msmpetsc.checkpoint import ANY, Checkpoint, Range
+from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
@@ -223,14 +223,6 @@ class Static(ImplicitEuler):
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", path.time, steps.count)
         return result, path
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        super().save(checkpoint)
-        checkpoint.keep_counts(self)
-
-    def restore(self, checkpoint: Checkpoint, time: float) -> None:
-        super().restore(checkpoint, time)
-        checkpoint.restore_counts(self)
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

@@ -23,13 +23,14 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
     return f"node {number}, {rest_point(lattice, number, point)}"
 
 
-def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> tuple[int, str]:
+def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool = False) -> tuple[int, str]:
     """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective).
 
     A solid's cell is where what is inside the surface is, in the mean: corners of a sliver may fold far outside.
+    By its ``corners`` it is folded, too, where they are while the mean is not.
     """
     cells, solid = lattice.local_cells[: lattice.cells_owned], lattice.solid
-    if solid is None:
+    if solid is None or corners:
         volumes = least_volumes(q, cells)
     else:
         volumes = volume_ratios(solid.forms[: len(cells)], q[cells], lattice.cell_size)

@@ -113,8 +113,7 @@ def _slopes(j: float, mu: float, lame: float) -> tuple[float, float]:
 def _volume_energy(j: float, mu: float, lame: float) -> float:
     """Return U at J = j."""
     above = max(j, ONSET)
-    slope, curvature = lame * (above - 1.0) - mu / above, mu / (above * above) + lame
-    below = j - above
+    below, (slope, curvature) = j - above, _slopes(above, mu, lame)
     return 0.5 * lame * (above - 1.0) ** 2 - mu * math.log(above) + below * (slope + 0.5 * curvature * below)
 
 

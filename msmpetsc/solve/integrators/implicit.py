@@ -16,15 +16,17 @@ Euler's difference of two positions is that of the turn half way between; BDF2's
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
-from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators.integrator import Integrator, State
@@ -110,6 +112,7 @@ class ImplicitEuler(Integrator):
 
     SHARE = 1.0  # tau / t
     STATIC = False  # M is no part of F
+    state: ClassVar[dict[str, Range]] = {}
 
     def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, prefix: str):
         self.comm, self.environment, self.solver, self.prefix = comm, environment, solver, prefix
@@ -117,7 +120,7 @@ class ImplicitEuler(Integrator):
         self.damping, self.retardation = environment.damping, environment.retardation
         self.tau = self._first_tau()
         self.anchors = environment.anchors_at(self.time_step)
-        self.stepper = self._new_stepper(self.time_step)
+        self.stepper = self._new_stepper(self._lattice_at(self.time_step))
 
     def _first_tau(self) -> float:
         return self.SHARE * self.time_step
@@ -182,9 +185,12 @@ class ImplicitEuler(Integrator):
         taken = -viscosity.change(result.position, problem.fixed)
         return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
 
-    def _new_stepper(self, time: float) -> Stepper:
-        """Make the solver for the nodes that are free at ``time``."""
-        solver, lattice = self.solver, self.environment.lattice.pin(self.environment.fixed_at(time))
+    def _lattice_at(self, time: float) -> Lattice:
+        return self.environment.lattice.pin(self.environment.fixed_at(time))
+
+    def _new_stepper(self, lattice: Lattice) -> Stepper:
+        """Make the solver for the free nodes of a lattice."""
+        solver = self.solver
         return Stepper(
             self.comm,
             lattice.with_viscosity(self.retardation / self.tau) if self.retardation else lattice,
@@ -204,17 +210,19 @@ class ImplicitEuler(Integrator):
             self.anchors = anchors
             self.destroy()
             self.tau = self._first_tau()  # whatever came before: a resumed run has not seen it
-            self.stepper = self._new_stepper(time)
+            self.stepper = self._new_stepper(self._lattice_at(time))
             self.set_up()
 
     def save(self, checkpoint: Checkpoint) -> None:
         if checkpoint.step:  # before the first there is nothing to forget
             self.stepper.forget(modes=False)
+        checkpoint.keep_counts(self)
         self.stepper.minimum.curvature.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         self._let_go(time)
         self.stepper.forget()
+        checkpoint.restore_counts(self)
         self.stepper.minimum.curvature.restore(checkpoint)
 
     def forget(self) -> None:

@@ -10,6 +10,7 @@ is at rest: as a step's Hessian has none for its M, from which bounds on errors 
 
 Where the whole load cannot be brought on at once it comes on in load steps. A share s of it, 0 to 1, is the
 equilibrium under  f_ext + (1 - s) r,  r = grad E(x_0) - f_ext  what keeps the state before, x_0, where it is.
+A start is no equilibrium: where the whole load fails from there, or leaves folds, x_0 is the rest shape.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Positions, Rows, to_host
-from msmpetsc.checkpoint import ANY, Checkpoint, Range
+from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
@@ -79,6 +80,7 @@ class LoadPath:
 
     problem    : of the share taken last
     sides      : (o, l) contact faces that it has
+    displaced  : whether the state before is a start, and not the rest shape
     """
 
     comm: MPI.Comm
@@ -93,7 +95,10 @@ class LoadPath:
         self.target = self.environment.prescribed(self.base, self.time)
         self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
         self.sides = self.state.sides
-        self.inverted = worst_inverted(self.comm, self.stepper.lattice, self.base)[0]
+        first, lattice = self.time < 1.5 * self.time_step, self.stepper.lattice
+        at_rest = self.comm.allreduce(bool((self.base == lattice.nodes).all()), MPI.LAND)
+        self.displaced = first and not at_rest
+        self.inverted = 0 if first else worst_inverted(self.comm, lattice, self.base)[0]
         self.holding: Rows | None = None  # r (owned, 3) [N], which keeps free nodes where they are; once asked for
         self.problem: StepProblem | None = None
 
@@ -109,7 +114,8 @@ class LoadPath:
             problem = self._problem(faces.problem(), share)
             result = self.stepper.step(problem, self._guess(problem, share))
             faces.compare(result.position)
-        count, where = worst_inverted(self.comm, self.stepper.lattice, result.position)
+        lattice = self.stepper.lattice
+        count, where = worst_inverted(self.comm, lattice, result.position, corners=self.displaced)
         if steps.may_be_refused and count > self.inverted:
             raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
         self.known = [self.known[-1], (share, result.position)]
@@ -148,13 +154,12 @@ class Static(ImplicitEuler):
 
     Forces, anchors and obstacles are taken as they are then.
 
-    error    : of the last state
-    made_for : time [s] whose nodes the stepper has for its unknowns
+    error : of the last state
     """
 
     STATIC = True
     state: ClassVar[dict[str, Range]] = {"error": ANY}
-    error = made_for = 0.0
+    error = 0.0
     problem: StepProblem | None = None  # of the last state
 
     def _first_tau(self) -> float:
@@ -167,10 +172,6 @@ class Static(ImplicitEuler):
         mass, stiffness = self.comm.allreduce(sums)
         return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
-    def _new_stepper(self, time: float) -> Stepper:
-        self.made_for = time
-        return super()._new_stepper(time)
-
     def set_up(self) -> None:
         """Make ready, and settle tau. Raises InputError for a body that is not held."""
         refuse_free_bodies(self.stepper.unknowns)
@@ -181,7 +182,7 @@ class Static(ImplicitEuler):
         if lowest > 0 and not WILL_DO[0] <= lowest <= WILL_DO[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()
-            self.stepper = self._new_stepper(self.made_for)
+            self.stepper = self._new_stepper(self.stepper.lattice)
             self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
@@ -192,15 +193,15 @@ class Static(ImplicitEuler):
         stepper = self.stepper
         begun = stepper.work_so_far()
         path = LoadPath(self.comm, stepper, self.environment, state, time, self.time_step)
-        result = self._follow(path, time)
+        result, path = self._follow(path)
         q, self.problem, self.error = result.position, path.problem, result.cost.step_error
         cost = replace(stepper.work_so_far() - begun, steps=1, step_error=self.error)
         result = replace(result, previous=q, cost=cost, static=True, problem=self.problem)
         return result, State(q, q, sides=path.sides)
 
-    def _follow(self, path: LoadPath, time: float) -> StepResult:
-        """Bring all of the load on, with as few load steps as may be. Raises StepFailed."""
-        steps, snes = LoadSteps(), self.stepper.snes
+    def _follow(self, path: LoadPath) -> tuple[StepResult, LoadPath]:
+        """Bring all of the load on in few load steps; return their path, too. Raises StepFailed."""
+        steps, snes, rest = LoadSteps(), self.stepper.snes, self.stepper.lattice.nodes
         most = snes.getTolerances()[3]
         hurries = not self.stepper.budget and self.stepper.options.is_default("snes_max_it")  # else the user has said
         try:
@@ -211,20 +212,17 @@ class Static(ImplicitEuler):
                     result = path.try_share(steps)
                     steps.take()
                 except StepFailed as failure:
-                    steps.halve(failure)
+                    if not path.displaced:
+                        steps.halve(failure)
+                        continue
+                    reason = str(failure).split("; try ")[0]
+                    log.info("t = %.6g s: begun at the rest shape: it %s", path.time, reason)
+                    path = replace(path, state=State(rest, rest))
         finally:
             snes.setTolerances(max_it=most)
         if steps.count > 1:
-            log.info("t = %.6g s: the load came on in %d steps", time, steps.count)
-        return result
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        super().save(checkpoint)
-        checkpoint.keep_counts(self)
-
-    def restore(self, checkpoint: Checkpoint, time: float) -> None:
-        super().restore(checkpoint, time)
-        checkpoint.restore_counts(self)
+            log.info("t = %.6g s: the load came on in %d steps", path.time, steps.count)
+        return result, path
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

@@ -104,7 +104,7 @@ class Renderer:
             self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **look)
         for obstacle in overlays.meshes:
             solid = self._composition.subject.solids[obstacle.number]
-            mesh = surface_of(solid.points + obstacle.by, solid.triangles)
+            mesh = surface_of(obstacle.moved(solid.points), solid.triangles)
             look = dict(smooth_shading=True, split_sharp_edges=True, ambient=0.42, diffuse=0.62)
             self._plotter.add_mesh(mesh, color=GLASS, **look)
 

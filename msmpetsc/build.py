@@ -12,7 +12,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Row
 from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.coverage import Regions, taken
 from msmpetsc.constraints.holders import Holders, clamped
-from msmpetsc.constraints.loads import Anchor, Load, OwnForce, RigidMotion, spread_by_mass, total_of
+from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles
@@ -35,7 +35,7 @@ from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice, to
 from msmpetsc.lattice.region import Finder, cell_materials
 from msmpetsc.scene.bodies import OfBody, held_by
 from msmpetsc.scene.motion import ForceTable, Gravity
-from msmpetsc.scene.obstacles import ObstacleTable
+from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
@@ -188,7 +188,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         penalties=penalties,
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
-        collision=collision_surface(scene.self_contact, scene, bodies, cages, lattice) if scene.self_contact else None,
+        collision=collision_surface(scene, bodies, cages, lattice, obstacles),
         taken=taken(comm, scene, lattice, anchors, masks),
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
@@ -300,7 +300,7 @@ def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders
         where = masks[anchor.key] & ~taken
         middle = holders.centers[holders.keys.index(anchor.key)]
         center = middle if anchor.table.center is None else np.array(anchor.table.center)
-        anchors.append(Anchor(where, RigidMotion.through(anchor.table.path, center), anchor.table.stop))
+        anchors.append(Anchor(where, Motion.through(anchor.table.path, center), anchor.table.stop))
         taken = taken | where
     return anchors
 
@@ -347,6 +347,8 @@ def _contacts(
         usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
     for obstacle, table in zip(obstacles, tables, strict=True):
         restitution = 1.0 if table.restitution is None else table.restitution
+        if table.response == BARRIER:
+            continue
         if table.response == "exchange":
             exchanges.append(Exchange(obstacle, restitution))
             continue

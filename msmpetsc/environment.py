@@ -36,8 +36,9 @@ class Environment:
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.exchanges = model.penalties, model.exchanges
         self.self_contact = NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
-        self._contacts = Contacts(self.self_contact) if self.self_contact else None  # of the last step that was begun
+        self._contacts = Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None  # of the last step begun
         self.touches = bool(self.penalties or self.self_contact)
+        self.standing = model.obstacles
         self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
         self.has_sides = any(obstacle.solid.has_sides for obstacle in self.obstacles)
         self.pressing, self.exchanging = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
@@ -49,10 +50,10 @@ class Environment:
 
     def events(self) -> list[float]:
         """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
-        paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.obstacles)]
+        paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.standing)]
         times = [time for path in paths for time in path.times.tolist()]
         times += [time for load in self.pulling for time in load.events]
-        times += [time for obstacle in self.obstacles for time in (obstacle.start, obstacle.stop) if time is not None]
+        times += [time for obstacle in self.standing for time in (obstacle.start, obstacle.stop) if time is not None]
         return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
 
     def begin_step(self, q: Positions, v: Rows, time: float) -> None:
@@ -122,7 +123,7 @@ class Environment:
         def at(time: float) -> list[Any]:
             loads = [load.state_at(time) for load in self.pulling]
             anchors = [anchor.holds_at(time) and tuple(anchor.path.value_at(time)) for anchor in self.anchors]
-            obstacles = [o.acts_at(time) and tuple(o.path.value_at(time)) for o in self.obstacles]
+            obstacles = [o.acts_at(time) and tuple(o.path.value_at(time)) for o in self.standing]
             return [*loads, *anchors, *obstacles]
 
         return at(begin) == at(end)
@@ -169,7 +170,7 @@ class Environment:
         pressing = self._pressing(time, sides)
         states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
         if self.self_contact:
-            self._contacts = self.self_contact.step(q, end)
+            self._contacts = self.self_contact.step(q, end, max(time - time_step, 0.0), time)
             surface = SurfaceContact(self._contacts, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
@@ -177,11 +178,11 @@ class Environment:
         """Forget what earlier steps showed (collective)."""
         if self.self_contact:
             self.self_contact.forget()
-            self._contacts = Contacts(self.self_contact)
+            self._contacts = Contacts(self.self_contact, 0.0, 0.0)
 
-    def touch(self, q: Positions) -> Touch:
-        """Return what there is of contacts of the surface with itself at q (collective)."""
-        return self._contacts.touch(q) if self._contacts else Touch()
+    def touch(self, q: Positions, time: float) -> Touch:
+        """Return what contacts the surface has with itself and obstacles at q and a time [s] (collective)."""
+        return self._contacts.touch(q, time) if self._contacts else Touch()
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
         """Return what presses at a time, without friction; None if nothing does."""

@@ -51,7 +51,6 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
     "movie": ("imageio", "imageio_ffmpeg"),
     "usd": ("pxr",),
     "repair": ("pymeshfix",),
-    "xarray": ("xarray",),
     "cuda": ("cupy",),
     "peers": ("newton",),
 }

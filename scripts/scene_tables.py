@@ -130,20 +130,20 @@ def touching(scene: str, args: Namespace) -> lab.Row:
     path = run("touching", scene, args)
     model = build_model(MPI.COMM_SELF, load_scene(lab.SCENES / f"{scene}.toml", args.set))
     assert isinstance(model.collision, CollisionSurface) and model.collision.surface and model.surface
-    points, triangles = model.collision.points, model.collision.surface.triangles
     with Result(path) as result:
-        position, last = result.frames.position, len(result.frames.time[:]) - 1
-        counted = [position[index] for index in np.unique(np.linspace(0, last, COUNTED).round().astype(int))]
-        least, most = np.nanmin(result.frames.self_distance[:]), result.frames.self_contacts[:].max()
+        whole = [*map(model.collision.points, result.frames.position, result.frames.time[:])]
+        counted = np.unique(np.linspace(0, len(whole) - 1, COUNTED).round().astype(int))
+        drawn = (result.embedding @ result.frames.position[index] for index in counted)
+        least = np.nanmin(result.frames.self_distance[:])
         return {
             "scene": f"`{scene}`",
             "cells": len(model.lattice.cells),
-            "triangles": len(triangles),
-            "steps": last,
-            "contacts at most": int(most),
+            "triangles": len(model.collision.surface.triangles),
+            "steps": len(whole) - 1,
+            "contacts at most": int(result.frames.self_contacts[:].max()),
             "least distance [µm]": f"{1e6 * least:.2g} of {1e6 * model.collision.law.distance:.0f}",
-            "crossed": sum(int(count_crossings(points(position[index]), triangles)) for index in range(last + 1)),
-            "drawn": sum(int(count_crossings(result.embedding @ q, model.surface.triangles)) for q in counted),
+            "crossed": sum(int(count_crossings(each, model.collision.surface.triangles)) for each in whole),
+            "drawn": sum(int(count_crossings(each, model.surface.triangles)) for each in drawn),
             **mean(result, "iterations", "products", "wall_time"),
         }
 

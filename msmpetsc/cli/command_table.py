@@ -124,14 +124,9 @@ RENDER = (
     argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)"),
     argument(
         "--colour", metavar="FIELD",
-        help="colour by displacement, speed, strain, stress, part or error, with a legend",
+        help="colour by displacement, speed, strain, stress or part, with a legend",
     ),
-    argument(
-        "--reference", metavar="OUT.h5", type=checked_file,
-        help="of --colour error: the result that it is counted from",
-    ),
-    switch("--axes", "draw a box around the body, with lengths"),
-    argument("--show", metavar="cells,springs", help="cut the body open: boundary cells red, interior ones blue"),
+    switch("--cells", "cut the body open: boundary cells red, interior ones blue"),
     argument("--speed", type=float, metavar="S", help="simulated seconds a second (1, which is real time)"),
     SET,
 )  # fmt: skip
@@ -236,7 +231,7 @@ COMMANDS = {
             "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5",
             "msmpetsc render out/my.h5 -o out/my.mp4 --speed 0.1",
             "msmpetsc render out/my.h5 -o out/my.html --colour strain",
-            "msmpetsc render my.toml --show cells",
+            "msmpetsc render my.toml --cells",
         ),
         RENDER,
         description="Draw some moments of a result side by side (*.png), a film (*.mp4, *.gif, *.webp), or a page for "
@@ -251,11 +246,10 @@ COMMANDS = {
         (
             argument("result", metavar="OUT.h5", type=checked_file),
             argument("-o", "--output", metavar="FILE", type=checked_file, required=True, help="what to write"),
-            argument("--mesh", choices=("surface", "lattice"), help="default: the first that the format can hold"),
             frames("these frames, or slices like 0:250:5; default: all, or the last (-1) of one"),
         ),
         description="Write frames of a result for another program; the name's ending says in which format: .glb "
-        "and .usd hold frames in time, .obj, .ply, .stl and .vtu one frame.",
+        "and .usd hold frames in time, .obj, .ply and .stl one frame.",
     ),
     "series": Command(
         "print energies, forces and places of probes of a result, a row a frame",

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import ForceFunction
-from msmpetsc.scene.motion import ForceTable, Keyframe, Pose
+from msmpetsc.scene.motion import ForceTable, Pose
 from msmpetsc.scene.values import Vector
 
 if TYPE_CHECKING:
@@ -36,27 +37,8 @@ class Lines:
         return np.array([np.interp(time, self.times, along) for along in self.vectors.T])
 
 
-class Motion(Lines):
-    """Displacements [m], none at time 0, the first."""
-
-    @classmethod
-    def through(cls, keyframes: Iterable[Keyframe]) -> "Motion":
-        """Return the motion of a scene's obstacle."""
-        stops = [(0.0, (0.0, 0.0, 0.0)), *((k.time, k.by) for k in keyframes)]
-        return cls(np.array([time for time, _ in stops]), np.array([by for _, by in stops], float))
-
-    @property
-    def leads_away(self) -> bool:
-        """Return whether the motion leaves where it starts."""
-        return len(self.times) > 1
-
-    def displacement_between(self, begin: float, end: float) -> Floats:
-        """Return the way (3,) [m] that the motion makes good from one time [s] to another."""
-        return self.value_at(end) - self.value_at(begin)
-
-
 @dataclass(frozen=True)
-class RigidMotion(Lines):
+class Motion(Lines):
     """Displacements [m] and rotation vectors [rad], side by side (k, 6); none at time 0, the first.
 
     center : (3,) about which it turns [m], at rest
@@ -65,10 +47,29 @@ class RigidMotion(Lines):
     center: Floats
 
     @classmethod
-    def through(cls, poses: Iterable[Pose], center: Floats) -> "RigidMotion":
-        """Return the motion of a scene's anchor."""
+    def through(cls, poses: Iterable[Pose], center: ArrayLike | None = None) -> "Motion":
+        """Return the motion along a scene's path; one without a center does not turn."""
         stops = [(0.0, np.zeros(6)), *((p.time, np.hstack([p.by, np.radians(p.turn)])) for p in poses)]
-        return cls(np.array([time for time, _ in stops]), np.array([pose for _, pose in stops]), center)
+        about = np.zeros(3) if center is None else np.array(center)
+        return cls(np.array([time for time, _ in stops]), np.array([pose for _, pose in stops]), about)
+
+    @property
+    def leads_away(self) -> bool:
+        """Return whether the motion leaves where it starts."""
+        return len(self.times) > 1
+
+    def displacement_at(self, time: float) -> Floats:
+        """Return the displacement (3,) [m] of the center at a time [s]."""
+        return self.value_at(time)[:3]
+
+    def displacement_between(self, begin: float, end: float) -> Floats:
+        """Return the way (3,) [m] that the motion makes good from one time [s] to another, but for turns."""
+        return self.displacement_at(end) - self.displacement_at(begin)
+
+    def unmoved(self, q: Positions, pose: Floats) -> Positions:
+        """Return where points q (n, 3) [m] of a pose (6,) are at time 0: what ``moved`` takes."""
+        at_rest: Positions = (q - self.center - pose[:3]) @ Rotation.from_rotvec(pose[3:]).as_matrix() + self.center
+        return at_rest
 
     def moved(self, x: Positions, pose: Floats) -> Positions:
         """Return where points x (n, 3) [m] are in a pose (6,): c + R (x - c) + by."""
@@ -95,7 +96,7 @@ class Anchor:
     """
 
     where: Mask
-    path: RigidMotion
+    path: Motion
     stop: float | None
 
     def holds_at(self, time: float) -> bool:

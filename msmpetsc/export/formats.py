@@ -15,13 +15,11 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError
-from msmpetsc.export.moments import Mesh, Moments, normals
+from msmpetsc.export.moments import Moments, normals
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result
 
-CELL_TYPES = {"surface": "triangle", "lattice": "hexahedron"}
-BARE = (".obj", ".ply", ".stl")  # formats of points and triangles alone
 FLOAT, UNSIGNED = 5126, 5125  # component types
 POINTS, TRIANGLES = 34962, 34963  # uses of a buffer view: vertex data, indices
 MOST_BYTES = 2**32 - 2**20  # less what is no vertex
@@ -125,16 +123,11 @@ def write_usd(moments: Moments, path: Path) -> None:
 
 
 def write_one_frame(moments: Moments, path: Path) -> None:
-    """Write a single frame by meshio, with data if the format holds them."""
+    """Write a single frame by meshio."""
     import meshio
 
     (frame,) = moments.frames
-    cells = [(CELL_TYPES[moments.mesh], moments.cells)]
-    of_points, of_cells = moments.data_of_points(frame), moments.data_of_cells(frame)
-    if path.suffix.lower() in BARE:
-        of_points, of_cells = {}, {}
-    in_blocks = {name: [values] for name, values in of_cells.items()}
-    meshio.write(path, meshio.Mesh(moments.points(frame), cells, of_points, in_blocks))
+    meshio.write(path, meshio.Mesh(moments.points(frame), [("triangle", moments.cells)]))
 
 
 FORMATS: dict[str, Callable[[Moments, Path], None]] = {
@@ -145,15 +138,12 @@ FORMATS: dict[str, Callable[[Moments, Path], None]] = {
     ".obj": write_one_frame,
     ".ply": write_one_frame,
     ".stl": write_one_frame,
-    ".vtu": write_one_frame,
 }
-MESHES: dict[str, tuple[Mesh, ...]] = {".vtu": ("lattice", "surface")}  # of which a file holds one; else surfaces
 
 
-def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Frames | None = None) -> Path:
-    """Write frames of a result in the format of the path's ending, and return the path.
+def export(result: str | Path, path: str | Path, frames: Frames | None = None) -> Path:
+    """Write the surface at frames of a result in the format of the path's ending, and return the path.
 
-    mesh   : "surface" or "lattice"; the first that the format holds if None
     frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
 
     Raises InputError.
@@ -164,18 +154,10 @@ def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frame
         raise InputError(f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}")
     with Result(result) as run:
         numbers = _frames(run, path, write is not write_one_frame, frames)
-        moments = Moments(run, _mesh(path, mesh), numbers)
+        moments = Moments(run, numbers)
         with whole_file(path) as part:
             write(moments, part)
     return path
-
-
-def _mesh(path: Path, mesh: Mesh | None) -> Mesh:
-    """Return the mesh to export. Raises InputError if the format does not hold it."""
-    meshes = MESHES.get(path.suffix.lower(), ("surface",))
-    if mesh is not None and mesh not in meshes:
-        raise InputError(f"{path}: a *{path.suffix} holds no {mesh}, but the {' or the '.join(meshes)}")
-    return mesh or meshes[0]
 
 
 def _frames(run: Result, path: Path, moves: bool, frames: Frames | None) -> list[int]:

@@ -135,15 +135,6 @@ def refuse_small_disk(path: Path, planned: int) -> None:
         raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
 
 
-def copy_sparse(source: int, path: Path) -> None:
-    """Copy an open file to a new name; blocks of zeros, such as frames to come, take no space."""
-    with open(path, "xb") as copy:
-        for start in range(0, size := os.fstat(source).st_size, 2**20):
-            if (piece := os.pread(source, 2**20, start)).strip(b"\0"):
-                os.pwrite(copy.fileno(), piece, start)
-        copy.truncate(size)
-
-
 @contextmanager
 def plain_errors(path: Path) -> Iterator[None]:
     """Turn errors of the file system, and HDF5's long wording of them, into an InputError of one line."""

@@ -1,6 +1,6 @@
-"""Arrays of a file that are read when they are indexed, as h5py's datasets are, or through xarray."""
+"""Arrays of a file that are read when they are indexed, as h5py's datasets are."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import h5py
@@ -91,20 +91,3 @@ class Arrays(Mapping[str, LazyArray]):
 
     def __repr__(self) -> str:
         return "\n".join([self._group, *map("  {!r}".format, self._arrays.values())])
-
-
-def xarray_variable(dimensions: Sequence[str], array: LazyArray, long_name: str) -> Any:
-    """Return an xarray.Variable that reads the array where it is used, as xarray's own do."""
-    import xarray
-    from xarray.backends import BackendArray
-    from xarray.core import indexing
-
-    class ArrayOfResult(BackendArray):
-        shape, dtype = array.shape, array.dtype
-
-        def __getitem__(self, key: Any) -> Any:
-            basic = indexing.IndexingSupport.BASIC
-            return indexing.explicit_indexing_adapter(key, self.shape, basic, array.__getitem__)
-
-    data = indexing.LazilyIndexedArray(ArrayOfResult())
-    return xarray.Variable(dimensions, data, {"long_name": long_name, "units": array.unit})

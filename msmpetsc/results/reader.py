@@ -19,13 +19,12 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Indices, Positions
 from msmpetsc.errors import InputError, one_line, printable
-from msmpetsc.fields import FIELDS, FRAME_FIELDS
-from msmpetsc.results.lazy import Arrays, LazyArray, xarray_variable
+from msmpetsc.fields import FIELDS
+from msmpetsc.results.lazy import Arrays, LazyArray
 from msmpetsc.scene.toml import toml_of
 
 if TYPE_CHECKING:  # who reads frames needs neither
     from scipy.sparse import csr_array
-    from xarray import Dataset
 
 FORMAT, FORMAT_VERSION = "msmpetsc", 1
 NEEDED = ("lattice/nodes", "frames/time", "frames/position")
@@ -39,10 +38,6 @@ NAMED = {  # by datasets of numbers, what these are numbers of
 PATIENCE = 10  # [s] to read a file's tables
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 DEFLATE_MOST = 1032  # zlib packs no better than this
-AXES: dict[int | str, str] = {  # xarray's names of dimensions
-    "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle", "b": "body",
-    "w": "probe", 3: "axis", 6: "component",
-}  # fmt: skip
 
 
 class Result:
@@ -150,26 +145,6 @@ class Result:
         if f"{group}/body" in self:
             return self[f"{group}/body"][:].astype(np.int64)
         return np.zeros(len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64)
-
-    def to_xarray(self) -> "Dataset":
-        """Return the frames, read where they are used, with coordinates, units and long names."""
-        try:
-            import xarray
-        except ImportError as error:  # also of what xarray itself needs
-            raise InputError(f"to_xarray needs the package xarray: pip install xarray ({error})") from None
-
-        variables = {name: _variable(f"frames/{name}", array) for name, array in self.frames.items()}
-        at_rest = {f"rest_{name}": field.at_rest for name, field in FRAME_FIELDS.items() if field.at_rest}
-        at_rest["mass"] = "lattice/mass"
-        coordinates = {name: _variable(path, self[path]) for name, path in at_rest.items() if path in self}
-        coordinates |= {"time": variables.pop("time").load(), "axis": ("axis", ["x", "y", "z"])}
-        return xarray.Dataset(variables, coordinates, self.attributes)
-
-
-def _variable(name: str, array: LazyArray) -> Any:
-    """Return the xarray.Variable of a dataset."""
-    field = FIELDS[name]
-    return xarray_variable([AXES[size] for size in field.shape], array, field.long_name)
 
 
 def open_result(path: str | Path) -> h5py.File:

@@ -13,7 +13,6 @@ then either. Else it writes a new one, takes the frames over, and renames it whe
 """
 
 import os
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from enum import Enum
@@ -35,7 +34,6 @@ from msmpetsc.results.disk import (
     Lock,
     Storage,
     bytes_taken,
-    copy_sparse,
     plain_errors,
     refuse_no_file,
     refuse_small_disk,
@@ -87,7 +85,6 @@ class ResultFile:
         self._storage: Storage | None = None  # that it is written to
         self._numbers: dict[str, h5py.Dataset] = {}  # datasets of one number a frame, once it has frames
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
-        self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
         self._lock: Lock | None = None  # held on rank 0 only
         self._copied: int | None = None  # most frames to take over, all if None
         self._layout = Layout()
@@ -160,7 +157,6 @@ class ResultFile:
                     self._flush(self._file)
                     self._refuse_to_replace()
                     os.replace(self._part, self.path)
-                self._same = os.open(self.path, os.O_RDONLY)
                 self._numbers = {
                     name: dataset
                     for name, dataset in self._file["frames"].items()
@@ -201,7 +197,6 @@ class ResultFile:
                 self._flush(self._file)
                 self._file["checkpoint/step"][slot] = saved.step
                 self._flush(self._file)
-                self._refuse_removed()
 
     def close(self, trim: bool = True) -> None:
         """Close the file; a second call does nothing.
@@ -273,25 +268,10 @@ class ResultFile:
                     dataset[index] = earlier.frames[name][index]
         self.finished = count
 
-    def _refuse_removed(self) -> None:
-        """Raise InputError if the file was removed during writing, after its contents are saved under a name."""
-        if self._same is None or os.fstat(self._same).st_nlink:
-            return
-        copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        copy_sparse(self._same, copy)
-        if not self.path.exists():
-            copy = copy.rename(self.path)
-        command = f"msmpetsc run --resume {shlex.quote(str(copy))}"
-        raise InputError(
-            f"{self.path} was removed while it was written; what it held is in {copy}, to go on: {command}"
-        )
-
     def _finish(self, trim: bool) -> None:
-        for descriptor in (self._direct, self._same):
-            if descriptor is not None:
-                os.close(descriptor)
-        self._direct = self._same = None
+        if self._direct is not None:
+            os.close(self._direct)
+        self._direct = None
         file, self._file, self._numbers = self._file, None, {}
         if file is None:
             return

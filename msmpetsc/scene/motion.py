@@ -1,7 +1,7 @@
 """Tables of what moves the body: its start, gravity, pins, anchors, forces."""
 
 from itertools import pairwise
-from typing import Annotated, Self, TypeVar
+from typing import Annotated, Self
 
 from pydantic import (
     AfterValidator,
@@ -57,16 +57,10 @@ class Gravity(Table):
     acceleration: Vector = Field(description="[m/s^2]")
 
 
-class Keyframe(Table):
-    """A displacement at a time of a path."""
-
-    time: Positive = Field(description="when it is reached [s]")
-    by: Vector = Field(description="displacement from the start [m]")
-
-
-class Pose(Keyframe):
+class Pose(Table):
     """A displacement and a turn at a time of a path."""
 
+    time: Positive = Field(description="when it is reached [s]")
     by: Vector = Field((0.0, 0.0, 0.0), description="displacement from the start [m]")
     turn: Vector = Field(
         (0.0, 0.0, 0.0),
@@ -75,16 +69,13 @@ class Pose(Keyframe):
     )
 
 
-KeyframeType = TypeVar("KeyframeType", bound=Keyframe)
-
-
-def _ascending(path: tuple[KeyframeType, ...]) -> tuple[KeyframeType, ...]:
+def _ascending(path: tuple[Pose, ...]) -> tuple[Pose, ...]:
     if any(a.time >= b.time for a, b in pairwise(path)):
         raise rule("must have ascending times")
     return path
 
 
-Path3 = Annotated[ListOf[Keyframe], AfterValidator(_ascending)]
+Path = Annotated[ListOf[Pose], AfterValidator(_ascending)]
 
 PATH = "from no displacement at time 0 in straight lines through these, and staying at the last"
 
@@ -148,9 +139,7 @@ class AnchorTable(Table):
     """Nodes that are led along a path as one rigid body."""
 
     region: Region = Field(description="the nodes led")
-    path: Annotated[ListOf[Pose], AfterValidator(_ascending)] = Field(
-        min_length=1, description=f"how they move: {PATH} [s, m, degrees]"
-    )
+    path: Path = Field(min_length=1, description=f"how they move: {PATH} [s, m, degrees]")
     center: Vector | None = Field(
         None,
         description="point at rest about which they turn, and which the path leads along; if absent the centre of mass "

@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field, field_validator, model_validator
 
 from msmpetsc.scene.body import MeshTable
-from msmpetsc.scene.motion import PATH, Path3
+from msmpetsc.scene.motion import PATH, Path
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.values import Box, FunctionName, NotNegative, Positive, Table, UnitVector, Vector, after_start
 
@@ -13,6 +13,10 @@ FRICTION_SPEED = (
     "slip speed below which friction fades, so that what it holds creeps; "
     "1% of the largest body's longest side a second if absent [m/s]"
 )
+
+BARRIER = "barrier"  # response
+NODES_ALONE = "reflect", "penalty", "exchange"
+MET = "box", "sphere", "mesh"  # shapes whose surface may meet that of the bodies
 
 NEEDED = {
     "plane": ("point", "normal"),
@@ -32,17 +36,21 @@ class ObstacleTable(Table):
         None, description="of the plane, towards its free side, normalised on reading [-]"
     )
     box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
-    center: Vector | None = Field(None, description="of the sphere [m]")
+    center: Vector | None = Field(
+        None, description="of the sphere, or of a barrier the point at rest about which its path turns [m]"
+    )
     radius: Positive | None = Field(None, description="of the sphere [m]")
     mesh: MeshTable | None = Field(None, description="a closed surface, of which the inside is meant")
     function: FunctionName | None = Field(
         None, description="name of a signed distance to a surface, registered in Python or installed"
     )
-    path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
+    path: Path = Field((), description=f"how it moves: {PATH} [s, m, degrees]")
     start: NotNegative = Field(0.0, description="is there from this time [s]")
     stop: Positive | None = Field(None, description="is there until this time [s]; to the end if absent")
-    response: Literal["reflect", "penalty", "exchange"] = Field(
-        "reflect", description="what happens on touching; exchange is the paper's"
+    response: Literal["reflect", "penalty", "exchange", "barrier"] = Field(
+        "reflect",
+        description="what happens on touching: barrier keeps the whole surface out, as [self_contact] says; the others "
+        "keep out nodes, and exchange is the paper's",
     )
     restitution: float | None = Field(
         None, ge=0, le=1, description="of nodes that strike: normal speed after over before; 1 if absent [-]"
@@ -62,7 +70,12 @@ class ObstacleTable(Table):
             raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
         uses: dict[str, tuple[str, ...]] = {name: (shape,) for shape, names in NEEDED.items() for name in names}
         uses |= dict.fromkeys(("stiffness", "friction", "friction_speed"), ("penalty",))
-        uses |= {"restitution": ("reflect", "exchange")}
+        uses |= {"restitution": ("reflect", "exchange"), "stop": NODES_ALONE, "center": ("sphere", "barrier")}
+        if self.response == BARRIER and (self.shape not in MET or self.start):
+            raise rule(f'has response = "barrier", which is for {" and ".join(MET)} that are there from the start')
+        turns = any(any(pose.turn) for pose in self.path)
+        if turns and (self.response != BARRIER or self.center is None):
+            raise rule('has a path that turns, which is for response = "barrier" with a center')
         for name, use in uses.items():
             if getattr(self, name) is not None and not {self.shape, self.response} & set(use):
                 raise rule(f"has {name}, which is for {' or '.join(map(repr, use))} only")

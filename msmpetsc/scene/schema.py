@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from msmpetsc.scene.bodies import OF_REGIONS, BodyTable, OfBody, regions_of_no_body, tables_of, unlike_the_material
 from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
-from msmpetsc.scene.obstacles import ObstacleTable, SelfContactTable
+from msmpetsc.scene.obstacles import BARRIER, ObstacleTable, SelfContactTable
 from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.statics import one_state, unlike_the_integrator
 from msmpetsc.scene.time import Time
@@ -134,6 +134,12 @@ class SceneFile(Table):
         if self.mesh is not None:
             return {("mesh",): self.mesh}
         return {("body", number, "mesh"): body.mesh for number, body in enumerate(self.body)}
+
+    @property
+    def touching(self) -> SelfContactTable | None:
+        """How surfaces touch: those of the bodies, or where these may cross, theirs and obstacles'; None if none do."""
+        meets = any(obstacle.response == BARRIER for obstacle in self.obstacle)
+        return self.self_contact or (SelfContactTable.model_validate({}) if meets else None)
 
     @property
     def starts(self) -> list[Start | None]:

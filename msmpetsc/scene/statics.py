@@ -45,18 +45,19 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
         yield "time", rule(f'{words}"implicit-euler" and "bdf2" have', "material")
     if integrator == STATIC:
         yield from _moving(scene)
-    if scene.self_contact and integrator not in IMPLICIT:
+    if scene.touching and integrator not in IMPLICIT:
         words = f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"'
-        yield "self_contact", rule(words, "time")
+        barrier = "" if scene.self_contact else 'with response = "barrier" '
+        yield "self_contact" if scene.self_contact else "obstacle", rule(barrier + words, "time")
     for number, obstacle in enumerate(scene.obstacle):
         if obstacle.response != "exchange":
             continue
         if integrator == "bdf2":  # a step would see that nodes were set back
             words = f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: it sets nodes back by '
             yield "obstacle", rule(f'{words}one step; "reflect" and "penalty" go', "time")
-        if scene.self_contact:
-            words = f'may not go with response = "exchange", as obstacle.{number} has it: that moves nodes past each '
-            yield "self_contact", rule(f'{words}other; "reflect" and "penalty" press', "obstacle")
+        if scene.touching:
+            words = f'may not have response = "exchange" where surfaces meet, as obstacle.{number} has it: that moves '
+            yield "obstacle", rule(f'{words}nodes past each other; "reflect" and "penalty" press', "self_contact")
 
 
 def _moving(scene: Any) -> Iterator[Broken]:
@@ -74,7 +75,7 @@ def _moving(scene: Any) -> Iterator[Broken]:
                 words = f'may be no function where time.integrator = "{STATIC}", as {whose}force.{number} is: it is '
                 yield key or "force", rule(f"{words}that of the state before, which is not at rest under it", "time")
     for number, obstacle in enumerate(scene.obstacle):
-        if obstacle.response != "penalty":
+        if obstacle.response not in ("penalty", "barrier"):
             words = f'may not {obstacle.response} where time.integrator = "{STATIC}", as obstacle.{number} does: '
             yield "obstacle", rule(f'{words}nothing strikes it; response = "penalty" presses', "time")
         if obstacle.friction:

@@ -108,7 +108,7 @@ class EnergyBalance:
         return Energies(
             **dict(zip(("kinetic", "free", "elastic", "contact", "potential"), sums[:5], strict=True)),
             momentum=sums[5:],
-            touch=environment.touch(q),
+            touch=environment.touch(q, time),
         )
 
     def step(self, integrator: Integrator, before: State, time: float, time_step: float) -> tuple[StepResult, State]:
@@ -187,17 +187,19 @@ class EnergyBalance:
         contact = environment.push(when, sides)
         known = self.known if self.known and q is self.known[0] else None  # whose elastic energy is known
         ended = result.position[owned], after.sides
+        pressing = result.problem and result.problem.contact and result.problem.contact.surface
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
             np.vdot(environment.load(time), result.position[owned] - q[owned])
             + environment.friction_work_bound((q[owned], sides), ended, time, time_step)
-            + result.viscous_work,
+            + result.viscous_work
+            + (pressing.of_obstacles(result.position)[1] / self.comm.size if pressing else 0.0),
             result.work,
             result.swing,
         )
-        sums[2] += environment.touch(q).energy
+        sums[2] += environment.touch(q, time - time_step).energy
         sums[0] += (known[1] if known else sums[1]) + sums[2]
         return sums[[0, 2, 3, 4, 5]]
 

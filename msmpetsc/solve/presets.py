@@ -56,6 +56,7 @@ LATTICE_MULTIGRID = {  # the cycle of -pc_type mg
 NEWTON = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
+    "snes_linesearch_minlambda": "1e-6",  # of a way that climbs a smaller share may seem to fall, by rounding
     "snes_max_it": MANY,
     **NO_STOP_BY_SIZE,
     "snes_max_linear_solve_fail": MANY,  # of an indefinite Hessian: CG's direction leads down all the same

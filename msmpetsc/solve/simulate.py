@@ -63,8 +63,8 @@ def refuse_bad_options(scene: Scene, probes: Probes) -> None:
     """Raise InputError for a preset that is unknown or not for this scene, and for steps and probes that cannot be."""
     solvers = solvers_of(scene, probes)
     refuse_bad_steps(scene.time)
-    if scene.self_contact and not all(preset.true_hessian for preset, _ in solvers.values()):
-        raise InputError(f"self_contact is for newton's presets, not {scene.solver.preset}")
+    if scene.touching and not all(preset.true_hessian for preset, _ in solvers.values()):
+        raise InputError(f"contact of surfaces is for newton's presets, not {scene.solver.preset}")
     if scene.time.error and probes != Probes():
         raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
     if "" not in solvers and probes != Probes():
@@ -99,7 +99,7 @@ class TimeLoop:
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, probes: Probes = Probes()):
         model = to_device(model, sender(comm))
         if model.collision and not on_host(model.lattice.nodes):
-            raise InputError("self_contact is computed on CPUs: --device cpu")
+            raise InputError("contact of surfaces is computed on CPUs: --device cpu")
         self.comm, self.model, self.probes, self.time_step = comm, model, probes, scene.time.step
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
@@ -119,7 +119,7 @@ class TimeLoop:
         self.monitors, self.true_errors = Monitors(comm, model.lattice), TrueErrors()
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
-        self.forces = Forces(scene, model, self.environment, self.elasticity)
+        self.forces = Forces(model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
@@ -323,10 +323,10 @@ class Forces:
     start and in explicit steps, nothing that is held accelerates, and obstacles push without friction.
     """
 
-    def __init__(self, scene: Scene, model: Model, environment: Environment, elasticity: Elasticity):
+    def __init__(self, model: Model, environment: Environment, elasticity: Elasticity):
         self.comm, self.model, self.environment = model.lattice.table.comm, model, environment
         self.elasticity = elasticity
-        self.pushing = [number for number, obstacle in enumerate(scene.obstacle) if obstacle.response != "exchange"]
+        self.keys = [obstacle.key for obstacle in model.obstacles]
         bodies = len(model.lattice.first_of_body) if model.collision else 0
         held = len(model.holders.keys)
         rows = {"reaction": held, "torque": held, "push": len(model.obstacles), "contact_push": bodies}
@@ -368,15 +368,16 @@ class Forces:
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
         """Return the pushes of obstacles (o, 3) and of contact on bodies (b, 3) on this rank's nodes with [N]."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
-        push, penalties = np.zeros((len(self.model.obstacles), 3)), self.environment.penalties
+        push = np.zeros((len(self.keys), 3))
         for state in contact.states if contact else ():
-            which = next(k for k, penalty in enumerate(penalties) if penalty.obstacle is state.obstacle)
             gradient = np.zeros_like(q[:owned])
             state.add_gradient(q[:owned], gradient)
-            push[self.pushing[which]] -= to_host(gradient.sum(axis=0))
+            push[self.keys.index(state.obstacle.key)] -= to_host(gradient.sum(axis=0))
         bodies = len(lattice.first_of_body)
         touching = np.zeros((bodies, 3))
         if contact and contact.surface:
+            obstacles, _ = contact.surface.of_obstacles(q)
+            push[contact.surface.contacts.obstacles.numbers] += obstacles / self.comm.size
             own = np.zeros_like(q[:owned])
             contact.surface.add_gradient(q, own)
             touching -= sums_by(lattice.body[:owned], own, bodies)

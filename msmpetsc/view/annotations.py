@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from msmpetsc.backend.arrays import Array
-from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
+from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, on_scale
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
 
@@ -32,23 +32,15 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
     return np.array(picture)
 
 
-def rounded(low: float, high: float) -> tuple[str, str]:
-    """Return the ends of an interval as text, rounded to a thousandth of its length or finer."""
-    span = max(high - low, abs(high) * 1e-12, 1e-300)
-    digits = 2 - int(np.floor(np.log10(span)))
-    first, last = (np.format_float_positional(round(end, digits) + 0.0, trim="-") for end in (low, high))
-    return first, last
-
-
 LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
 FINE = 3  # a legend is drawn so many times larger, and shrunk
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A legend entry: a bar of colours, a swatch, an arrow or a line in front of a text.
+    """A legend entry: a bar of colours, a swatch, or an arrow in front of a text.
 
-    kind  : "bar", "swatch", "glass", "arrow" or "line"
+    kind  : "bar", "swatch", "glass" or "arrow"
     width : of what stands in front of the text [px]
     low, high : numbers at the ends of a bar
     """
@@ -71,10 +63,8 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     elif colouring is not None:
         low, title, high = colouring.ends
         entries.append(Entry("bar", title, width=BAR, low=low, high=high))
-    kinds = {kind for still in stills if still.cut for kind in still.cut.cells}
+    kinds = {kind for still in stills if still.cut for kind in still.cut}
     entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
-    if any(still.cut and len(still.cut.springs) for still in stills):
-        entries.append(Entry("line", "spring", SPRING))
     if any(composition.subject.fixed(still.index).any() for still in (stills[0], stills[-1])):
         held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
@@ -132,8 +122,7 @@ def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, f
     elif entry.kind == "glass":
         draw.rectangle(box, "#e3e9ed", GLASS_EDGE, FINE)
     else:
-        draw.line((left, middle, right - half * (entry.kind == "arrow"), middle), entry.colour, 2 * FINE)
-    if entry.kind == "arrow":
+        draw.line((left, middle, right - half, middle), entry.colour, 2 * FINE)
         draw.polygon(
             [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)], entry.colour
         )

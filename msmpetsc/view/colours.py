@@ -1,22 +1,18 @@
 """Colours of pictures: fixed colours, and fields on the surface in a colour scale."""
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Rows
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.results.comparison import common_times, refuse_different_meshes
-from msmpetsc.results.reader import Result
 from msmpetsc.view.drawable import Drawable
 
 BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"
-GLASS, GLASS_EDGE, BOX = "#a3b6c4", "#667e90", "#8a929b"
-BOUNDARY_CELL, INTERIOR_CELL, SPRING = "#c8372d", "#2f5fb3", "#5b6570"  # Figure 2 of the paper: red and blue
+GLASS, GLASS_EDGE = "#a3b6c4", "#667e90"
+BOUNDARY_CELL, INTERIOR_CELL = "#c8372d", "#2f5fb3"  # Figure 2 of the paper: red and blue
 # ColorBrewer's YlGnBu without its palest: the least is light, for dark is what is pinned
 SCALE = ("#edf8b1", "#c7e9b4", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
 CLASSES = (
@@ -90,26 +86,21 @@ class Colouring:
         return "0", f"{self.title} [{PREFIXES[size]}{self.unit}]", f"{self.high / size:.3g}"
 
 
-def colouring_of(subject: Drawable, name: str, reference: Result | None = None) -> Colouring:
-    """Return a field by name. Raises InputError.
-
-    reference : the result that an error is counted from
-    """
+def colouring_of(subject: Drawable, name: str) -> Colouring:
+    """Return a field by name. Raises InputError."""
     if name not in COLOURINGS:
         near = did_you_mean(name, COLOURINGS)
         raise InputError(f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}")
-    if (name == "error") != (reference is not None):
-        raise InputError("--colour error goes with --reference OUT.h5, the result that it is counted from")
-    return COLOURINGS[name](subject, reference)
+    return COLOURINGS[name](subject)
 
 
-def _displacement(subject: Drawable, _: Result | None) -> Colouring:
+def _displacement(subject: Drawable) -> Colouring:
     """Return the field of distances from the points at rest."""
     rest = subject.rest.points
     return Colouring("displacement", "m", lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1))
 
 
-def _speed(subject: Drawable, _: Result | None) -> Colouring:
+def _speed(subject: Drawable) -> Colouring:
     """Return the field of mean speeds between the frames before and after."""
     last = len(subject.times) - 1
 
@@ -123,7 +114,7 @@ def _speed(subject: Drawable, _: Result | None) -> Colouring:
     return Colouring("speed", "m/s", values)
 
 
-def _strain(subject: Drawable, _: Result | None) -> Colouring:
+def _strain(subject: Drawable) -> Colouring:
     """Return the field of the springs' relative change of length, root mean square around a node."""
     springs, rest_length = subject.array("lattice/springs"), subject.array("lattice/rest_length")
     count = np.maximum(1, np.bincount(springs.ravel(), minlength=len(subject.rest.nodes)))
@@ -137,7 +128,7 @@ def _strain(subject: Drawable, _: Result | None) -> Colouring:
     return Colouring("strain of the springs", "%", values)
 
 
-def _stress(subject: Drawable, _: Result | None) -> Colouring:
+def _stress(subject: Drawable) -> Colouring:
     """Return the field of von Mises' stress at the nodes, carried by the embedding."""
     von_mises = subject.von_mises
     if von_mises is None:
@@ -147,23 +138,7 @@ def _stress(subject: Drawable, _: Result | None) -> Colouring:
     return Colouring("von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)))
 
 
-def _error(subject: Drawable, reference: Result | None) -> Colouring:
-    """Return the field of distances from another result at the same time."""
-    assert reference is not None  # as colouring_of sees to
-    times = reference.frames.time[:]
-    match = dict(common_times(subject.times, times))
-
-    def values(index: int) -> Floats:
-        if index not in match:
-            raise InputError(f"{reference.path} has no frame of {subject.times[index]:.6g} s, as frame {index}")
-        true = reference.frames.surface[match[index]]
-        apart = np.linalg.norm(subject.surface(index)[: len(true)] - true, axis=1)  # of the file's points, the first
-        return np.asarray(apart if subject.carry is None else subject.carry @ apart)
-
-    return Colouring("distance from the reference", "m", values)
-
-
-def _part(subject: Drawable, _: Result | None) -> Colouring:
+def _part(subject: Drawable) -> Colouring:
     """Return the field of the scene's part to which the nearest cell belongs last."""
     rest, parts = subject.rest, list(subject.scene.tables("part"))
     if not parts:
@@ -181,25 +156,13 @@ def plain_colouring(subject: Drawable) -> Colouring | None:
     return Colouring("body", "", lambda _: number, 1.0, ("",) * len(CLASSES)) if number.any() else None
 
 
-COLOURINGS: dict[str, Callable[[Drawable, Result | None], Colouring]] = {
+COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {
     "displacement": _displacement,
     "speed": _speed,
     "strain": _strain,
     "stress": _stress,
-    "error": _error,
     "part": _part,
 }
-
-
-@contextmanager
-def opened_reference(path: Path | None, run: Result) -> Iterator[Result | None]:
-    """Open the reference result of errors, if any. Raises InputError where its mesh is another."""
-    if path is None:
-        yield None
-        return
-    with Result(path) as reference:
-        refuse_different_meshes(run, reference)
-        yield reference
 
 
 def scaled(colouring: Colouring, frames: Iterable[int]) -> Colouring:

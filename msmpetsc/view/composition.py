@@ -8,7 +8,6 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.errors import InputError
 from msmpetsc.results.progress_bar import counted
-from msmpetsc.results.reader import Result
 from msmpetsc.view.camera import Camera, camera_facing
 from msmpetsc.view.colours import Colouring, colouring_of, plain_colouring, scaled
 from msmpetsc.view.drawable import FARTHEST, Drawable
@@ -16,7 +15,6 @@ from msmpetsc.view.mesh import Cut, cut_open
 from msmpetsc.view.overlays import MARGIN, Overlays, overlays_at
 
 DIRECTIONS = 40  # in which the points farthest out of a frame stand for all of it
-LABELS = np.array([0.55, 0.15])  # of the bodies' longest extent: beside and above them, where axes are labelled
 
 
 @dataclass(frozen=True)
@@ -26,15 +24,13 @@ class Style:
     eye    : direction (3,) from the body to the eye; the scene's picture.eye if None
     colour : name of a field
     size   : width and height [px] of a film, a still, or a panel
-    axes   : whether a box with lengths is drawn around the body
-    shown  : "cells", "springs"
+    cells  : whether the body is cut open
     """
 
     eye: Sequence[float] | None = None
     colour: str | None = None
     size: tuple[int, int] | None = None
-    axes: bool = False
-    shown: tuple[str, ...] = ()
+    cells: bool = False
 
 
 @dataclass(frozen=True)
@@ -67,16 +63,16 @@ class Composition:
         """Corners (2, 3) of the box around all frames [m]."""
         return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
-    def cut(self, shown: tuple[str, ...]) -> Cut | None:
-        """Return the cells and springs behind the body's middle, as the camera sees it."""
-        return cut_open(self.subject, self.camera, shown) if shown else None
+    def cut(self, cells: bool) -> Cut | None:
+        """Return the cells behind the body's middle, as the camera sees it, if they are shown."""
+        return cut_open(self.subject, self.camera) if cells else None
 
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
         """Return the still of each frame, with its time and `words` in the caption.
 
         Equal stills in a row are one object.
         """
-        cut = self.cut(self.style.shown)
+        cut = self.cut(self.style.cells)
         made: list[Still] = []
         for index in frames:
             if made and made[-1].index == index:
@@ -91,7 +87,7 @@ class Composition:
 
         With a margin. Of a ground only the shadows of the bodies count.
         """
-        margin = (LABELS if self.style.axes else MARGIN) * np.ptp(self.box, axis=0).max()
+        margin = MARGIN * np.ptp(self.box, axis=0).max()
         ends, corners = [], [self.extremes]
         for still in stills:
             shown = still.overlays
@@ -103,14 +99,9 @@ class Composition:
         return np.min(ends, axis=0), np.max(ends, axis=0), depth
 
 
-def composition_of(
-    subject: Drawable, frames: Sequence[int], style: Style, reference: Result | None = None
-) -> Composition:
-    """Return the composition of frames, which are read one at a time. Raises InputError.
-
-    reference : result that the colour "error" is counted from
-    """
-    colouring = colouring_of(subject, style.colour, reference) if style.colour else plain_colouring(subject)
+def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Composition:
+    """Return the composition of frames, which are read one at a time. Raises InputError."""
+    colouring = colouring_of(subject, style.colour) if style.colour else plain_colouring(subject)
     number = np.arange(DIRECTIONS) + 0.5  # spread over the sphere, those of the axes first (Fibonacci's spiral)
     height, angle = 1 - 2 * number / DIRECTIONS, np.pi * (1 + 5**0.5) * number
     flat = np.sqrt(1 - height**2)

@@ -96,7 +96,6 @@ class Drawable:
     array     : name of a dataset of a result, "lattice/springs" -> its numbers
     solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
     von_mises : number of a frame -> stress at the nodes (n,) [Pa]; None where none was stored
-    carry     : (v, w) numbers at the file's own points -> numbers at the surface points; None: they are the same
     """
 
     name: str
@@ -110,7 +109,6 @@ class Drawable:
     embedding: csr_array
     array: Callable[[str], Array]
     solids: Mapping[int, Surface]
-    carry: csr_array | None = None
     von_mises: Callable[[int], Floats] | None = None
 
     @property

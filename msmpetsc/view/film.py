@@ -14,7 +14,6 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.progress_bar import counted
-from msmpetsc.results.reader import Result
 from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable
@@ -85,11 +84,10 @@ def write_film(
     frames: Sequence[int],
     style: Style,
     playback: Playback,
-    reference: Result | None = None,
 ) -> None:
     """Write a film of some frames. Raises InputError where it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
-    composition = composition_of(drawn(subject), played, style, reference)
+    composition = composition_of(drawn(subject), played, style)
     stills = composition.stills(played, playback.words)
     if playback.speed:
         seconds = len(played) / playback.fps

@@ -4,7 +4,7 @@ Triangles of the surface that are larger than cells follow the cells that carry 
 points are those of the file, in their order, then those put into long edges, then copies along sharp edges.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,6 @@ def _refined(subject: Drawable) -> Drawable:
         triangles=triangles,
         surface=lambda index: np.concatenate([subject.surface(index), T @ subject.nodes(index)]),
         embedding=csr_array(vstack([W, T])),
-        carry=carry,
     )
 
 
@@ -102,7 +101,6 @@ def _split(subject: Drawable) -> Drawable:
         triangles=triangles,
         surface=lambda index: subject.surface(index)[origin],
         embedding=W[origin],
-        carry=(csr_array(eye_array(len(subject.rest.points))) if subject.carry is None else subject.carry)[origin],
     )
 
 
@@ -117,33 +115,17 @@ def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indi
     return split["pyvistaOriginalPointIds"], split.regular_faces
 
 
-SHOWN = ("cells", "springs")
 BOUNDARY, INTERIOR = 1, 2  # lattice/cell_kind
 SHRUNK = 0.86  # of a cell's size, so that neighbours are told apart
 THROUGH = 0.3  # opacity of a body whose lattice is shown
+Cut = dict[int, Indices]  # cells (c, 8) by their kind, of the half that remains
 KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "interior cell")}
 
 
-@dataclass(frozen=True)
-class Cut:
-    """The half of the lattice that remains when the half before its middle is cut away.
-
-    cells   : (c, 8) by their kind
-    springs : (s, 2), both ends of which lie behind
-    """
-
-    cells: dict[int, Indices]
-    springs: Indices
-
-
-def cut_open(subject: Drawable, camera: Camera, shown: tuple[str, ...]) -> Cut:
+def cut_open(subject: Drawable, camera: Camera) -> Cut:
     """Return the half of the lattice behind the middle of the body at rest."""
     cells, depth = subject.rest.cells, subject.rest.nodes @ camera.to_eye
-    middle = (depth.min() + depth.max()) / 2
-    parts: dict[int, Indices] = {}
-    if "cells" in shown:
-        behind, kind = depth[cells].mean(axis=1) <= middle, subject.array("lattice/cell_kind")
-        parts = {number: cells[behind & (kind == number)] for number in KINDS}
-    springs = subject.array("lattice/springs") if "springs" in shown else np.empty((0, 2), int)
-    springs = springs[(depth[springs] <= middle).all(axis=1)]
-    return Cut({number: part for number, part in parts.items() if len(part)}, springs)
+    behind = depth[cells].mean(axis=1) <= (depth.min() + depth.max()) / 2
+    kind = subject.array("lattice/cell_kind")
+    parts = {number: cells[behind & (kind == number)] for number in KINDS}
+    return {number: part for number, part in parts.items() if len(part)}

@@ -42,11 +42,19 @@ class Ball:
 
 @dataclass(frozen=True)
 class MeshObstacle:
-    """An obstacle with a surface: its number, its displacement (3,) [m], corners (8, 3) as of a Ball."""
+    """An obstacle with a surface: its number, and corners (8, 3) as of a Ball.
+
+    turn, by : (3, 3) and (3,) [m]: it is at x @ turn + by of points x at time 0
+    """
 
     number: int
+    turn: Rows
     by: Floats
     seen: Positions
+
+    def moved(self, points: Positions) -> Positions:
+        """Return where points (n, 3) [m] of it at time 0 are."""
+        return np.asarray(points @ self.turn + self.by)
 
 
 @dataclass(frozen=True)
@@ -83,9 +91,12 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
     for number, obstacle in enumerate(scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):
             continue
-        by = Motion.through(obstacle.path).value_at(time)
+        path = Motion.through(obstacle.path, obstacle.center)
+        pose = path.value_at(time)
+        by = pose[:3]
+        seen_from_it = path.unmoved(bodies, pose)
         if obstacle.shape == "box":
-            shown.glass.extend(_box(np.array(obstacle.box) + by, bodies))
+            shown.glass.extend(path.moved(corners, pose) for corners in _box(np.array(obstacle.box), seen_from_it))
         elif obstacle.shape == "sphere":
             center, radius = np.array(obstacle.center) + by, obstacle.radius or 0.0
             seen = _box(np.array([center - radius, center + radius]), bodies)
@@ -95,8 +106,9 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
         elif obstacle.shape == "plane":
             _add_plane(shown, np.array(obstacle.point) + by, np.array(obstacle.normal), bodies, camera)
         elif number in solids and len(solids[number].points):
-            corners = _box(bounds_of(solids[number]) + by, bodies)
-            shown.meshes.extend(MeshObstacle(number, by, seen) for seen in corners)
+            origin, *axes = path.moved(np.concatenate([np.zeros((1, 3)), np.eye(3)]), pose)
+            corners = (path.moved(box, pose) for box in _box(bounds_of(solids[number]), seen_from_it))
+            shown.meshes.extend(MeshObstacle(number, np.array(axes) - origin, origin, seen) for seen in corners)
     return shown
 
 

@@ -22,7 +22,6 @@ from msmpetsc.comm import log
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.progress_bar import counted
-from msmpetsc.results.reader import Result
 from msmpetsc.view import colours
 from msmpetsc.view.annotations import entries_of
 from msmpetsc.view.colours import Colouring
@@ -34,19 +33,16 @@ from msmpetsc.view.overlays import Overlays
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
-TINY = 1e-300
 PARTS = files("msmpetsc.view")
 SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js")
 
 
-def write_page(
-    subject: Drawable, path: Path, frames: Sequence[int], style: Style, reference: Result | None = None
-) -> None:
+def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Style) -> None:
     """Write the page of these frames, or of fewer if it would be larger than `MOST`.
 
     Raises InputError where they cannot be drawn or the page not be written.
     """
-    composition = composition_of(drawn(subject), frames, style, reference)
+    composition = composition_of(drawn(subject), frames, style)
     chosen = list(frames)
     while True:
         streams = packed_frames(composition, chosen)
@@ -165,8 +161,9 @@ def solid_facts(surface: Surface) -> dict[str, list[float]]:
     """Return an obstacle's surface for the script: corners of each triangle, with a normal at each."""
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), TINY)[:, None]
-    digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=TINY))))
+    tiny = np.finfo(float).tiny
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), tiny)[:, None]
+    digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=tiny))))
     return {
         "corners": np.round(corners, digits).ravel().tolist(),
         "normals": np.round(np.repeat(normals, 3, axis=0), 3).ravel().tolist(),

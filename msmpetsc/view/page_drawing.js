@@ -224,16 +224,20 @@ function drawBall(camera, { center, radius }, eye) { // without perspective a sp
   drawFlat(camera, rim, gl.LINE_LOOP, [...colour("#667e90"), 1]);
 }
 
-function drawMesh(camera, eye, { number, by }) { // a mesh, in the colour of obstacles
+function turned(vectors, turn) { // in threes: each is x @ turn of x
+  return Float32Array.from(vectors, (_, k) => [0, 1, 2].reduce((total, row) => total + vectors[k - k % 3 + row] * turn[row][k % 3], 0));
+}
+
+function drawMesh(camera, eye, { number, turn, by }) { // a mesh, in the colour of obstacles
   const { corners, normals } = data.solids[number];
   use(lit, camera, by, [1, 1, 1]);
   gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
   gl.uniform3fv(lit.uniforms.fixedColour, colour("#a3b6c4"));
   gl.vertexAttrib1f(lit.attributes.number, 0);
   gl.vertexAttrib1f(lit.attributes.fixing, 1);
-  filled("corners", new Float32Array(corners));
+  filled("corners", turned(corners, turn));
   attribute(lit, "position", "corners", 3, gl.FLOAT, false);
-  filled("sides", new Float32Array(normals));
+  filled("sides", turned(normals, turn));
   attribute(lit, "normal", "sides", 3, gl.FLOAT, false);
   gl.drawArrays(gl.TRIANGLES, 0, corners.length / 3);
 }

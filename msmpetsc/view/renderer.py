@@ -7,21 +7,17 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
-from PIL import Image, ImageDraw
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.backend.arrays import Array, Floats, Mask, Positions
 from msmpetsc.errors import InputError
-from msmpetsc.view.annotations import rounded, typeface
-from msmpetsc.view.colours import ARROW, BODY, BOX, FIXED, GLASS, GLASS_EDGE, GROUND, INK, SHADOW, SPRING, rgb
+from msmpetsc.view.colours import ARROW, BODY, FIXED, GLASS, GLASS_EDGE, GROUND, SHADOW, rgb
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, surface_of
-from msmpetsc.view.overlays import Ground, Overlays, corners_of
+from msmpetsc.view.overlays import Ground, Overlays
 
 GLASS_OPACITY = 0.22
 FADING, AROUND = 0.55, 72  # share of a ground's radius from which on it fades; corners of its rim
-LABEL = 11  # [px]: size of what is written at the box
-LABEL_GAP = 8  # [px] between an edge and what is written at it
 
 
 class Renderer:
@@ -53,20 +49,16 @@ class Renderer:
 
     def picture(self, still: Still) -> Array:
         """Return the picture (height, width, 3) of a still. Raises InputError if the graphics library gives none."""
-        has_axes = self._composition.style.axes
         with quiet_opengl():
             self._plotter.suppress_rendering = True  # or all that is added would be drawn once more, half done
             self._plotter.clear_actors()
             self._draw(still)
-            if has_axes:
-                box = _hexahedron(corners_of(self._composition.box))
-                self._plotter.add_mesh(box.extract_all_edges(), color=BOX, line_width=1, lighting=False)
             self._plotter.suppress_rendering = False
             self._plotter.render()
             picture = self._plotter.screenshot(return_img=True)
         if picture is None or not picture.any():
             raise InputError("nothing can be drawn: the graphics library gives a black picture")
-        return self._with_extents(picture) if has_axes else picture
+        return np.asarray(picture)
 
     def _face(self) -> None:
         """Set the orthographic camera."""
@@ -79,26 +71,6 @@ class Renderer:
         view.parallel_projection = True
         view.parallel_scale = self._size[1] / self.scale / 2
         view.clipping_range = (far / 100, 2 * far)
-
-    def _with_extents(self, picture: Array) -> Array:
-        """Return the picture with the coordinates of the box written at its outermost edges."""
-        box, drawn = self._composition.box, Image.fromarray(picture)
-        corners = (self._composition.camera.flat(corners_of(box)) - self._centre) * [
-            1,
-            -1,
-        ] * self.scale + self._size / 2  # [px]
-        for axis, name in enumerate("xyz"):
-            middles = corners.reshape(2, 2, 2, 2).mean(axis=axis).reshape(4, 2)
-            ways = middles - middles.mean(axis=0)
-            # of two that are as far, as opposite ones are, the one to the right and above
-            farthest = int(np.argmax(np.linalg.norm(ways, axis=1) + ways @ (1e-6, -2e-6)))
-            low, high = rounded(*box[:, axis])
-            text = f"{name}: {low} to {high} m"
-            half = np.array([typeface(LABEL).getlength(text), LABEL]) / 2
-            way = ways[farthest] / np.linalg.norm(ways[farthest])
-            middle = np.clip(middles[farthest] + (LABEL_GAP + half) * way, half, self._size - half)
-            ImageDraw.Draw(drawn).text(tuple(middle), text, INK, typeface(LABEL), anchor="mm")
-        return np.array(drawn)
 
     def _draw(self, still: Still) -> None:
         """Draw the bodies, obstacles and arrows of a still."""
@@ -132,7 +104,7 @@ class Renderer:
             self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **look)
         for obstacle in overlays.meshes:
             solid = self._composition.subject.solids[obstacle.number]
-            mesh = surface_of(solid.points + obstacle.by, solid.triangles)
+            mesh = surface_of(obstacle.moved(solid.points), solid.triangles)
             look = dict(smooth_shading=True, split_sharp_edges=True, ambient=0.42, diffuse=0.62)
             self._plotter.add_mesh(mesh, color=GLASS, **look)
 
@@ -152,12 +124,9 @@ def _hexahedron(corners: Positions) -> pv.StructuredGrid:
 
 
 def _draw_lattice(plotter: pv.Plotter, cut: Cut, nodes: Positions) -> None:
-    for kind, cells in cut.cells.items():
+    for kind, cells in cut.items():
         grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, nodes).shrink(SHRUNK)
         plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
-    if len(cut.springs):
-        lines = pv.PolyData(nodes, lines=np.insert(cut.springs, 0, 2, axis=1).ravel())
-        plotter.add_mesh(lines, color=SPRING, line_width=1, lighting=False)
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None:

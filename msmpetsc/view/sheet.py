@@ -15,7 +15,6 @@ from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage
 from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
-from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_result
 from msmpetsc.view.mesh import drawn
@@ -28,11 +27,11 @@ COUNT = 5  # moments, where nothing is said
 
 @dataclass(frozen=True)
 class Moment:
-    """One panel: number of its frame, a caption of two lines, and what is shown of the lattice."""
+    """One panel: number of its frame, a caption of two lines, and whether the body is cut open."""
 
     index: int
     caption: tuple[str, str]
-    shown: tuple[str, ...] = ()
+    cells: bool = False
 
 
 def contact_sheet(
@@ -41,33 +40,29 @@ def contact_sheet(
     frames: Frames | None = None,
     count: int | None = None,
     style: Style | None = None,
-    reference: Path | None = None,
 ) -> Path:
     """Draw the surface at some moments of a result; return png_path.
 
-    frames    : these, or (count) as many as `choose_moments` finds, or those at the scene's picture.times
-    reference : result that the colour "error" is counted from
+    frames : these, or (count) as many as `choose_moments` finds, or those at the scene's picture.times
     """
     style = style or Style()
-    with plain_damage(Path(h5_path)), Result(h5_path) as run, opened_reference(reference, run) as compared:
+    with plain_damage(Path(h5_path)), Result(h5_path) as run:
         subject = drawable_of_result(run)
         chosen = _moments(run, subject, frames, count)
         times = subject.times
-        moments = [Moment(i, (f"t = {times[i]:.3f} s", text), style.shown) for i, text in chosen.items()]
-        draw_moments(subject, Path(png_path), moments, style, compared)
+        moments = [Moment(i, (f"t = {times[i]:.3f} s", text), style.cells) for i, text in chosen.items()]
+        draw_moments(subject, Path(png_path), moments, style)
     return Path(png_path)
 
 
-def draw_moments(
-    subject: Drawable, path: Path, moments: Sequence[Moment], style: Style, reference: Result | None = None
-) -> None:
+def draw_moments(subject: Drawable, path: Path, moments: Sequence[Moment], style: Style) -> None:
     """Draw bodies at some moments, in rows of panels above the legend.
 
     The panels are drawn one by one: a graphics library's own pictures end at some width, and beyond it they are black.
     """
-    composition = composition_of(drawn(subject), [moment.index for moment in moments], style, reference)
+    composition = composition_of(drawn(subject), [moment.index for moment in moments], style)
     stills = [
-        replace(still, caption=moment.caption, cut=composition.cut(moment.shown))
+        replace(still, caption=moment.caption, cut=composition.cut(moment.cells))
         for still, moment in zip(composition.stills([moment.index for moment in moments]), moments, strict=True)
     ]
     low, high, _ = composition.room(stills)

@@ -11,13 +11,13 @@ from obstacles import box, plane, sphere
 from msmpetsc.constraints.loads import Motion
 from msmpetsc.contact.obstacles.penalty import Contact, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
-from msmpetsc.scene.motion import Keyframe
+from msmpetsc.scene.motion import Pose
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
 
 T = 0.1
-SIDEWAYS = Motion.through([Keyframe(time=1.0, by=(0.5, 0.2, 0.0))])
+SIDEWAYS = Motion.through([Pose(time=1.0, by=(0.5, 0.2, 0.0))])
 
 
 # ---- derivatives
@@ -349,7 +349,7 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
 
 def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its_own_reversed():
     """As seen from the plane, at 0.5 m/s, its normal velocity is reversed; e times where e < 1."""
-    path = Motion.through([Keyframe(time=2.0, by=(0, 0, 1.0))])
+    path = Motion.through([Pose(time=2.0, by=(0, 0, 1.0))])
     floor = plane([0, 0, 0], [0, 0, 1], path)
     q, before = np.array([[0.3, 0, 0.2], [0.3, 0, 0.4]]), np.array([[0.2, 0, 0.23], [0.3, 0, 0.4]])
     for e in (1.0, 0.5, 0.0):

@@ -34,7 +34,7 @@ def barrier_of(half: float = HALF) -> tuple[Barrier, np.ndarray, tuple[int, int]
     """The barrier of a grooved block, its points (14, 3), and how many pairs are in creases and how many push never."""
     mesh = grooved(half)
     points = np.array(mesh.vertices)
-    barrier = Barrier(Surface(points, np.array(mesh.faces)), LAW)
+    barrier = Barrier(Surface(points, np.array(mesh.faces)), LAW, len(points))
     return barrier, points, barrier.leave_out_neighbours(points)
 
 
@@ -122,8 +122,8 @@ def scene(folder: Path, **tables) -> Path:
 def test_a_groove_that_is_pressed_shut_does_not_cross(tmp_path):
     model, frames = play(scene(tmp_path, self_contact={"distance": DISTANCE, "friction": 0.3}))
     triangles = model.collision.surface.triangles
-    assert sum(count_crossings(model.collision.points(frame.position), triangles) for frame in frames) == 0
+    assert sum(count_crossings(model.collision.points(frame.position, 0.0), triangles) for frame in frames) == 0
     assert frames[0].self_contacts == 0 and max(frame.self_contacts for frame in frames) > 0
     assert 0 < min(frame.self_distance for frame in frames if frame.self_contacts) < DISTANCE / 4
     _, without = play(scene(tmp_path))
-    assert count_crossings(model.collision.points(without[-1].position), triangles) > 0
+    assert count_crossings(model.collision.points(without[-1].position, 0.0), triangles) > 0

@@ -48,7 +48,7 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     assert model.collision is not None
     end = q.copy()
     end[q[:, 0] < 0, 1] += slid
-    return SurfaceContact(NearPairs(COMM, model.collision).step(q, q), q, T), end
+    return SurfaceContact(NearPairs(COMM, model.collision).step(q, q, 0.0, T), q, T), end
 
 
 @pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])  # without friction, below the kink of friction, beyond it
@@ -74,7 +74,7 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
     hessian.add_product(forward, product)
     bend = term.change(q + step * forward, q) + term.change(q - step * forward, q)  # the linear parts cancel
     assert bend / (step**2 * np.vdot(product, forward)) == pytest.approx(1, rel=1e-3)
-    longest = np.abs(model.collision.points(forward)).max()
+    longest = np.abs(model.collision.points.moved(forward)).max()
     below, above = (term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share for share in (0.999, 1.001))
     assert below / above == pytest.approx(1, rel=0.01)  # where one formula takes over from the other
 
@@ -185,7 +185,7 @@ def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_fr
     assert 300 < len(surface.triangles) <= 400
     squares = igl.point_mesh_squared_distance(surface.points, whole, model.surface.triangles)[0]
     assert squares.max() < 1e-18
-    np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
+    np.testing.assert_allclose(model.collision.points(model.lattice.nodes, 0.0), surface.points, atol=1e-12)
     off = np.sqrt(igl.point_mesh_squared_distance(whole, surface.points, surface.triangles)[0])
     assert f"up to {off.max():.2g} m, half of it by more than {np.median(off):.2g} m" in caplog.text
     diagonal = np.linalg.norm(np.ptp(whole, axis=0))
@@ -214,7 +214,7 @@ def test_what_would_move_the_surface_past_itself_is_refused(tmp_path, override: 
 
 def test_presets_of_a_are_refused(tmp_path):
     scene = load_scene(pinch_scene(tmp_path), ("solver.preset=anderson",))
-    with pytest.raises(InputError, match="self_contact is for newton's presets, not anderson"):
+    with pytest.raises(InputError, match="is for newton's presets, not anderson"):
         refuse_bad_options(scene, Probes())
 
 

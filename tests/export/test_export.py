@@ -19,7 +19,6 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export
 from msmpetsc.export.moments import normals
-from msmpetsc.results.reader import Result
 from msmpetsc.results.xdmf import write_xdmf
 
 PINNED = [0, 3]
@@ -100,19 +99,6 @@ def test_one_frame_of_the_surface(result: Path, tmp_path: Path, ending: str):
     assert np.allclose(mesh.triangles, surface(FRAMES - 1)[[[0, 1, 2], [1, 2, 3]]], atol=1e-6)
 
 
-def test_one_frame_of_the_lattice(result: Path, tmp_path: Path):
-    path = export(result, tmp_path / "x.vtu", frames=[2])
-    mesh = pyvista.read(path)
-    assert np.allclose(mesh.points, position(2)) and mesh.volume == pytest.approx(2 * H**3)
-    assert np.allclose(mesh["displacement"], position(2) - NODES)
-    assert np.allclose(mesh["velocity"], (position(2) - position(1)) / DT)
-    assert list(mesh.celltypes) == [pyvista.CellType.HEXAHEDRON] * 2 and mesh["cell_kind"].tolist() == [1, 1]
-    assert np.flatnonzero(mesh["pinned"]).tolist() == PINNED and np.allclose(mesh["mass"], 0.25)
-    of_surface = meshio.read(export(result, path, "surface", [-1]))
-    assert np.allclose(of_surface.points, surface(FRAMES - 1), atol=1e-6)
-    assert np.allclose(of_surface.point_data["velocity"], [1.0, 0, 0], atol=1e-4)
-
-
 def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tmp_path: Path):
     with h5py.File(result, "r+") as file:
         del file["frames/surface"]
@@ -123,7 +109,6 @@ def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tm
 
 WRONG = {
     "what is exported is named *.glb, *.usd": ("x.vtkhdf", {}),  # on a full disk HDF5 crashed in it
-    "a *.glb holds no lattice, but the surface": ("x.glb", {"mesh": "lattice"}),
     "has frames 0 to 4, not 5": ("x.glb", {"frames": [0, 5]}),
     "a *.obj holds one frame, not 2": ("x.obj", {"frames": [0, 1]}),
     "must follow each other in time": ("x.glb", {"frames": [3, 1]}),
@@ -139,7 +124,6 @@ def test_what_cannot_be_exported_is_said_in_one_line(result: Path, tmp_path: Pat
 
 def test_a_result_without_a_surface(tmp_path: Path):
     result = small_result.write(tmp_path / "x.h5", surface=False)
-    assert isinstance(pyvista.read(export(result, tmp_path / "x.vtu")), pyvista.UnstructuredGrid)
     with pytest.raises(InputError, match=r"has no surface: it was run with output.surface = false"):
         export(result, tmp_path / "x.obj")
 
@@ -186,8 +170,8 @@ def stressed(index: int) -> dict[str, np.ndarray]:
     return numbers | {f"{whose}stress": index + np.arange(6.0 * rows[whose]).reshape(-1, 6) for whose in rows}
 
 
-def test_stress_comes_with_xdmf_and_vtu(tmp_path: Path):
-    """In VTK's order, and of the surface as the embedding carries it; XDMF has a tensor as two vectors."""
+def test_stress_comes_with_xdmf(tmp_path: Path):
+    """XDMF has a tensor as two vectors."""
     result = small_result.write(tmp_path / "x.h5", [small_result.frame(k, **stressed(k)) for k in range(3)])
     reader = vtk.vtkXdmfReader()
     reader.SetFileName(str(write_xdmf(result)))
@@ -200,9 +184,3 @@ def test_stress_comes_with_xdmf_and_vtu(tmp_path: Path):
             assert np.array_equal(data[f"{whose}stress_shear"], expected[f"{whose}stress"][:, 3:])
             assert all(np.array_equal(data[whose + name], expected[whose + name]) for name in SCALARS)
     assert heard == []
-    lattice = meshio.read(export(result, tmp_path / "l.vtu", frames=[1]))
-    found = lattice.point_data | {name: blocks[0] for name, blocks in lattice.cell_data.items()}
-    assert all(np.array_equal(found[name], rows) for name, rows in stressed(1).items())
-    surface_data = meshio.read(export(result, tmp_path / "s.vtu", "surface", [1])).point_data
-    with Result(result) as run:
-        assert np.allclose(surface_data["von_mises"], run.embedding @ stressed(1)["von_mises"])

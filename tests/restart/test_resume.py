@@ -380,32 +380,6 @@ def test_no_two_hold_a_lock(tmp_path):
     assert [process.exitcode for process in four] == [0] * 4 and twice.value == 0
 
 
-@pytest.mark.parametrize("with_its_folder", [False, True])
-@pytest.mark.parametrize("another", [False, True])
-def test_a_file_that_is_removed_while_it_is_written(whole: Path, tmp_path, monkeypatch, with_its_folder, another):
-    """The run stops at its next checkpoint, and what it had is there to go on from."""
-    folder, scene = tmp_path / "out", str(whole.parent / "scene.toml")
-    path = folder / "x.h5"
-
-    def removed() -> None:
-        shutil.rmtree(folder) if with_its_folder else path.unlink()
-        folder.mkdir(exist_ok=True)
-        if another:
-            path.write_text("another")
-
-    with monkeypatch.context() as patch:
-        at_step(patch, 17, removed)
-        text = command_error("run", scene, "-o", path, "--true-error", "3", "--checkpoint-every", "3")
-    kept = folder / f"x.{os.getpid()}.h5" if another else path
-    assert "was removed while it was written" in text and text.endswith(f"--resume {kept}")
-    assert os.listdir(folder) == [kept.name] or (another and sorted(os.listdir(folder)) == sorted([kept.name, "x.h5"]))
-    with h5py.File(kept) as file:
-        assert max(file["checkpoint/step"]) == 18 and finished(file) == 7
-    assert main(["run", "--resume", str(kept)]) == 0
-    assert_same(kept, whole)
-    assert not another or path.read_text() == "another"
-
-
 @pytest.mark.parametrize("given", [[], ["--resume", "none.h5"], ["--resume", "none.h5", "-o", "other.h5"]])
 def test_what_cannot_be_resumed_is_told(given, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,5 @@
 """msmpetsc.open: what is in the file comes out, of running and of old files too; a bad file ends in one line."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -182,25 +181,3 @@ def test_what_is_wrong_in_a_part_is_told_when_it_is_asked_for(copy: Path, spoil,
     spoil(copy)
     with msmpetsc.open(copy) as run, pytest.raises(InputError, match=words):
         _ = run.indices("lattice/springs") if ask == "springs" else getattr(run, ask)
-
-
-def test_xarray_has_coordinates_units_and_names(bar_result: Path):
-    pytest.importorskip("xarray")
-    with msmpetsc.open(bar_result) as run:
-        data = run.to_xarray()
-        assert data.position.dims == ("time", "node", "axis") and data.surface.dims == ("time", "point", "axis")
-        assert data.kinetic.attrs == {"long_name": "kinetic energy", "units": "J"}
-        x = data.position.sel(axis="x").sel(time=2 * DT, method="nearest").isel(node=[11, 0])
-        assert x.values.tolist() == position(2)[[11, 0], 0].tolist()
-        assert np.array_equal(data.rest_position, NODES) and data.attrs["ranks"] == 1
-        weight = (data.mass * data.position).sum("node").isel(time=1, axis=2)
-        assert float(weight) == pytest.approx(0.25 * NODES[:, 2].sum())
-
-
-def test_without_xarray_one_line_says_so(bar_result: Path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    with (
-        msmpetsc.open(bar_result) as run,
-        pytest.raises(InputError, match="needs the package xarray"),
-    ):
-        run.to_xarray()

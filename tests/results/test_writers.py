@@ -65,7 +65,7 @@ def film(path: Path) -> None:
 
 def page(result: Path, path: Path) -> None:
     with Result(result) as run:
-        write_page(drawable_of_result(run), path, [0, 1], Style(), None)
+        write_page(drawable_of_result(run), path, [0, 1], Style())
 
 
 def chart(path: Path) -> None:

@@ -19,7 +19,6 @@ from msmpetsc.view.colours import (
     Colouring,
     colouring_of,
     on_scale,
-    opened_reference,
     rgb,
     scaled,
 )
@@ -68,17 +67,8 @@ def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
         nodes=lambda _: moved,
         array={"lattice/springs": np.array([[0, 1], [1, 2]]), "lattice/rest_length": np.ones(2)}.__getitem__,
     )
-    values = COLOURINGS["strain"](subject, None).values(0)
+    values = COLOURINGS["strain"](subject).values(0)
     assert values == pytest.approx([0.1, np.sqrt((0.1**2 + 0.2**2) / 2), 0.2])
-
-
-def test_error_is_the_distance_from_the_reference(subject, falling_ball):
-    with Result(falling_ball) as run, opened_reference(falling_ball, run) as reference:
-        assert colouring_of(subject, "error", reference).values(4) == pytest.approx(0.0, abs=1e-12)
-        raised = replace(subject, surface=lambda index: subject.surface(index) + np.array([0.003, 0, 0.004]))
-        error = scaled(colouring_of(raised, "error", reference), [0, 4])
-        assert error.values(4) == pytest.approx(0.005, rel=1e-3)
-        assert error.ends == ("0", "distance from the reference [mm]", "5")
 
 
 def test_parts_are_those_of_the_nearest_cell(subject):

@@ -33,11 +33,25 @@ stop = 0.95
 LOW, HIGH = np.array([0.15, -0.05, 0.45]), np.array([0.25, 0.05, 0.55])  # to the right of the ball [m]
 
 
+BAR = np.array([[0.15, -0.05, 0.49], [0.25, 0.05, 0.51]])
+TURNING = """
+[[obstacle]]
+path = [{ time = 1.0, turn = [0, 90, 0] }]
+center = [0.2, 0, 0.5]
+response = "barrier"
+"""
+TWO_BARS = TURNING + f'shape = "box"\nbox = {BAR.tolist()}' + TURNING + 'shape = "mesh"\nmesh.source = "bar.ply"'
+
+
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     """The ball, and beside it a cube that sinks with it, slower."""
-    path = write_ball(tmp_path / "x.h5", scene=BARE + STATUE)
-    cube = trimesh.creation.box(bounds=[LOW, HIGH])
+    return with_mesh(write_ball(tmp_path / "x.h5", scene=BARE + STATUE), [LOW, HIGH])
+
+
+def with_mesh(path: Path, bounds) -> Path:
+    """A result whose obstacle 1 is a mesh, a box between two corners."""
+    cube = trimesh.creation.box(bounds=bounds)
     with h5py.File(path, "r+", libver="earliest") as file:
         file["obstacle/points"], file["obstacle/triangles"] = cube.vertices, cube.faces
         file["obstacle/number"] = np.ones(len(cube.faces), "i4")
@@ -84,6 +98,28 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
     )
     sunk = right_of_the_ball(pictures[1])[0]
     assert sunk.mean() - rows.mean() == pytest.approx(0.2 * metre, rel=0.1)
+
+
+@in_browser
+@pytest.mark.timeout(120)
+def test_a_bar_that_turns_is_drawn_as_it_has_turned(tmp_path: Path):
+    """Lying at first, upright at the end; a box and a mesh alike."""
+    path = with_mesh(write_ball(tmp_path / "x.h5", scene=BARE + "picture.eye = [0, -1, 0]" + TWO_BARS), BAR)
+    with Result(path) as run:
+        (still,) = composition_of(drawable_of_result(run), [0, 10], Style()).stills([10])
+        solid = solids_of(run)[1]
+    ((mesh,), (box,)) = still.overlays.meshes, still.overlays.glass
+    upright = [[0.19, -0.05, 0.45], [0.21, 0.05, 0.55]]
+    for drawn in (box, mesh.seen, mesh.moved(solid.points)):
+        np.testing.assert_allclose([drawn.min(axis=0), drawn.max(axis=0)], upright, atol=1e-12)
+    render(path, "-o", path.with_suffix(".html"), "--eye", "0,-1,0")
+    with Browser(path.with_suffix(".html")) as browser:
+        pictures = [browser.picture() for frame in (0, 10) if not browser.value(f"goTo({frame})")]
+    rows, columns, metre = right_of_the_ball(pictures[0])
+    assert np.ptp(columns) == pytest.approx(0.1 * metre, rel=0.1) and np.ptp(rows) < 0.03 * metre
+    right = pictures[1][:, columns.min() : columns.max() + 1]
+    tall, wide = np.nonzero(right.min(axis=2) < 230)
+    assert np.ptp(tall) == pytest.approx(0.1 * metre, rel=0.1) and np.ptp(wide) < 0.03 * metre
 
 
 DAMAGE = {

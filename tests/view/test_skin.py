@@ -8,7 +8,6 @@ import trimesh
 from scipy.sparse import csr_array
 from surface_alone import drawable_of
 
-from msmpetsc.view.annotations import rounded
 from msmpetsc.view.colours import plain_colouring
 from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
@@ -52,7 +51,6 @@ def test_a_block_of_twelve_triangles_is_drawn_as_its_cells_bend():
     # trilinear between nodes: 0.3 h^2 / 4 off the parabola in the middle of a cell, where 12 triangles are 0.075 off
     assert points == pytest.approx(bent(rest), abs=0.3 * H**2 / 4 + 1e-9)
     assert subject.embedding @ subject.nodes(1) == pytest.approx(points)
-    assert subject.carry @ block().rest.points == pytest.approx(rest)
 
 
 def test_long_edges_are_divided_without_holes():
@@ -116,12 +114,3 @@ def test_bodies_have_a_colour_each():
     halves = replace(subject.rest, body_of_point=np.repeat([0, 1], 4))
     colouring = plain_colouring(replace(subject, rest=halves))
     assert len(np.unique(colouring.rgb(0), axis=0)) == 2
-
-
-@pytest.mark.parametrize(
-    ("span", "texts"),
-    [((-1.08e-05, 0.3), ("0", "0.3")), ((1000.0, 1000.25), ("1000", "1000.25")), ((-0.1044, 0.2), ("-0.104", "0.2")),
-     ((0.0, 12345.0), ("0", "12300")), ((0.0, 0.0), ("0", "0"))],
-)  # fmt: skip
-def test_ends_of_axes_are_rounded_to_their_span(span: tuple[float, float], texts: tuple[str, str]):
-    assert rounded(*span) == texts

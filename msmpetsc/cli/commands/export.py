@@ -9,5 +9,5 @@ from msmpetsc.results.reader import refuse_deadly
 def run(args: argparse.Namespace) -> int:
     """Export the result and print the path of what was written; return the exit status."""
     refuse_deadly(args.result)
-    print(export(args.result, args.output, args.mesh, args.frames))
+    print(export(args.result, args.output, args.frames))
     return 0

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES, RESULT_NAMES, SCENE_NAMES, refuse_other_format
-from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.errors import InputError
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.view.colours import opened_reference
 from msmpetsc.view.composition import Style
 from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result
 from msmpetsc.view.film import playback_of, write_film
-from msmpetsc.view.mesh import SHOWN
 from msmpetsc.view.page import write_page
 from msmpetsc.view.sheet import Moment, contact_sheet, draw_moments
 
@@ -26,10 +24,8 @@ ONLY = {  # options by the endings of what they are for
     "count": PICTURE_NAMES,
     "size": (*PICTURE_NAMES, *MOVIE_NAMES),
     "speed": MOVIE_NAMES,
-    "show": (*PICTURE_NAMES, *MOVIE_NAMES),
-    "axes": (*PICTURE_NAMES, *MOVIE_NAMES),
+    "cells": (*PICTURE_NAMES, *MOVIE_NAMES),
 }
-FASTEST = 1e6  # simulated seconds a second
 
 
 def run(args: argparse.Namespace) -> int:
@@ -53,35 +49,31 @@ def run(args: argparse.Namespace) -> int:
 def style_of(args: argparse.Namespace) -> Style:
     """Return the style of a picture. Raises InputError."""
     eye = None if args.eye is None else _direction(args.eye)
-    shown = tuple(args.show.split(",")) if args.show else ()
-    for name in shown:
-        if name not in SHOWN:
-            raise InputError(f"--show takes {' and '.join(SHOWN)}, not {name!r}{did_you_mean(name, SHOWN)}")
-    if args.speed is not None and not (0 < args.speed <= FASTEST):
-        raise InputError(f"--speed must be above 0, and {FASTEST:g} at most, not {args.speed:g}")
-    return Style(eye, args.colour, _size(args.size), args.axes, shown)
+    if args.speed is not None and not 0 < args.speed < np.inf:
+        raise InputError(f"--speed must be above 0, not {args.speed:g}")
+    return Style(eye, args.colour, _size(args.size), args.cells)
 
 
 def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
     """Draw a result: moments of it, a film, or a page."""
     if path.suffix.lower() in PICTURE_NAMES:
-        contact_sheet(args.subject, path, args.frames, args.count, style, args.reference)
+        contact_sheet(args.subject, path, args.frames, args.count, style)
         return
-    with plain_damage(args.subject), Result(args.subject) as run, opened_reference(args.reference, run) as reference:
+    with plain_damage(args.subject), Result(args.subject) as run:
         subject = drawable_of_result(run)
         everything: Frames = [slice(None)]
         numbers = frames_of(subject.name, args.frames or everything, len(subject.times))
         if path.suffix.lower() in PAGE_NAMES:
-            write_page(subject, path, numbers, style, reference)
+            write_page(subject, path, numbers, style)
         else:
             playback = playback_of(subject.times[numbers], args.speed)
-            write_film(subject, path, numbers, style, playback, reference)
+            write_film(subject, path, numbers, style, playback)
 
 
 def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     """Draw a scene as it lies before anything is run."""
     refuse_other_format("render", args.subject, (*RESULT_NAMES, *SCENE_NAMES))
-    for option in ("frames", "count", "speed", "reference"):
+    for option in ("frames", "count", "speed"):
         if getattr(args, option) is not None:
             raise InputError(f"--{option} is for results, and {args.subject} is none")
     if path.suffix.lower() in MOVIE_NAMES:
@@ -90,10 +82,10 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     if path.suffix.lower() not in PICTURE_NAMES:
         write_page(subject, path, [0], style)
         return
-    moments = [Moment(0, (subject.title, about[0]), style.shown)]
-    if not style.shown:
-        moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
-    draw_moments(subject, path, moments, replace(style, size=style.size or STILL, axes=True))
+    moments = [Moment(0, (subject.title, about[0]), style.cells)]
+    if not style.cells:
+        moments.append(Moment(0, ("cut open", about[1]), True))
+    draw_moments(subject, path, moments, replace(style, size=style.size or STILL))
 
 
 def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:

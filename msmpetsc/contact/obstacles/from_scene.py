@@ -32,7 +32,7 @@ def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Flo
     obstacles = []
     for number, table in enumerate(scene.obstacle):
         key = f"obstacle.{number}"
-        path, solid = Motion.through(table.path), _solid(comm, table, key, scene.folder)
+        solid = _solid(comm, table, key, scene.folder)
         if isinstance(solid, FunctionSolid):
             with together(comm):
                 length = 1.0  # of the gradients at most nodes, as a distance's are
@@ -42,6 +42,7 @@ def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Flo
                 if abs(length - 1) > MOST_OFF:
                     wrong = f"its gradient is {length:.3g} long at most nodes, not 1"
                     raise InputError(f"{key}.function: no signed distance: {wrong}")
+        path = Motion.through(table.path, table.center)
         obstacles.append(Obstacle(solid, path, table.start, table.stop, key, outside))
     return obstacles
 

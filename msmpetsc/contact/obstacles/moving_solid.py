@@ -35,7 +35,7 @@ class Obstacle(Timed):
 
     def seen_from(self, q: Positions, time: float) -> Positions:
         """Return where positions (n, 3) [m] at a time [s] are as seen from the solid."""
-        return q - like(q, self.path.value_at(time)) if self.path.leads_away else q
+        return q - like(q, self.path.displacement_at(time)) if self.path.leads_away else q
 
     def depths(self, q: Positions, time: float, sides: Indices | None = None) -> tuple[Floats, Indices]:
         """Return how deep the surface at nodes (n, 3) lies in the obstacle at a time [s], (n,) [m], and faces (n,).

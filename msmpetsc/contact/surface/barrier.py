@@ -1,4 +1,4 @@
-"""Barrier between the triangles of one surface, and its friction, by ipctk (Li et al. 2020,
+"""Barrier between the triangles of surfaces, and its friction, by ipctk (Li et al. 2020,
 Incremental Potential Contact): all that is computed of points on one rank.
 
 A pair of triangles' parts that are nearer than dhat has the energy  kappa a b(d),  a an area of the surface, d their
@@ -64,10 +64,11 @@ class SweptPairs:
 class Barrier:
     """Barrier of a surface (p, 3), by the positions S (p, 3) [m] of its points.
 
-    edge : mean length of the surface's edges at rest [m]
+    bodies : number of its first points, those of bodies; obstacles have the others, and do not meet each other
+    edge   : mean length of the bodies' edges at rest [m]
     """
 
-    def __init__(self, surface: Surface, law: BarrierLaw):
+    def __init__(self, surface: Surface, law: BarrierLaw, bodies: int, meets_itself: bool = True):
         import ipctk  # of the extra "contact"
 
         ipctk.set_num_threads(1)
@@ -76,7 +77,12 @@ class Barrier:
         triangles = np.asfortranarray(surface.triangles, np.int32)
         edges = np.asfortranarray(ipctk.edges(triangles), np.int32)
         self.mesh = ipctk.CollisionMesh(np.asfortranarray(surface.points), edges, triangles)
-        ends = surface.points[edges]
+        obstacles = len(surface.points) - bodies
+        if not meets_itself:
+            self.mesh.can_collide = ipctk.make_vertex_patches_filter(np.repeat([0, 1], [bodies, obstacles]))
+        elif obstacles:
+            self.mesh.can_collide = ipctk.make_static_obstacle_filter(bodies)
+        ends = surface.points[edges[edges.max(axis=1) < bodies]]
         self.edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
@@ -92,12 +98,27 @@ class Barrier:
         (p, 3) [m] at rest; how many these are, and how many do not push at all."""
         pairs = neighbours(self.candidates(points, 0.0), self.mesh, points, self.law.distance)
         if pairs:
-            self.mesh.can_collide = self.ipctk.make_sparse_filter(pairs, True)
+            self.mesh.can_collide = self.mesh.can_collide & self.ipctk.make_sparse_filter(pairs, True)
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
         self.creases = list(sets.values())
         self.distances += sets
         self.potentials += [self._potential(distance) for distance in sets]
         return sum(map(len, self.creases)), dropped
+
+    def crossings(self) -> Indices:
+        """Return the triangles (k,) that edges of others cross at rest or that have such an edge, ascending."""
+        ipctk, mesh, points = self.ipctk, self.mesh, self.mesh.rest_positions
+        phase = ipctk.LBVH()
+        phase.can_vertices_collide = mesh.can_collide
+        phase.build(points, mesh.edges, mesh.faces)
+        cut, crossing = set(), set()
+        for pair in phase.detect_edge_face_candidates():
+            edge, face = mesh.edges[pair.edge_id], mesh.faces[pair.face_id]
+            if not set(edge) & set(face) and ipctk.is_edge_intersecting_triangle(*points[edge], *points[face]):
+                crossing.add(pair.edge_id)
+                cut.add(pair.face_id)
+        cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
+        return np.array(sorted(cut), np.int64)
 
     def candidates(self, points: Positions, reach: float) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than
@@ -233,21 +254,3 @@ def hessian_of(acting: list[Acting], points: Positions, projected: bool) -> "lis
 
 def _kept(share: float) -> float:
     return share if share >= 1 else KEPT * share
-
-
-def crossings(surface: Surface) -> Indices:
-    """Return the triangles (k,) that edges of others cross or that have such an edge, ascending."""
-    barrier = Barrier(surface, BarrierLaw(1.0, 1.0, 0.0, 1.0))
-    ipctk, mesh = barrier.ipctk, barrier.mesh
-    points = surface.points
-    phase = ipctk.LBVH()
-    phase.can_vertices_collide = mesh.can_collide
-    phase.build(np.asfortranarray(points), mesh.edges, mesh.faces)
-    cut, crossing = set(), set()
-    for pair in phase.detect_edge_face_candidates():
-        edge, face = mesh.edges[pair.edge_id], mesh.faces[pair.face_id]
-        if not set(edge) & set(face) and ipctk.is_edge_intersecting_triangle(*points[edge], *points[face]):
-            crossing.add(pair.edge_id)
-            cut.add(pair.face_id)
-    cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
-    return np.array(sorted(cut), np.int64)

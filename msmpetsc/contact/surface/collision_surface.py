@@ -1,4 +1,4 @@
-"""The surface that meets itself: the body's own or a coarser one, without the triangles that cut others at rest."""
+"""The surface that meets itself and obstacles: the bodies' own or a coarser one, but for what cuts itself."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,10 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
 from msmpetsc.contact.obstacles.friction import STICK
-from msmpetsc.contact.surface.barrier import BarrierLaw, crossings
+from msmpetsc.contact.obstacles.moving_solid import Obstacle
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
+from msmpetsc.contact.surface.creases import NEAREST
+from msmpetsc.contact.surface.obstacle_surfaces import obstacle_surfaces
 from msmpetsc.contact.surface.pairs import CollisionSurface
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.errors import InputError
@@ -27,19 +30,24 @@ PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (lattice.material)
 
 
 def collision_surface(
-    table: SelfContactTable, scene: Scene, bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice
-) -> CollisionSurface:
-    """Return the surface of all bodies that meets itself (collective).
+    scene: Scene, bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice, obstacles: list[Obstacle]
+) -> CollisionSurface | None:
+    """Return the surface of all bodies that meets itself or obstacles; None where neither is asked for (collective).
 
-    Raises InputError on all ranks where more than a tenth of its triangles cut others at rest.
+    obstacles : in the scene's order
+    Raises InputError on all ranks where over a tenth of its triangles cut others at rest, and where obstacles do.
     """
-    comm = bodies[0].comm
-    prepared = on_root(comm, lambda: _prepared([body.surface for body in bodies if body.surface], table))
-    surfaces, off = prepared or ([], 0.0)
+    table, comm = scene.touching, bodies[0].comm
+    if table is None:
+        return None
+    whole = [body.surface for body in bodies if body.surface]
+    surfaces, *lengths = on_root(comm, lambda: _prepared(whole, table, scene.self_contact is not None)) or ([],)
+    off, edge = comm.bcast(lengths)
+    met = obstacle_surfaces(scene, obstacles, edge)
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
     sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)
-    distance = table.distance or max(NEAR * float(np.linalg.norm(sides)), comm.bcast(off))
+    distance = table.distance or max(NEAR * float(np.linalg.norm(sides)), off)
     # kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells, E / h, and what its
     # inertia adds in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness)
     # takes both of each contact; with those of the stiffest cell it, and the energy of a state, is always the same.
@@ -47,31 +55,66 @@ def collision_surface(
     layer = (PER_EDGE * lattice.stiffest(comm) + mass / scene.time.step**2) / lattice.cell_size**2
     stick = table.friction_speed or STICK * float(sides.max())
     law = BarrierLaw(distance, float(distance**2 * layer), table.friction, stick)
-    return CollisionSurface(joined(surfaces), SurfacePoints(comm, lattice, embedding), law)
+    carried = SurfacePoints(comm, lattice, embedding, met)
+    joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))
+    surface = CollisionSurface(joint, carried, law, scene.self_contact is not None)
+    on_root(comm, lambda: _refuse_touching(surface))
+    return surface
 
 
-def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float]:
+def _prepared(bodies: list[Surface], table: SelfContactTable, meets_itself: bool) -> tuple[list[Surface], float, float]:
     """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without those
-    that cut others, and the median distance [m] of their own points from them. Raises InputError where too many do."""
+    that cut others, the median distance [m] of their own points from them, and their edges' mean length [m].
+
+    Raises InputError where too many do.
+    """
     off = 0.0
     if table.surface is not None:
         share = table.surface / sum(len(body.triangles) for body in bodies)
         coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
+    if meets_itself:
+        bodies = _without_cut(bodies)
+    ends = np.concatenate([b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies])
+    return bodies, off, float(np.linalg.norm(ends, axis=2).mean())
+
+
+def _refuse_touching(surface: CollisionSurface) -> None:
+    """Raise InputError where an obstacle cuts a body at rest, or all but touches it."""
+    whole, law = surface.surface, surface.law
+    if whole is None or not surface.points.obstacles.total:
+        return
+    barrier = Barrier(whole, law, surface.points.bodies, meets_itself=False)
+    cut = barrier.crossings()
+    if len(cut):
+        raise InputError(f"obstacle: one of the barrier cuts a body at rest, at {_place(whole, cut[0])} m")
+    near = barrier.contacts(barrier.candidates(whole.points, 0.0), whole.points)
+    if (least := barrier.least(near, whole.points)) < NEAREST * law.distance:
+        raise InputError(f"obstacle: one of the barrier is but {least:.2g} m from a body at rest: leave a gap")
+
+
+def _place(surface: Surface, triangle: int) -> str:
+    """Return where a triangle is, in words."""
+    middle = surface.points[surface.triangles[triangle]].mean(axis=0)
+    return "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
+
+
+def _without_cut(bodies: list[Surface]) -> list[Surface]:
+    """Return surfaces without the triangles that cut others. Raises InputError where too many do."""
     whole = joined(bodies)
     assert whole is not None
-    cut = crossings(whole)
+    cut = Barrier(whole, BarrierLaw(1.0, 1.0, 0.0, 1.0), len(whole.points)).crossings()
     if len(cut) == 0:
-        return bodies, off
-    at = ", ".join(f"{c:.4g}" for c in whole.points[whole.triangles[cut[0]]].mean(axis=0))
-    what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at ({at}) m"
+        return bodies
+    what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at "
+    what += f"{_place(whole, cut[0])} m"
     if len(cut) > MOST_CUT * len(whole.triangles):
         raise InputError(f'{what}, too many to leave out: mesh.prepare = ["union"] or ["repair"] may mend the mesh')
     log.warning("%s: they are left out, and may be crossed", what)
     of_body = np.split(
         ~np.isin(np.arange(len(whole.triangles)), cut), np.cumsum([len(b.triangles) for b in bodies])[:-1]
     )
-    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)], off
+    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)]
 
 
 def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:

@@ -1,4 +1,4 @@
-"""Points of the surface that meets itself, as the nodes carry them: S = W q, and forces on them back to the nodes.
+"""Points of the surfaces that meet: S = W q of the bodies', as the nodes carry them, and after these the obstacles'.
 
 Each rank has the columns of W that belong to its nodes, so that S is the sum of what the ranks send to rank 0, and a
 force f on the points is W^T f on each rank's nodes. Rank 0 has the whole of S, as it has the surface mesh.
@@ -10,8 +10,9 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
 
-from msmpetsc.backend.arrays import Indices, Positions
+from msmpetsc.backend.arrays import Indices, Positions, Rows
 from msmpetsc.comm import Route
+from msmpetsc.contact.surface.obstacle_surfaces import ObstacleSurfaces
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -25,14 +26,15 @@ class Carried(NamedTuple):
 class SurfacePoints:
     """W by columns. All methods but ``carried`` are collective.
 
-    total  : number of points
+    bodies : number of points that nodes carry; ``total`` with the obstacles'
     spread : greatest sum of the sizes of a point's weights: no point moves farther than that times the farthest node
     rows   : (k,) the points that nodes of this rank carry, ascending; ``weights`` (k, owned) theirs
     """
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array, obstacles: ObstacleSurfaces):
         counts = comm.allgather(embedding.shape[0])
-        self.comm, self.total = comm, sum(counts)
+        self.comm, self.obstacles, self.bodies = comm, obstacles, sum(counts)
+        self.total = self.bodies + obstacles.total
         sizes = abs(embedding).sum(axis=1)
         self.spread = comm.allreduce(float(sizes.max(initial=0)), MPI.MAX)
         to_owner = Route(comm, lattice.table.owner_of_index(embedding.indices))
@@ -45,9 +47,16 @@ class SurfacePoints:
         self.to_root = Route(comm, np.zeros(len(self.rows), np.int64))
         self.received = np.split(self.to_root.send(self.rows), np.cumsum(self.to_root.received)[:-1])
 
-    def __call__(self, q: Positions) -> Positions:
-        """Return the points (total, 3) [m] of positions q (owned or more, 3) on rank 0; (0, 3) on the others."""
-        parts = self.to_root.send(self.weights @ q[: self.weights.shape[1]])
+    def __call__(self, q: Positions, time: float) -> Positions:
+        """Return the points (total, 3) [m] of positions q (owned or more, 3) at a time [s] on rank 0; else none."""
+        points = self.moved(q)
+        if self.obstacles.total and len(points):
+            points[self.bodies :] = self.obstacles.points_at(time)
+        return points
+
+    def moved(self, v: Rows) -> Rows:
+        """Return W v (total, 3) of nodes' v (owned or more, 3), 0 for obstacles, on rank 0; (0, 3) on the others."""
+        parts = self.to_root.send(self.weights @ v[: self.weights.shape[1]])
         points = np.zeros((self.total if self.comm.rank == 0 else 0, 3))
         first = 0
         for rows in self.received if self.comm.rank == 0 else ():  # in the order of the ranks: the same sum each time

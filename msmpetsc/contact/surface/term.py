@@ -83,7 +83,8 @@ class SurfaceContact:
         self.rubbing: list[Acting] = []
         self._hessians: dict[bool, tuple[ContactsAt, SurfaceHessian]] = {}  # with and without their negative parts
         if contacts.law.friction > 0:
-            moment, barrier = contacts.find(start), contacts.barrier
+            moment = contacts.find(start, contacts.begin)
+            barrier = contacts.barrier
             self.rubs = moment.count > 0
             if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
                 stick = contacts.law.stick * time_step
@@ -94,7 +95,9 @@ class SurfaceContact:
         moment = self.contacts.find(q)
         if moment.count == 0 and not self.rubs:
             return None
-        return moment if moment.points is not None else replace(moment, points=self.contacts.points(moment.q))
+        if moment.points is not None:
+            return moment
+        return replace(moment, points=self.contacts.points(moment.q, moment.time))
 
     def presses(self, q: Positions) -> bool:
         """Return whether it acts at q."""
@@ -108,7 +111,7 @@ class SurfaceContact:
         after, before = self._acting(q), self._acting(base)
         if after is None and before is None:
             return 0.0
-        moved = self.contacts.points(q - base)
+        moved = self.contacts.points.moved(q - base)
         if moved.size and np.abs(moved).max() < SMALL * self.contacts.law.distance:
             forces = filter(None, (self._forces(moment) for moment in (before, after) if moment))  # on rank 0
             return sum(0.5 * float(np.vdot(gradient, moved[touched])) for touched, gradient in forces)
@@ -137,9 +140,30 @@ class SurfaceContact:
         """Return on rank 0 the points (k,) that are pushed, and the gradient there (k, 3) [N]."""
         if self.contacts.barrier is None or moment.points is None:
             return None
-        forces = gradient_of(self._pushing(moment), moment.points) + gradient_of(self.rubbing, moment.points)
-        touched = np.flatnonzero(forces.any(axis=1))
+        forces = self._gradient(moment)
+        touched = np.flatnonzero(forces[: self.contacts.points.bodies].any(axis=1))
         return touched, forces[touched]
+
+    def _gradient(self, moment: ContactsAt) -> Rows:
+        """Return the gradient (total, 3) [N] on rank 0."""
+        assert moment.points is not None
+        return gradient_of(self._pushing(moment), moment.points) + gradient_of(self.rubbing, moment.points)
+
+    def of_obstacles(self, q: Positions) -> tuple[Rows, float]:
+        """Return the pushes of obstacles (k, 3) [N] on the bodies, and their work [J] in the step that ends at q.
+
+        They do it with the push of its end: where the energy is convex, no less is what the step adds to it.
+        """
+        moment = self._acting(q)
+        points, obstacles = self.contacts.points, self.contacts.obstacles
+        found = np.zeros((len(obstacles.numbers), 3)), 0.0
+        if obstacles.total and moment is not None:
+            if moment.points is not None and len(moment.points):
+                forces = self._gradient(moment)[points.bodies :]
+                way = obstacles.way(self.contacts.begin, self.contacts.time)
+                found = obstacles.sums(forces), float((forces * way).sum())
+            found = self.comm.bcast(found)
+        return found
 
     def hessian(self, q: Positions, projected: bool) -> SurfaceHessian | None:
         """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts."""
@@ -173,7 +197,8 @@ class SurfaceContact:
             return None
         parts = hessian_of([*self._pushing(moment), *self.rubbing], moment.points, projected)
         whole = csr_array(sum(parts))
-        touched = np.flatnonzero(np.diff(whole.indptr).reshape(-1, 3).any(axis=1))
+        rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
+        touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))
         numbers = (3 * touched[:, None] + np.arange(3)).ravel()
         return touched, csr_array(whole[numbers][:, numbers])
 

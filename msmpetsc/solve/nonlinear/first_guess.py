@@ -45,20 +45,25 @@ class FirstGuess:
     def _without_crossing(self, guess: Positions) -> Positions:
         """The guess, or as much of the way there, beside the body's own as a whole, as leads to no crossing.
 
-        Raises StepFailed where anchors alone lead the surface through itself.
+        Raises StepFailed where anchors and obstacles alone lead the surface through something.
         """
         functional, q = self.functional, self.functional.problem.q
-        share = functional.free_share(q, self._held(guess))
+        share = functional.free_share(q, self._held(guess), True)
         if share == 1.0:
             return guess
-        moved = guess - q
-        drift = self._drift(moved)
-        if functional.problem.prescribed is None:
+        assert functional.surface is not None
+        contacts, moved = functional.surface.contacts, guess - q
+        obstacles, ends = contacts.obstacles, (contacts.begin, contacts.time)
+        if functional.problem.prescribed is None and contacts.same(*ends):
+            drift = 0.0 if obstacles.total else self._drift(moved)
             return q + share * moved + (1 - share) * drift
-        if functional.free_share(q, self._held(q)) == 1.0:  # anchors move on at once
-            return q
+        for way in [0 * moved] if contacts.same(*ends) else [moved, 0 * moved]:  # what is led moves on at once
+            end = q + obstacles.carried(q, way, *ends, functional.lattice.cell_size)
+            if functional.free_share(q, self._held(end), True) == 1.0:
+                return end
         raise StepFailed(
-            'has anchors that lead the surface through itself; try safety.on_failure = "substep", or other paths',
+            "has anchors or obstacles that lead the surface through itself or lead it through them; "
+            'try safety.on_failure = "substep", or other paths',
             "contact",
         )
 

@@ -134,12 +134,15 @@ class StepFunctional:
         """What keeps the surface from crossing itself in this step, if anything does."""
         return self.problem.contact.surface if self.problem.contact else None
 
-    def free_share(self, base: Positions, q: Positions) -> float:
-        """Share, up to 1, of the straight way from base to q (l, 3) on which the surface does not meet itself."""
+    def free_share(self, base: Positions, q: Positions, with_obstacles: bool = False) -> float:
+        """Share, up to 1, of the straight way from base to q (l, 3) on which the surface meets nothing.
+
+        with_obstacles : these go from where the step begins to where they are at its end
+        """
         if self.surface is None:
             return 1.0
         with CONTACT:
-            return self.surface.contacts.free_share(base, q)
+            return self.surface.contacts.free_share(base, q, with_obstacles)
 
     def _inner(self, a: Rows, b: Rows) -> float:
         """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""

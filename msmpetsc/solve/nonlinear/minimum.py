@@ -22,7 +22,10 @@ CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may 
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
 DOUBTFUL = 30.0  # times what both say may be the error: 10 times were seen in a valley
 SLOPE = 0.25  # over what the curvature makes of it on the first move: less, as of a symmetric body, may be rounding
-FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
+FIRST_MOVE, MOVES = (
+    1e-3,
+    24,
+)  # off a saddle [cells]; doubled while g falls, or halved until it does
 
 
 @dataclass(frozen=True)
@@ -133,9 +136,13 @@ class Minimum:
             self.memory.write(self.f)[:] = self.memory.read(x) + move * direction
             q = functional.positions(self.f)
             change = functional.change(q, base)[0] if functional.free_share(base, q) == 1.0 else np.inf
-            if not change < lowest:
+            if change < lowest:
+                best, lowest = move, change
+                move *= 2
+            elif best == 0.0:
+                move /= 2
+            else:
                 break
-            best, lowest, move = move, change, 2 * move
         self.memory.write(x)[:] += best * direction
         return best != 0.0
 

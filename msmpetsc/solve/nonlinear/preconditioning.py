@@ -168,7 +168,9 @@ class LatticePreconditioner:
         """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
         if self.translations is None or contact is None:
             return self.translations is not None
-        if contact.surface and len(self.multigrid.bodies.free) > 1 and contact.surface.presses(q):
+        surface = contact.surface
+        alone = len(self.multigrid.bodies.free) == 1 and not (surface and surface.contacts.obstacles.total)
+        if surface and not alone and surface.presses(q):
             return False  # of one body alone it moves the middle no more than springs do
         pressed = any(len(nodes) for nodes, _ in contact.hessian(q, True))
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)

@@ -1,0 +1,168 @@
+"""Obstacles whose surface meets that of the bodies: nothing crosses at rest, pressed, turned, on one rank and two."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from block_scene import DENSITY, SIDES, G, block_scene, play
+from conftest import run
+from crossings import count_crossings
+from one_process import input_error
+
+from msmpetsc.build import Model
+from msmpetsc.contact.surface.obstacle_surfaces import ObstacleSurfaces
+from msmpetsc.fields import Frame
+from msmpetsc.results.reader import Result
+from msmpetsc.scene.reading import load_scene
+
+SOLID = {"young_modulus": 1e5, "density": DENSITY, "law": "neo-hookean", "poisson_ratio": 0.3, "damping": 5.0}
+FLOOR = {"shape": "box", "box": [[-1.03, -1.1, -0.2], [1.5, 1.6, -0.002]], "response": "barrier"}
+PLATE = {"shape": "box", "box": [[-0.2, -0.2, 0.26], [0.7, 0.7, 0.3]], "response": "barrier"}
+PLATE["path"] = [{"time": 0.5, "by": [0, 0, -0.06]}]
+FOOT = [{"region": {"box": [[-1, -1, -1], [1, 1, 0.01]]}}]
+WEIGHT = DENSITY * G * SIDES.prod()
+GRAVITY = {"acceleration": [0, 0, -G]}
+ERROR = {"preset": "newton", "error": 1e-4}
+pytestmark = pytest.mark.timeout(300)
+
+
+def fine_block(folder: Path, **tables) -> Path:
+    """A block whose surface has edges of 3 to 6 cm, about those of a cell."""
+    scene = block_scene(folder, **{"solver": ERROR, "material": SOLID, "output": {}} | tables)
+    block = trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide_to_size(0.1)
+    block.export(folder / "scene.ply")
+    return scene
+
+
+def surfaces(model: Model) -> ObstacleSurfaces:
+    assert model.collision is not None
+    return model.collision.points.obstacles
+
+
+def crossed(model: Model, frame: Frame) -> int:
+    """How many edges cross triangles, of body and obstacles as the model has them at a frame."""
+    obstacles, body = surfaces(model), model.surface
+    assert body is not None and frame.surface is not None
+    points, triangles, first = [frame.surface, obstacles.points_at(frame.time)], [body.triangles], len(body.points)
+    for solid in obstacles.solids:
+        triangles.append(solid.triangles + first)
+        first += len(solid.points)
+    return count_crossings(np.concatenate(points), np.concatenate(triangles))
+
+
+def test_a_block_comes_to_rest_on_a_floor_that_carries_its_weight(tmp_path: Path):
+    time = {"step": 0.02, "duration": 1.0}
+    scene = fine_block(tmp_path, time=time, obstacle=[FLOOR], gravity=GRAVITY)
+    model, frames = play(scene)
+    last = frames[-1]
+    assert not any(crossed(model, frame) for frame in frames)
+    assert last.push[0] == pytest.approx([0, 0, WEIGHT], abs=0.01 * WEIGHT)
+    np.testing.assert_allclose(last.contact_push[0], last.push[0], atol=1e-9 * WEIGHT)
+    assert 0 < last.self_distance < 3e-4 * np.linalg.norm(SIDES)
+    assert max(frame.energy_gained for frame in frames) < 1e-3 * last.elastic
+
+
+def test_a_plate_presses_a_block_that_is_held_at_its_foot(tmp_path: Path):
+    """Its step is many times the distance from which it pushes: what is near it is carried along."""
+    time = {"step": 0.05, "duration": 0.6}
+    model, frames = play(fine_block(tmp_path, time=time, obstacle=[PLATE], pin=FOOT))
+    assert not any(crossed(model, frame) for frame in frames)
+    last = frames[-1]
+    pressed = 0.05 / SIDES[2]  # at most: a little less by the distance
+    force = pressed * SOLID["young_modulus"] * SIDES[0] * SIDES[1]
+    assert force < -last.push[0, 2] < 2 * force  # stiffer, for its foot does not spread
+    assert last.reaction[0, 2] == pytest.approx(-last.push[0, 2], rel=0.01)
+
+
+def test_a_plate_turns_as_its_path_says_and_pushes_a_block_aside(tmp_path: Path):
+    box, center = [[0.55, 0.1, -0.1], [0.6, 0.4, 0.35]], [0.575, 1.0, 0.0]
+    plate = {"shape": "box", "box": box, "response": "barrier", "center": center}
+    plate["path"] = [{"time": 1.0, "by": [0, 0.1, 0], "turn": [0, 0, -90]}]
+    time = {"step": 0.02, "duration": 0.3}
+    model, frames = play(fine_block(tmp_path, time=time, obstacle=[plate]))
+    matrix = trimesh.transformations.rotation_matrix(-0.3 * np.pi / 2, [0, 0, 1], center)
+    expected = trimesh.transform_points(surfaces(model).solids[0].points, matrix) + np.array([0, 0.03, 0])
+    np.testing.assert_allclose(surfaces(model).points_at(0.3), expected, atol=1e-14)
+    assert not any(crossed(model, frame) for frame in frames)
+    assert frames[-1].momentum[0] < -1.0
+    assert sum(frame.products for frame in frames) < 15_000  # a body that an obstacle presses is not free to move away
+    assert max(frame.energy_gained for frame in frames) < 0.01 * frames[-1].kinetic
+
+
+@pytest.mark.parametrize("shape", ["sphere", "mesh"])
+def test_a_ball_and_a_mesh_stop_what_falls_on_them(tmp_path: Path, shape: str):
+    ball = {"shape": "sphere", "center": [0.25, 0.25, -0.31], "radius": 0.3, "response": "barrier"}
+    if shape == "mesh":
+        trimesh.creation.icosphere(radius=0.3).apply_translation(ball.pop("center")).export(tmp_path / "ball.ply")
+        ball = {"shape": "mesh", "mesh": {"source": "ball.ply"}, "response": "barrier"}
+    time = {"step": 0.02, "duration": 0.4}
+    scene = fine_block(tmp_path, time=time, obstacle=[ball], gravity=GRAVITY)
+    model, frames = play(scene)
+    assert not any(crossed(model, frame) for frame in frames)
+    assert frames[-1].self_contacts > 0 and frames[-1].push[0, 2] > 0.1 * WEIGHT
+
+
+@pytest.mark.parametrize("response", ["barrier", "penalty"])
+def test_a_ball_pressed_into_a_hole_stays_on_its_rim(tmp_path: Path, response: str):
+    """Which is met by edges: nodes alone let it in."""
+    trimesh.creation.annulus(0.045, 0.12, 0.06, sections=24).export(tmp_path / "washer.ply")
+    washer = {"shape": "mesh", "mesh": {"source": "washer.ply", "base": [0, 0, -0.0605]}, "response": response}
+    everywhere = {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}
+    pressed = {"region": everywhere, "total": [0, 0, -20.0]}
+    time = {"step": 0.01, "duration": 0.1}
+    scene = fine_block(tmp_path, time=time, obstacle=[washer], force=[pressed], cages={"count": 150})
+    ball = trimesh.creation.icosphere(3, 0.06)
+    ball.apply_translation([0, 0, 0.042]).export(tmp_path / "scene.ply")
+    model, frames = play(scene)
+    ring = trimesh.load(tmp_path / "washer.ply").apply_translation([0, 0, -0.0305])
+    triangles = np.concatenate([model.surface.triangles, ring.faces + len(model.surface.points)])
+    crossing = [count_crossings(np.concatenate([frame.surface, ring.vertices]), triangles) for frame in frames]
+    assert (max(crossing) == 0) == (response == "barrier")
+    assert 5 < frames[-1].push[0, 2] < 60
+
+
+def test_ranks_agree(tmp_path: Path):
+    tables = {"self_contact": {"friction": 0.5}, "solver": ERROR | {"error": 1e-8}}
+    ball = {
+        "shape": "sphere",
+        "center": [0.23, 0.28, 0.36],
+        "radius": 0.1,
+        "response": "barrier",
+        "path": PLATE["path"],
+    }
+    scene = fine_block(tmp_path, time={"step": 0.05, "duration": 0.5}, obstacle=[ball], pin=FOOT, **tables)
+    ends = []
+    for ranks in (1, 2):
+        path = tmp_path / f"{ranks}.h5"
+        run(ranks, "-m", "msmpetsc", "run", scene, "-o", path, status=0)
+        with Result(path) as result:
+            ends.append((result.frames.position[-1], result.frames.push[-1] / WEIGHT))
+    assert ends[0][1][0, 2] < -0.1
+    for one, two in zip(*ends, strict=True):
+        np.testing.assert_allclose(two, one, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"box": [[-1, -1, -0.2], [1.5, 1.5, 0.01]]}, "obstacle: one of the barrier cuts a body at rest, at ("),
+        ({"box": [[-1, -1, -0.2], [1.5, 1.5, -1e-9]]}, "from a body at rest"),
+        (
+            {"response": "penalty", "path": [{"time": 1.0, "turn": [0, 0, 90]}]},
+            'has a path that turns, which is for response = "barrier" with a center',
+        ),
+        ({"path": [{"time": 1.0, "turn": [0, 0, 90]}]}, 'turns, which is for response = "barrier" with a center'),
+        ({"start": 0.1}, "that are there from the start"),
+        ({"stop": 0.1}, "has stop, which is for"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, changes: dict, expected: str):
+    scene = fine_block(tmp_path, time={"step": 0.02, "duration": 0.2}, obstacle=[FLOOR | changes])
+    assert expected in input_error(lambda: play(scene))
+
+
+def test_explicit_steps_refuse_it(tmp_path: Path):
+    time = {"step": 0.02, "duration": 0.2, "integrator": "verlet"}
+    scene = fine_block(tmp_path, time=time, obstacle=[FLOOR])
+    assert 'obstacle: with response = "barrier"' in input_error(lambda: load_scene(scene))

@@ -5,11 +5,6 @@ import sys
 
 import bench
 
-
-def main() -> int:
-    sys.argv.insert(1, "--gpu")
-    return bench.main()
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.argv.insert(1, "--gpu")
+    sys.exit(bench.main())

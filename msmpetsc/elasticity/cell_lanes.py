@@ -15,9 +15,7 @@ from msmpetsc.elasticity.springs import Four, Vector
 from msmpetsc.lattice.cell_moments import FORM
 
 LANES = 8
-ROWS = (
-    FORM + 2
-)  # of a cell's constants: its form, the modes' part times m = mu V / (16 h^2), then m and lambda V / (16 h^2)
+ROWS = FORM + 2  # of a cell's constants: its form, modes times m = mu V / (16 h^2); m; lambda V / (16 h^2)
 STATE = 11  # F by rows, V U' / (16 h^2), V U'' / (16 h^2)
 BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of VTK's order, x fastest, then y
 

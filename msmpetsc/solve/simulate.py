@@ -104,9 +104,7 @@ class TimeLoop:
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
         points = [probe.point for probe in scene.output.probe]
-        self.probe = (
-            ProbePoints(comm, model.lattice, points) if points else None
-        )  # or refused, before PETSc has objects
+        self.probe = ProbePoints(comm, model.lattice, points) if points else None  # may refuse: no PETSc objects yet
         self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
         swings = scene.time.integrator != "implicit-euler"
         checks = scene.safety.checks

@@ -22,10 +22,7 @@ CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may 
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
 DOUBTFUL = 30.0  # times what both say may be the error: 10 times were seen in a valley
 SLOPE = 0.25  # over what the curvature makes of it on the first move: less, as of a symmetric body, may be rounding
-FIRST_MOVE, MOVES = (
-    1e-3,
-    24,
-)  # off a saddle [cells]; doubled while g falls, or halved until it does
+FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled while g falls, or halved until it does
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,6 @@ ON_RANKS = """
 import sys
 import numpy as np
 import msmpetsc as msm
-from msmpetsc.app import summary
 from mpi4py import MPI
 for _ in range(2):
     try:

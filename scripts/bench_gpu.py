@@ -3,8 +3,9 @@
 
 import sys
 
-import bench
+from bench import main
+
+sys.argv.insert(1, "--gpu")
 
 if __name__ == "__main__":
-    sys.argv.insert(1, "--gpu")
-    sys.exit(bench.main())
+    sys.exit(main())

@@ -55,20 +55,23 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
     return np.concatenate([2 * middle, 4 * products, own, coupled, 16 * (x * y + x * z + y * z)[:, None]], axis=1)
 
 
+def _slopes(forms: Rows, sums: Rows) -> tuple[Rows, Rows, Rows]:
+    """Return 4 h times the mean slopes (c, k) along x, y and z of values, by their seven sums (7, c or 1, k)."""
+    (cx, cy, cz), (xy, xz, yz) = forms[:, :3].T[:, :, None], forms[:, 3:6].T[:, :, None]
+    x, y, z, of_xy, of_xz, of_yz, of_xyz = sums
+    return (
+        x + (cy * of_xy + cz * of_xz + yz * of_xyz),
+        y + (cx * of_xy + cz * of_yz + xz * of_xyz),
+        z + (cx * of_xz + cy * of_yz + xy * of_xyz),
+    )
+
+
 def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:
     """Return, of corner values, 4 times the mean slopes (c, 3, 8) of cells in cell units, and their modes (c, 4, 8)."""
-    (cx, cy, cz), (xy, xz, yz), (f_xy, f_xz, f_yz, f_xyz) = forms[:, :3].T, forms[:, 3:6].T, SUMS[3:]
-
-    def plus(base: Floats, *terms: tuple[Floats, Floats]) -> Rows:
-        return base + sum(np.multiply.outer(factor, sums) for factor, sums in terms)
-
-    slopes = (
-        plus(SUMS[0], (cy, f_xy), (cz, f_xz), (yz, f_xyz)),
-        plus(SUMS[1], (cx, f_xy), (cz, f_yz), (xz, f_xyz)),
-        plus(SUMS[2], (cx, f_xz), (cy, f_yz), (xy, f_xyz)),
-    )
-    modes = plus(f_xy, (cz, f_xyz)), plus(f_xz, (cy, f_xyz)), plus(f_yz, (cx, f_xyz)), plus(f_xyz, (0 * cx, f_xyz))
-    return np.stack(slopes, axis=1), np.stack(modes, axis=1)
+    cx, cy, cz = forms[:, :3].T[:, :, None]
+    of_xyz = SUMS[6]
+    modes = SUMS[3] + cz * of_xyz, SUMS[4] + cy * of_xyz, SUMS[5] + cx * of_xyz, of_xyz + 0 * cx
+    return np.stack(_slopes(forms, SUMS[:, None]), axis=1), np.stack(modes, axis=1)
 
 
 def volume_ratios(forms: Rows, corners: Rows, cell_size: float) -> Floats:
@@ -76,12 +79,8 @@ def volume_ratios(forms: Rows, corners: Rows, cell_size: float) -> Floats:
 
     corners : (c, 8, 3) positions [m]
     """
-    (cx, cy, cz), (xy, xz, yz) = forms[:, :3, None].transpose(1, 0, 2), forms[:, 3:6, None].transpose(1, 0, 2)
-    sums = (SUMS @ corners.transpose(1, 0, 2).reshape(8, -1)).reshape(7, -1, 3)
-    along_x = sums[0] + cy * sums[3] + cz * sums[4] + yz * sums[6]
-    along_y = sums[1] + cx * sums[3] + cz * sums[5] + xz * sums[6]
-    along_z = sums[2] + cx * sums[4] + cy * sums[5] + xy * sums[6]
-    ratios: Floats = (along_x * np.cross(along_y, along_z)).sum(axis=1) / (4 * cell_size) ** 3
+    x, y, z = _slopes(forms, (SUMS @ corners.transpose(1, 0, 2).reshape(8, -1)).reshape(7, -1, 3))
+    ratios: Floats = (x * np.cross(y, z)).sum(axis=1) / (4 * cell_size) ** 3
     return ratios
 
 

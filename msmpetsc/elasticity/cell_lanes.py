@@ -113,11 +113,11 @@ def corner_strain(w: Floats, a: int, lane: int) -> Seven:
 
 
 @numba.njit(cache=True, inline="always")
-def gather(nodes: Indices, b: int, q: Rows, w: Floats) -> None:
+def gather(nodes: Indices, b: int, q: Rows, w: Floats, at: int = 0) -> None:
     for lane in range(LANES):
         for a in range(8):
-            i = nodes[b, lane, a]
-            w[24 * a + lane], w[24 * a + 8 + lane], w[24 * a + 16 + lane] = q[i, 0], q[i, 1], q[i, 2]
+            i, k = nodes[b, lane, a], at + 24 * a + lane
+            w[k], w[k + 8], w[k + 16] = q[i, 0], q[i, 1], q[i, 2]
 
 
 @numba.njit(cache=True, inline="always")

@@ -34,9 +34,11 @@ from msmpetsc.elasticity.cell_lanes import (
     CONSTANTS,
     FAST,
     LANES,
+    RESULT,
     STATE,
     WORK,
     Blocks,
+    Seven,
     corner_strain,
     gather,
     in_blocks,
@@ -143,14 +145,19 @@ def _borne(f: Nine, j: float, slope: float, least: float) -> float:
 
 
 @numba.njit(cache=True, inline="always")
-def gradient_of(w: Floats, lane: int, over: float) -> Nine:
-    """Return F of a lane whose corners' positions are in the work array; ``over`` is 1 / (4 h)."""
-    a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
+def scaled(x: Seven, y: Seven, z: Seven, over: float) -> Nine:
+    """Return the mean slopes of three components' strains; ``over`` is 1 / (4 h)."""
     return (
-        over * a[0], over * a[1], over * a[2],
-        over * b[0], over * b[1], over * b[2],
-        over * c[0], over * c[1], over * c[2],
+        over * x[0], over * x[1], over * x[2],
+        over * y[0], over * y[1], over * y[2],
+        over * z[0], over * z[1], over * z[2],
     )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def gradient_of(w: Floats, lane: int, over: float) -> Nine:
+    """Return F of a lane whose corners' positions are in the work array."""
+    return scaled(strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane), over)
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -251,14 +258,20 @@ def linearise(blocks: Blocks, h4: float, q: Positions, projected: bool, state: R
 
 
 @numba.njit(cache=True, inline="always")
-def _quadratic(w: Floats, other: Floats, lane: int) -> float:
-    """Return the inner product of two lanes' strains in the form that mu has: mean slopes and modes, times m."""
-    total, m = 0.0, w[CONSTANTS + 104 + lane]
-    for k in range(3):
-        a, b = strain(w, 8 * k, lane), strain(other, 8 * k, lane)
-        x, y, z, v = modes_forces(w, lane, b[3], b[4], b[5], b[6])
-        total += m * (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) + a[3] * x + a[4] * y + a[5] * z + a[6] * v
-    return total
+def _quadratic(w: Floats, lane: int, a: Seven, b: Seven) -> float:
+    """Return the inner product of two strains of a component, slopes and modes, in the form that mu has."""
+    x, y, z, v = modes_forces(w, lane, b[3], b[4], b[5], b[6])
+    m: float = w[CONSTANTS + 104 + lane]
+    return m * (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) + a[3] * x + a[4] * y + a[5] * z + a[6] * v
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _energy_lanes(w: Floats, over: float) -> None:
+    for lane in range(LANES):
+        x, y, z = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
+        f, s = scaled(x, y, z, over), AT_STATE + lane
+        w[s] = determinant(f, cofactors(f))
+        w[s + 8] = 0.5 * (_quadratic(w, lane, x, x) + _quadratic(w, lane, y, y) + _quadratic(w, lane, z, z))
 
 
 @numba.njit(cache=True)
@@ -268,11 +281,35 @@ def cell_energies(blocks: Blocks, h4: float, q: Positions, energies: Rows) -> No
     for b in range(len(energies)):
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        for lane in range(LANES):
-            f, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
-            j = determinant(f, cofactors(f))
-            volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
-            energies[b, lane] = 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
+        _energy_lanes(w, 1.0 / h4)
+        for lane in range(LANES):  # logarithms, which are no lanes'
+            s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
+            volume = _volume_energy(w[s], m, lame) if m > 0.0 else 0.0
+            energies[b, lane] = w[s + 8] + h4 * h4 * (volume - 1.5 * m)
+
+
+@numba.njit(cache=True, inline="always")
+def _between(a: Seven, b: Seven) -> Seven:
+    """Return b + a / 2."""
+    return (
+        b[0] + 0.5 * a[0], b[1] + 0.5 * a[1], b[2] + 0.5 * a[2],
+        b[3] + 0.5 * a[3], b[4] + 0.5 * a[4], b[5] + 0.5 * a[5], b[6] + 0.5 * a[6],
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _change_lanes(w: Floats, over: float) -> None:
+    for lane in range(LANES):
+        a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
+        x, y, z = strain(w, RESULT, lane), strain(w, RESULT + 8, lane), strain(w, RESULT + 16, lane)
+        d, f, s = scaled(a, b, c, over), scaled(x, y, z, over), AT_STATE + lane
+        n, n_d = cofactors(f), cofactors(d)
+        w[s], w[s + 8] = determinant(f, n), _inner(n, d) + _inner(f, n_d) + determinant(d, n_d)
+        w[s + 16] = (
+            _quadratic(w, lane, a, _between(a, x))
+            + _quadratic(w, lane, b, _between(b, y))
+            + _quadratic(w, lane, c, _between(c, z))
+        )
 
 
 @numba.njit(cache=True)
@@ -281,20 +318,17 @@ def elastic_change(blocks: Blocks, owned: int, h4: float, q: Positions, base: Po
 
     With D the change of F_0, J - J_0 = cof F_0 : D + F_0 : cof D + det D.
     """
-    moved, mean = q - base, 0.5 * (q + base)
-    w, w_mean, w_base, change = np.zeros(WORK), np.zeros(WORK), np.zeros(WORK), 0.0
+    moved, w, change = q - base, np.zeros(WORK), 0.0
     for b in range(owned):
-        for values, work in ((moved, w), (mean, w_mean), (base, w_base)):
-            gather(blocks.nodes, b, values, work)
-            load(blocks.constants, blocks.which[b], work, CONSTANTS)
+        gather(blocks.nodes, b, moved, w)
+        gather(blocks.nodes, b, base, w, RESULT)
+        load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _change_lanes(w, 1.0 / h4)
         for lane in range(LANES):
-            d, f, m = gradient_of(w, lane, 1.0 / h4), gradient_of(w_base, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
-            n, n_d = cofactors(f), cofactors(d)
-            before = determinant(f, n)
-            more = _inner(n, d) + _inner(f, n_d) + determinant(d, n_d)
+            s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
+            before, more = w[s], w[s + 8]
             if m > 0.0:
-                volume = _volume_change(before + more, before, more, m, w[CONSTANTS + 112 + lane])
-                change += _quadratic(w, w_mean, lane) + h4 * h4 * volume
+                change += w[s + 16] + h4 * h4 * _volume_change(before + more, before, more, m, lame)
     return change
 
 

@@ -148,6 +148,7 @@ CHECKPOINT = {  # two slots, of which the one with the greater step holds
     "history_q": Field("f8", (2, "n", 3), "m", "positions that BDF2 looks back to"),
     "history_v": Field("f8", (2, "n", 3), "m/s", "velocities that BDF2 looks back to"),
     "lowest_mode": Field("f8", (2, "n", 3), "kg^-1/2", "mode of the least curvature"),
+    "loads": Field("f8", (2, "n"), "-", "compression of nodes that the load factor was found at"),
     "sides": Field("f8", (2, "n", "o"), "1", "side of a thin obstacle on which a node is"),
 }
 GROUPS = {

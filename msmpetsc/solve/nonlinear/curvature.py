@@ -1,11 +1,18 @@
 """Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
 
 F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H
-is positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is
-looked for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev
+is positive definite for certain, which one pass over the springs tells.
+
+Elsewhere the load factor nu may say so, the greatest with H v = (1 - nu) H+ v, H+ the projected Hessian, which has
+nothing negative and all of M: no eigenvalue of M^(-1) H is below 1 - nu. It is 1 where a body buckles, and grows as
+what presses the body does (linear buckling analysis), so that one that was found serves for many steps. Where it is not
+small the lowest eigenvalue of M^(-1) H is looked for: at length when the body is compressed anew or more than it was,
+or something showed a negative curvature; at all other steps the mode found last is followed in a few iterations, with
+multigrid only where its curvature changed.
+
+Both are found by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev
 2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1); with Jacobi's a single direction was seen to settle
-on the third. At length when the body is compressed anew or more than it was, or something showed a negative curvature;
-at all other steps the mode found last is followed in a few iterations, with multigrid only where its curvature changed.
+on the third.
 """
 
 from collections.abc import Callable
@@ -32,7 +39,8 @@ ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
 
-Block = tuple[Rows, Rows]  # directions (k, n), and what H makes of them
+Block = tuple[Rows, ...]  # directions (k, n), what H makes of them, and what M or the projected Hessian does
+Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
 
 
 class Alarm(IntEnum):
@@ -57,6 +65,11 @@ EFFORT = SearchEffort(4, 12, 2)
 # curvature of 0.04, and seemed to have 0.35.
 UNIFORM_EFFORT = SearchEffort(2, 2, 1)
 UNCHANGED = 0.1  # of its curvature: a mode that is followed by multigrid is taken as it is
+LIGHT = 0.5  # load factor: up to there no mode need be known
+LOADED = 3  # iterations of its search; one less where a mode is known
+UNSEEN = 1.2  # times the load factor that a few iterations find, which is no more than the true one
+GROWN = 4.0  # times the compression that it was found at: so far a body is taken to be loaded alike
+NEGLIGIBLE = 0.3  # of the greatest compression: nodes of less do not say how it has grown
 
 
 @dataclass(frozen=True)
@@ -90,7 +103,7 @@ class LowestCurvature:
     preconditioner : of the step's linear solves, or multigrid for a long search
     """
 
-    state: ClassVar[dict[str, Range]] = {"searched": ANY, "value": ANY, "knows_mode": (0, 1)}
+    state: ClassVar[dict[str, Range]] = {"searched": ANY, "value": ANY, "knows_mode": (0, 1), "load": ANY}
 
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
@@ -102,6 +115,11 @@ class LowestCurvature:
         self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
         self.value = 0.0  # its curvature when it was found
         self.knows_mode = False  # in the last checkpoint
+        self.projected = TrueHessian(self.unknowns, functional.elasticity, functional.time_step, hessian.contact)
+        self.load = np.inf  # load factor found last; infinite where none was
+        self.loads = np.zeros_like(functional.lattice.mass[self.unknowns.free])  # compression (m,) that it was found at
+        self.load_mode: Floats | None = None  # and its mode (n,)
+        self.ratios = np.empty(0)  # compression (m,) of the free nodes, at the positions asked for last
         self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         self.rigid: Rows | None = None  # motions (6, n) that are left out
 
@@ -121,7 +139,7 @@ class LowestCurvature:
         concavity = elasticity.concavity(q)[free]
         if functional.surface:
             concavity = concavity + functional.surface.concavity(q)[free]
-        ratios = functional.t2 * concavity / functional.lattice.mass[free]
+        self.ratios = ratios = functional.t2 * concavity / functional.lattice.mass[free]
         gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)
         known = Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
@@ -130,15 +148,23 @@ class LowestCurvature:
 
     def lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
-    ) -> tuple[float, Floats]:
+    ) -> tuple[float, Floats | None]:
         """Lowest eigenvalue of M^(-1) H that a search comes to, and a direction (n,) of about that curvature.
+
+        Or a positive number that it is no less than, and None, where the load factor is small.
 
         q       : positions (l, 3) [m] that H was linearised at last
         hint    : a direction that may have part in it
         """
         products = self.hessian.products + self.preconditioner.products
-        values, modes = self._lowest(q, compression, alarm, hint)
+        is_known = not (alarm or compression.resists or self.unknowns.static)
+        least = 1 - self._load(q) if is_known else 0.0
+        found = None if least >= 1 - LIGHT else self._lowest(q, compression, alarm, hint)
         self.products += self.hessian.products + self.preconditioner.products - products
+        if found is None:
+            self.searched = NONE  # so that a body that is loaded more has a long search
+            return least, None
+        values, modes = found
         if not np.isfinite(values[0]):  # springs of no length: from a cusp any way leads down
             self.mode = None
             return -np.inf, self._random(1)[0]
@@ -164,6 +190,31 @@ class LowestCurvature:
             with self.preconditioner.searching(q, self.functional.problem.contact):
                 found = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
         return found
+
+    def _load(self, q: Positions) -> float:
+        """The load factor at positions q (l, 3) [m], at the most: as far as the body is loaded as it was when that was
+        found, it grows as the compression does."""
+        floor = NEGLIGIBLE * self.comm.allreduce(greatest(self.loads), MPI.MAX)
+        growth = np.inf if floor == 0.0 else greatest(self.ratios / np.maximum(self.loads, floor))
+        growth = self.comm.allreduce(growth, MPI.MAX)
+        load: float = UNSEEN * self.load * growth
+        is_heavy = MORE * UNSEEN * self.load > LIGHT  # so nearly that a search would soon be due again
+        if not np.isfinite(load) or (not is_heavy and (growth > GROWN or load > LIGHT)):
+            with self.preconditioner.searching(q, self.functional.problem.contact):
+                self.load = self._load_factor(q) if self.preconditioner.is_uniform else np.inf
+            self.loads, load = self.ratios, UNSEEN * self.load
+        return load
+
+    def _load_factor(self, q: Positions) -> float:
+        """The greatest nu with H v = (1 - nu) H+ v, H+ the projected Hessian, found by a few iterations."""
+        self.projected.linearise(q, self.functional.problem.contact, True)
+        known = [] if self.load_mode is None else [self.load_mode[None]]
+        start = np.concatenate([*known, self._random(2 - len(known))])
+        values, modes = self._iterate(start, 2, MOST, LOADED - len(known), self.projected.mult)
+        self.load_mode = modes[0].copy()
+        self.hessian.products += self.projected.products
+        self.projected.products = 0
+        return 1 - float(values[0])
 
     def _followed(self) -> tuple[Floats, Rows] | None:
         """Lowest curvatures, and their modes, near the mode found last. None where none is known, or where it has
@@ -202,21 +253,20 @@ class LowestCurvature:
         random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
         return self._unit(self._of_each(self.preconditioner.apply, like(self.functional.mass, random)))
 
-    def _iterate(self, start: Rows, block: int, most: int, least: int) -> tuple[Floats, Rows]:
+    def _iterate(self, start: Rows, block: int, most: int, least: int, weigh: Act | None = None) -> tuple[Floats, Rows]:
         """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l,
-        n), and theirs (k, n)."""
-        size, mass = min(block, len(start)), self.functional.mass
-        values, (x, last) = self._ritz((start, self._of_each(self.hessian.mult, start)), size)
+        n), and theirs (k, n). They are of W^(-1) H, W what ``weigh`` applies, M if None."""
+        size = min(block, len(start))
+        values, (x, last) = self._ritz(self._block(start, weigh), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
-            residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
+            residuals = x[1] - like(start, values)[:, None] * x[2]
             sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
             self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
             residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])  # so that float32 holds them
             w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
-            blocks = [x, (w, self._of_each(self.hessian.mult, w)), *([] if last is None else [last])]
-            span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-            values, (x, last) = self._ritz((span, products), size)
+            blocks = [x, self._block(w, weigh), *([] if last is None else [last])]
+            values, (x, last) = self._ritz(tuple(np.concatenate(parts) for parts in zip(*blocks, strict=True)), size)
             lowest.append(values[0])
             self.its += len(w)
             if lowest[-1] < 0:
@@ -226,25 +276,33 @@ class LowestCurvature:
                 break
         return values, x[0]
 
+    def _block(self, directions: Rows, weigh: Act | None) -> Block:
+        weighed = directions * self.functional.mass if weigh is None else self._of_each(weigh, directions)
+        return directions, self._of_each(self.hessian.mult, directions), weighed
+
     def _ritz(self, block: Block, size: int) -> tuple[Floats, tuple[Block, Block | None]]:
-        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and
-        of each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
-        span, products = block
-        own = [span @ products.T, (span * self.functional.mass) @ span.T]
-        grams = self.comm.allreduce(np.stack([to_host(gram) for gram in own]))
-        sizes, parts = np.linalg.eigh(grams[1])
+        """The lowest eigenvalues in the span of a block, ascending (size,); their directions, of unit length, and of
+        each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
+        span, products, weighed = block
+        grams = self.comm.allreduce(np.stack([to_host(span @ products.T), to_host(span @ weighed.T)]))
+        lengths = np.sqrt(np.maximum(grams[1].diagonal(), TINY))
+        grams = grams / lengths / lengths[:, None]
+        sizes, parts = np.linalg.eigh(0.5 * (grams[1] + grams[1].T))
         kept = sizes > DEPENDENT * max(sizes[-1], TINY)
         parts = parts[:, kept] / np.sqrt(sizes[kept])
         values, turns = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
-        parts = (parts @ turns)[:, :size].T
+        parts = (parts @ turns)[:, :size].T / lengths
         on_device = like(span, parts)
-        best = on_device @ span, on_device @ products
+        best = tuple(on_device @ rows for rows in block)
         if len(span) <= size:
             return values[:size], (best, None)
         rest = like(span, parts[:, size:])
-        moved = rest @ span[size:]
-        lengths = like(span, np.maximum(self._lengths(moved), TINY))[:, None]
-        return values[:size], (best, (moved / lengths, rest @ products[size:] / lengths))
+        return values[:size], (best, self._scaled(tuple(rest @ rows[size:] for rows in block)))
+
+    def _scaled(self, block: Block) -> Block:
+        """A block whose directions have unit length in the norm of M."""
+        lengths = like(block[0], np.maximum(self._lengths(block[0]), TINY))[:, None]
+        return tuple(rows / lengths for rows in block)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal
@@ -269,7 +327,7 @@ class LowestCurvature:
         parts = self.comm.allreduce(to_host((directions * self.functional.mass) @ self.rigid.T))
         return directions - like(directions, parts) @ self.rigid
 
-    def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: Rows) -> Rows:
+    def _of_each(self, act: Act, directions: Rows) -> Rows:
         source, product = self.vectors
         results = np.empty_like(directions)
         for direction, result in zip(directions, results, strict=True):
@@ -293,7 +351,9 @@ class LowestCurvature:
         self.knows_mode = self.mode is not None
         if self.mode is not None:
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
-        checkpoint.keep({"lowest_mode": rows})
+        loads = np.zeros_like(self.functional.lattice.mass)
+        loads[self.unknowns.free] = self.loads
+        checkpoint.keep({"lowest_mode": rows, "loads": loads})
         checkpoint.keep_counts(self)
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -302,9 +362,13 @@ class LowestCurvature:
         if self.knows_mode:
             rows = like(self.functional.mass, checkpoint.row("lowest_mode"))
             self.mode = rows[self.unknowns.free].T.ravel()
+        self.loads = like(self.functional.mass, checkpoint.row("loads"))[self.unknowns.free]
 
-    def forget(self) -> None:
-        self.searched, self.mode = NONE, None
+    def forget(self, modes: bool = True) -> None:
+        """Forget what a checkpoint does not hold; ``modes``: all else, too."""
+        self.load_mode = None
+        if modes:
+            self.searched, self.mode, self.load = NONE, None, np.inf
 
     def destroy(self) -> None:
         for vector in self.vectors:

@@ -216,8 +216,7 @@ class Stepper:
         """Forget what earlier steps showed, so that the next step does not depend on it; modes: the lowest mode too."""
         for part in (self.first_guess, self.control, self.jacobian.preconditioner):
             part.forget()
-        if modes:
-            self.minimum.curvature.forget()
+        self.minimum.curvature.forget(modes)
 
     def work_so_far(self) -> Work:
         """Work of all steps so far, of their estimates and searches for negative curvature."""

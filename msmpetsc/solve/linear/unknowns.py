@@ -42,6 +42,7 @@ class Unknowns:
         self.inertia = np.zeros_like(lattice.mass) if static else lattice.mass
         self.ballast = BALLAST * lattice.mass if static else lattice.mass
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
+        self.rows = self.free.astype(np.uint32)  # for kernels, which need not look whether a number is negative
         self.size = len(self.free)
         first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]  # an Intracomm
         self.total = comm.allreduce(self.size)
@@ -84,7 +85,7 @@ class Unknowns:
         if self.has_ghosts:
             with GHOSTS:
                 self.scatter.scatter(vector, self.ghost_values)
-        _spread(self.size, self.columns(vector), self.free, nodes)
+        _spread(self.size, self.columns(vector), self.rows, nodes)
         if len(self.free_ghosts):
             nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
 
@@ -94,11 +95,11 @@ class Unknowns:
 
     def collect(self, nodes: Rows, columns: Rows) -> None:
         """Write the free owned rows of ``nodes`` (>= owned, 3) into ``columns`` (3, m)."""
-        _collect(self.size, nodes, self.free, columns)
+        _collect(self.size, nodes, self.rows, columns)
 
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
-        _scaled_sum(self.size, self.inertia, a, t2, b, self.free, self.columns_to_write(vector))
+        _scaled_sum(self.size, self.inertia, a, t2, b, self.rows, self.columns_to_write(vector))
 
     def destroy(self) -> None:
         """Collective."""

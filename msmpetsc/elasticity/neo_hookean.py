@@ -21,13 +21,14 @@ Whole cells of one material share their constants; a Hessian keeps F, U' and U''
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, greatest
 from msmpetsc.elasticity.cell_lanes import (
     AT_STATE,
     BY_AXIS,
@@ -35,6 +36,7 @@ from msmpetsc.elasticity.cell_lanes import (
     FAST,
     LANES,
     RESULT,
+    ROWS,
     STATE,
     WORK,
     Blocks,
@@ -49,7 +51,6 @@ from msmpetsc.elasticity.cell_lanes import (
     strain,
     write_forces,
 )
-from msmpetsc.elasticity.springs import Product
 from msmpetsc.lattice.lattice import Lattice
 
 ONSET = 0.2  # J_0: below it U is a parabola
@@ -443,6 +444,22 @@ def _add_block(
 
 
 @dataclass(frozen=True)
+class CellHessians:
+    """Hessians of cells, as ``linearise`` leaves them in ``state``: what adds their product with v [N]."""
+
+    blocks: Blocks
+    state: Array
+
+    def __call__(self, v: Array, product: Array) -> None:
+        add_product(*self.blocks, self.state, v, product)
+
+    @property
+    def slopes(self) -> Array:
+        """V U' (b, LANES) of the cells, to be read or written: by it a cell's J bends with F."""
+        return self.state[:, 9 * LANES : 10 * LANES]
+
+
+@dataclass(frozen=True)
 class NeoHookean:
     """The cells around this rank's nodes, those that it owns first: what Elasticity asks of a law.
 
@@ -480,6 +497,23 @@ class NeoHookean:
         """Corner nodes (c, 8) of the cells that this rank owns, in the order of its blocks."""
         return self.blocks.nodes[: self.owned].reshape(-1, 8)
 
+    @property
+    def stiffest(self) -> float:
+        """The greatest lambda of a cell, in mu."""
+        mu, lame = self.blocks.constants.reshape(-1, ROWS, LANES)[:, -2:].swapaxes(0, 1)
+        return float(greatest(lame / np.where(mu > 0, mu, 1.0)))
+
+    @contextmanager
+    def softened(self, ratio: float) -> Iterator[None]:
+        """Take no lambda for more than ``ratio`` mu meanwhile."""
+        mu, lame = self.blocks.constants.reshape(-1, ROWS, LANES)[:, -2:].swapaxes(0, 1)
+        true = lame.copy()
+        np.minimum(true, ratio * mu, out=lame)
+        try:
+            yield
+        finally:
+            lame[:] = true
+
     def energy(self, q: Positions) -> float:
         """Return E [J] of the cells that this rank owns."""
         energies = np.empty((self.owned, LANES))
@@ -504,10 +538,10 @@ class NeoHookean:
         linearise(self.blocks, self.h4, q, projected, state)
         return state
 
-    def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
+    def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> "CellHessians":
         """Return what adds (Hessian of E at q) v [N] to its second argument."""
         constants: Rows = self.blocks.constants.astype(dtype, copy=False)
-        return partial(add_product, self.blocks.nodes, self.blocks.which, constants, self.state(q, projected, dtype))
+        return CellHessians(self.blocks._replace(constants=constants), self.state(q, projected, dtype))
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add the diagonal blocks of the projected Hessian to ``blocks`` (l, 9) [N/m]: an eighth of what bounds it."""

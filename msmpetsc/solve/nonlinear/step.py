@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.backend.arrays import Array, Positions, Rows
 from msmpetsc.comm import Stop
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError, StepStopped
@@ -92,6 +92,7 @@ class Stepper:
     touches: bool = False  # whether steps may have a ``contact``
     prefix: str = ""  # of its PETSc options
     static: bool = False  # what is looked for is an equilibrium: M weighs errors and nothing else
+    softer: float = 9.0  # how far |F| may rise at first; then lambda, from one solid that leads on to the next
     observer: Callable[[Positions], None] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -100,12 +101,16 @@ class Stepper:
             self.budget = self.preset.iterations or 0
         self.projected = False  # whether newton's Hessian is, at the moment
         self.outcome = Outcome()  # of the solve in progress, as its last iterate has it
+        self.is_first, self.begun = False, np.inf  # iteration, of which softer solids may follow; |F| before it
+        self.slopes: Array | None = None  # V U' of a softer solid, for the next Hessian
         self.iterations = 0  # of all steps so far
         self.base = np.empty_like(self.lattice.nodes)  # positions that g is compared with
         self.kinks, self.owned = FrictionKinks(), ExitStack()
         self.unknowns = Unknowns(self.comm, self.lattice, self.static)
         self.owned.callback(self.unknowns.destroy)
         elasticity = Elasticity(self.lattice)
+        of_rank = elasticity.solid.stiffest if elasticity.solid else 0.0
+        self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)  # lambda of a cell, in mu
         self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
         self.first_guess = FirstGuess(self.functional, self.preset.extrapolate)
         self.options = SolverOptions(self.preset, self.prefix, self.budget)
@@ -182,6 +187,8 @@ class Stepper:
         with petsc_errors("PETSc cannot take a step with these options", self._abandon):
             before = self.work_so_far()
             self._begin(problem, start)
+            self.is_first = self.static and self.stiffest > 2 and self.preset.true_hessian and not self.budget
+            self.slopes = None
             outcome = self.solve_once(Outcome(self.control.target))
             verdict = self.examine(outcome)
             while not verdict.is_minimum and (doubted := self._leave(verdict, outcome)):
@@ -242,6 +249,8 @@ class Stepper:
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()
         iterations, most = self._run_snes(), self.snes.getTolerances()[3]
+        if self.snes.reason == PETSc.SNES.ConvergedReason.CONVERGED_ITS and not self.budget:
+            return self._solve_softened(outcome)
         while self.preset.true_hessian and self.snes.reason in CLIMBS and iterations < most:
             self.projected = True
             its = self._run_snes()
@@ -253,6 +262,23 @@ class Stepper:
             worst = where_worst(self.functional, self._evaluate(self.snes.getSolution()))
             raise not_converged(self.snes, self.ksp, self.outcome, iterations, worst, self.preset.true_hessian)
         return self.outcome
+
+    def _solve_softened(self, outcome: Outcome) -> Outcome:
+        """Solve for solids whose lambda is mu, then more and more of it. Raises StepFailed.
+
+        The greater lambda, the shorter a straight way until it has changed volumes; from solution to solution they
+        change little. The first Hessian of each has the pressure of the one before: with its own lambda, what lacks of
+        volume would bend everything.
+        """
+        solid, ratio, goal = self.functional.elasticity.solid, 1.0, max(self.control.target, DEFAULT_ERROR)
+        while solid and 2 * ratio < self.stiffest:
+            with solid.softened(ratio):
+                self.forget(modes=False)
+                self.solve_once(Outcome(goal))
+                self.slopes = solid.hessian_at(self.functional.positions(self.x), False).slopes
+            ratio *= self.softer
+        self.forget(modes=False)
+        return self.solve_once(outcome)
 
     def _run_snes(self) -> int:
         self.snes.solve(None, self.x)
@@ -344,6 +370,9 @@ class Stepper:
             self.jacobian.linearise(
                 self.base, self.functional.problem.contact, self.projected, self.kinks.secants, known
             )
+            if self.slopes is not None and not (known or self.projected):
+                self.jacobian.hessian.take_slopes(self.slopes)
+            self.slopes = None
             self.kinks.is_awaited = True
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
@@ -378,6 +407,8 @@ class Stepper:
             self.observer(iterate.q)
         if not np.isfinite(outcome.residual):
             return NOT_FINITE
+        if self.is_first and self._overshoots(its):
+            return reasons.CONVERGED_ITS
         if outcome.is_enough:
             if outcome.at_rounding:
                 return reasons.CONVERGED_FNORM_ABS
@@ -390,6 +421,13 @@ class Stepper:
             return reasons.DIVERGED_INNER  # _run_snes says so
         self._adapt()
         return reasons.ITERATING
+
+    def _overshoots(self, its: int) -> bool:
+        """Whether the first iteration has raised |F| so much that softer solids are to lead on."""
+        self.is_first = its == 0
+        if self.is_first:
+            self.begun = self.outcome.residual
+        return self.outcome.residual > self.softer * self.begun
 
     def _iterate(self, snes: PETSc.SNES) -> Iterate:
         """Return SNES's iterate, and F there."""

@@ -67,6 +67,33 @@ def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool
         np.testing.assert_allclose(curved, product, rtol=1e-4, atol=1e-5 * np.abs(product).max())
 
 
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
+    """lambda = 49 mu, no more than mu meanwhile: as that of Poisson's ratio 1/4, by its mu. A Hessian with the pressure
+    of the softer solid is that solid's, and above it only by what resists the change of each cell's volume."""
+    lattice = solid(2, 2, 1, poisson=0.49, cut=cut)
+    assert lattice.solid is not None
+    elastic = Elasticity(lattice)
+    softer = Elasticity(Lattice(**(vars(lattice) | {"solid": lattice.solid._replace(lame=lattice.solid.shear)})))
+    q = lattice.nodes + 0.2 * H * RNG.standard_normal(lattice.nodes.shape)
+    before, law = gradient(elastic, q), elastic.solid
+    assert law is not None and law.stiffest == pytest.approx(49)
+    with pytest.raises(KeyError), law.softened(1.0):
+        assert elastic.energy(q) == pytest.approx(softer.energy(q), rel=1e-12)
+        np.testing.assert_allclose(gradient(elastic, q), gradient(softer, q), rtol=1e-9, atol=1e-9)
+        slopes = law.hessian_at(q, False).slopes
+        raise KeyError
+    assert np.array_equal(gradient(elastic, q), before)
+    hessian, columns = law.hessian_at(q, False), []
+    hessian.slopes[:] = slopes
+    for unit in np.eye(q.size):
+        columns.append(np.zeros_like(q))
+        hessian(unit.reshape(q.shape), columns[-1])
+    added = np.reshape(columns, (q.size, q.size)) - dense_hessian(softer, q)
+    values = np.linalg.eigvalsh(added)
+    assert values[0] > -1e-9 * values[-1] and (values > 1e-9 * values[-1]).sum() <= len(lattice.local_cells)
+
+
 @cases
 def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(poisson: float, cut: bool):
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut)

@@ -270,11 +270,12 @@ class Stepper:
         change little. The first Hessian of each has the pressure of the one before: with its own lambda, what lacks of
         volume would bend everything.
         """
-        solid, ratio, goal = self.functional.elasticity.solid, 1.0, max(self.control.target, DEFAULT_ERROR)
+        solid = self.functional.elasticity.solid
+        ratio = 1.0
         while solid and 2 * ratio < self.stiffest:
             with solid.softened(ratio):
                 self.forget(modes=False)
-                self.solve_once(Outcome(goal))
+                self.solve_once(Outcome(max(self.control.target, DEFAULT_ERROR)))
                 self.slopes = solid.hessian_at(self.functional.positions(self.x), False).slopes
             ratio *= self.softer
         self.forget(modes=False)

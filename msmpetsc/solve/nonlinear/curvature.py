@@ -63,7 +63,7 @@ class SearchEffort(NamedTuple):
 EFFORT = SearchEffort(4, 12, 2)
 # With multigrid smooth modes come at once. But not where something is alarming: one bent by 270 degrees had a lowest
 # curvature of 0.04, and seemed to have 0.35.
-UNIFORM_EFFORT = SearchEffort(2, 2, 1)
+UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 UNCHANGED = 0.1  # of its curvature: a mode that is followed by multigrid is taken as it is
 LIGHT = 0.5  # load factor: up to there no mode need be known
 LOADED = 3  # iterations of its search; one less where a mode is known

@@ -34,20 +34,27 @@ from msmpetsc.elasticity.cell_lanes import (
     BY_AXIS,
     CONSTANTS,
     FAST,
-    LANES,
     RESULT,
     ROWS,
     STATE,
     WORK,
     Blocks,
-    Seven,
-    corner_strain,
+    component_in,
     gather,
     in_blocks,
     load,
-    modes_forces,
     scatter,
     shared,
+    strains_in,
+)
+from msmpetsc.elasticity.cell_strain import (
+    LANES,
+    Nine,
+    Seven,
+    Strains,
+    corner_strain,
+    form_of,
+    modes_forces,
     strain,
     write_forces,
 )
@@ -56,8 +63,6 @@ from msmpetsc.lattice.lattice import Lattice
 ONSET = 0.2  # J_0: below it U is a parabola
 CONVEX = 0.5  # J from which on compression takes nothing from the 3 x 3 block
 NORM = math.sqrt(4 / 3)  # R
-
-Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
 @numba.njit(cache=True, inline="always")
@@ -146,48 +151,63 @@ def _borne(f: Nine, j: float, slope: float, least: float) -> float:
 
 
 @numba.njit(cache=True, inline="always")
-def scaled(x: Seven, y: Seven, z: Seven, over: float) -> Nine:
-    """Return the mean slopes of three components' strains; ``over`` is 1 / (4 h)."""
+def _times(a: float, x: Nine) -> Nine:
+    return a * x[0], a * x[1], a * x[2], a * x[3], a * x[4], a * x[5], a * x[6], a * x[7], a * x[8]
+
+
+@numba.njit(cache=True, inline="always")
+def _plus(x: Nine, a: float, y: Nine) -> Nine:
+    """Return x + a y."""
     return (
-        over * x[0], over * x[1], over * x[2],
-        over * y[0], over * y[1], over * y[2],
-        over * z[0], over * z[1], over * z[2],
+        x[0] + a * y[0], x[1] + a * y[1], x[2] + a * y[2],
+        x[3] + a * y[3], x[4] + a * y[4], x[5] + a * y[5],
+        x[6] + a * y[6], x[7] + a * y[7], x[8] + a * y[8],
     )  # fmt: skip
 
 
 @numba.njit(cache=True, inline="always")
-def gradient_of(w: Floats, lane: int, over: float) -> Nine:
-    """Return F of a lane whose corners' positions are in the work array."""
-    return scaled(strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane), over)
+def _slope_of(e: Strains) -> Nine:
+    """Return 4 h times the mean slope by rows."""
+    a, b, c = e
+    return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+
+
+@numba.njit(cache=True, inline="always")
+def gradient_of(e: Strains, over: float) -> Nine:
+    """Return F by the strains of positions; ``over`` is 1 / (4 h)."""
+    return _times(over, _slope_of(e))
+
+
+@numba.njit(cache=True, inline="always")
+def kept_gradient(state: Floats, s: int) -> Nine:
+    """Return F as a Hessian keeps it."""
+    rows = state[s], state[s + 8], state[s + 16], state[s + 24], state[s + 32], state[s + 40]
+    return rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], state[s + 48], state[s + 56], state[s + 64]
+
+
+@numba.njit(cache=True, inline="always")
+def _pull(e: Strains, m: float, lame: float, h4: float) -> Nine:
+    """Return grad E by 4 h times the mean slope."""
+    g, over = _slope_of(e), 1.0 / h4
+    n = cofactors(g)
+    j = determinant(g, n) * (over * over * over)
+    return _plus(_times(m, g), over * _slopes(j, m, lame)[0], n)
+
+
+@numba.njit(cache=True, inline="always")
+def _turned_pull(e: Strains, m: float, state: Floats, s: int) -> Nine:
+    """Return the Hessian's product with the strains of a displacement, as ``_pull`` does the gradient."""
+    f, g = kept_gradient(state, s), _slope_of(e)
+    n = cofactors(f)
+    along = state[s + 80] * _inner(n, g)
+    return _plus(_plus(_times(m, g), along, n), state[s + 72], _change_of_cofactors(f, g))
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _product_lanes(w: Floats) -> None:
     for lane in range(LANES):
-        a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
-        g = a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
-        s = AT_STATE + lane
-        f = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
-        m, slope, n = w[CONSTANTS + 104 + lane], w[s + 72], cofactors(f)
-        along, t = w[s + 80] * _inner(n, g), _change_of_cofactors(f, g)
-        x = (
-            m * g[0] + along * n[0] + slope * t[0],
-            m * g[1] + along * n[1] + slope * t[1],
-            m * g[2] + along * n[2] + slope * t[2],
-        )
-        y = (
-            m * g[3] + along * n[3] + slope * t[3],
-            m * g[4] + along * n[4] + slope * t[4],
-            m * g[5] + along * n[5] + slope * t[5],
-        )
-        z = (
-            m * g[6] + along * n[6] + slope * t[6],
-            m * g[7] + along * n[7] + slope * t[7],
-            m * g[8] + along * n[8] + slope * t[8],
-        )
-        write_forces(w, 0, lane, x, a)
-        write_forces(w, 8, lane, y, b)
-        write_forces(w, 16, lane, z, c)
+        k, e = CONSTANTS + lane, strains_in(w, lane)
+        write_forces(w, RESULT + lane, w, k, _turned_pull(e, w[k + 104], w, AT_STATE + lane), e)
 
 
 @numba.njit(cache=True)
@@ -205,18 +225,8 @@ def add_product(nodes: Indices, which: Indices, constants: Rows, state: Rows, v:
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _gradient_lanes(w: Floats, h4: float) -> None:
     for lane in range(LANES):
-        a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
-        g = a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
-        m, lame = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
-        n, over = cofactors(g), 1.0 / h4
-        j = determinant(g, n) * (over * over * over)
-        slope = over * _slopes(j, m, lame)[0]
-        x = m * g[0] + slope * n[0], m * g[1] + slope * n[1], m * g[2] + slope * n[2]
-        y = m * g[3] + slope * n[3], m * g[4] + slope * n[4], m * g[5] + slope * n[5]
-        z = m * g[6] + slope * n[6], m * g[7] + slope * n[7], m * g[8] + slope * n[8]
-        write_forces(w, 0, lane, x, a)
-        write_forces(w, 8, lane, y, b)
-        write_forces(w, 16, lane, z, c)
+        k, e = CONSTANTS + lane, strains_in(w, lane)
+        write_forces(w, RESULT + lane, w, k, _pull(e, w[k + 104], w[k + 112], h4), e)
 
 
 @numba.njit(cache=True)
@@ -233,7 +243,7 @@ def add_gradient(blocks: Blocks, h4: float, q: Positions, gradient: Rows) -> Non
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _state_lanes(w: Floats, over: float, projected: bool) -> None:
     for lane in range(LANES):
-        f = gradient_of(w, lane, over)
+        f = gradient_of(strains_in(w, lane), over)
         m, lame, n = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane], cofactors(f)
         j = determinant(f, n)
         slope, curvature = _slopes(j, m, lame)
@@ -259,20 +269,22 @@ def linearise(blocks: Blocks, h4: float, q: Positions, projected: bool, state: R
 
 
 @numba.njit(cache=True, inline="always")
-def _quadratic(w: Floats, lane: int, a: Seven, b: Seven) -> float:
-    """Return the inner product of two strains of a component, slopes and modes, in the form that mu has."""
-    x, y, z, v = modes_forces(w, lane, b[3], b[4], b[5], b[6])
-    m: float = w[CONSTANTS + 104 + lane]
-    return m * (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) + a[3] * x + a[4] * y + a[5] * z + a[6] * v
+def _quadratic(w: Floats, k: int, a: Strains, b: Strains) -> float:
+    """Return the inner product of two strains in the form that mu has: mean slopes and modes, times m."""
+    total: float = w[k + 104] * _inner(_slope_of(a), _slope_of(b))
+    for i in range(3):
+        x, y, z, v = modes_forces(w, k, b[i])
+        total += a[i][3] * x + a[i][4] * y + a[i][5] * z + a[i][6] * v
+    return total
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _energy_lanes(w: Floats, over: float) -> None:
     for lane in range(LANES):
-        x, y, z = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
-        f, s = scaled(x, y, z, over), AT_STATE + lane
+        e, s = strains_in(w, lane), AT_STATE + lane
+        f = gradient_of(e, over)
         w[s] = determinant(f, cofactors(f))
-        w[s + 8] = 0.5 * (_quadratic(w, lane, x, x) + _quadratic(w, lane, y, y) + _quadratic(w, lane, z, z))
+        w[s + 8] = 0.5 * _quadratic(w, CONSTANTS + lane, e, e)
 
 
 @numba.njit(cache=True)
@@ -301,16 +313,12 @@ def _between(a: Seven, b: Seven) -> Seven:
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _change_lanes(w: Floats, over: float) -> None:
     for lane in range(LANES):
-        a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
-        x, y, z = strain(w, RESULT, lane), strain(w, RESULT + 8, lane), strain(w, RESULT + 16, lane)
-        d, f, s = scaled(a, b, c, over), scaled(x, y, z, over), AT_STATE + lane
+        moved, base, s = strains_in(w, lane), strains_in(w, lane, RESULT), AT_STATE + lane
+        d, f = gradient_of(moved, over), gradient_of(base, over)
         n, n_d = cofactors(f), cofactors(d)
         w[s], w[s + 8] = determinant(f, n), _inner(n, d) + _inner(f, n_d) + determinant(d, n_d)
-        w[s + 16] = (
-            _quadratic(w, lane, a, _between(a, x))
-            + _quadratic(w, lane, b, _between(b, y))
-            + _quadratic(w, lane, c, _between(c, z))
-        )
+        mean = _between(moved[0], base[0]), _between(moved[1], base[1]), _between(moved[2], base[2])
+        w[s + 16] = _quadratic(w, CONSTANTS + lane, moved, mean)
 
 
 @numba.njit(cache=True)
@@ -341,12 +349,12 @@ def add_diagonal(blocks: Blocks, state: Rows, diagonal: Rows) -> None:
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         load(state, b, w, AT_STATE)
         for lane in range(LANES):
-            s = AT_STATE + lane
-            n = cofactors((w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]))
+            s, k = AT_STATE + lane, CONSTANTS + lane
+            n, form = cofactors(kept_gradient(w, s)), form_of(w, k)
             for a in range(8):
-                g, block = corner_strain(w, a, lane), diagonal[blocks.nodes[b, lane, a]]
-                x, y, z, v = modes_forces(w, lane, g[3], g[4], g[5], g[6])
-                own = w[CONSTANTS + 104 + lane] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+                g, block = corner_strain(a, form), diagonal[blocks.nodes[b, lane, a]]
+                x, y, z, v = modes_forces(w, k, g)
+                own = w[k + 104] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
                 own += x * g[3] + y * g[4] + z * g[5] + v * g[6]
                 e = (
                     n[0] * g[0] + n[1] * g[1] + n[2] * g[2],
@@ -370,13 +378,13 @@ def add_concavity(blocks: Blocks, h4: float, q: Positions, concavity: Floats) ->
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         for lane in range(LANES):
-            f, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+            f, m = gradient_of(strains_in(w, lane), 1.0 / h4), w[CONSTANTS + 104 + lane]
             n = cofactors(f)
             j = determinant(f, n)
             slope = _slopes(j, m, w[CONSTANTS + 112 + lane])[0]
-            lost = max(abs(slope) * _borne(f, j, slope, CONVEX) - m, 0.0)
+            lost, form = max(abs(slope) * _borne(f, j, slope, CONVEX) - m, 0.0), form_of(w, CONSTANTS + lane)
             for a in range(8):
-                g = corner_strain(w, a, lane)
+                g = corner_strain(a, form)
                 sizes[a] = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
             lost *= sizes.sum()
             for a in range(8):
@@ -401,18 +409,18 @@ def add_coarse(
             b, lane = order[at] // LANES, order[at] % LANES
             load(blocks.constants, blocks.which[b], w, CONSTANTS)
             load(state, b, w, AT_STATE)
-            s, m = AT_STATE + lane, w[CONSTANTS + 104 + lane]
-            of_f = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
+            s, row, m = AT_STATE + lane, CONSTANTS + lane, w[CONSTANTS + 104 + lane]
+            of_f, form = kept_gradient(w, s), form_of(w, row)
             slope, curvature, k = w[s + 72], w[s + 80], cofactors(of_f)
             for r in range(9):
                 f[r // 3, r % 3] = of_f[r]
             for a in range(8):
                 for corner in range(8):
                     w[24 * corner + lane] = weights[code[at, corner], a]
-                e = strain(w, 0, lane)
+                e = strain(component_in(w, lane), form)
                 g[a, 0], g[a, 1], g[a, 2] = e[0], e[1], e[2]
                 modes[a, 0], modes[a, 1], modes[a, 2], modes[a, 3] = e[3], e[4], e[5], e[6]
-                pushed[a, 0], pushed[a, 1], pushed[a, 2], pushed[a, 3] = modes_forces(w, lane, e[3], e[4], e[5], e[6])
+                pushed[a, 0], pushed[a, 1], pushed[a, 2], pushed[a, 3] = modes_forces(w, row, e)
                 n[a, 0] = k[0] * e[0] + k[1] * e[1] + k[2] * e[2]
                 n[a, 1] = k[3] * e[0] + k[4] * e[1] + k[5] * e[2]
                 n[a, 2] = k[6] * e[0] + k[7] * e[1] + k[8] * e[2]

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
-from msmpetsc.elasticity.cell_lanes import LANES, STATE
+from msmpetsc.elasticity.cell_lanes import STATE
+from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.neo_hookean import ONSET, NeoHookean, cell_energies
 from msmpetsc.lattice.lattice import Lattice
 

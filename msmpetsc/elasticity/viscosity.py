@@ -16,7 +16,8 @@ import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Positions, Rows
-from msmpetsc.elasticity.cell_lanes import AT_STATE, CONSTANTS, LANES, ROWS, STATE, WORK, Blocks, gather, load
+from msmpetsc.elasticity.cell_lanes import AT_STATE, CONSTANTS, ROWS, STATE, WORK, Blocks, gather, load, strains_in
+from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.neo_hookean import (
     ONSET,
     NeoHookean,
@@ -25,6 +26,7 @@ from msmpetsc.elasticity.neo_hookean import (
     cofactors,
     determinant,
     gradient_of,
+    kept_gradient,
 )
 from msmpetsc.elasticity.springs import Product
 
@@ -44,7 +46,7 @@ def turned_state(blocks: Blocks, h4: float, q: Positions, state: Rows) -> None:
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         for lane in range(LANES):
-            r, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + (ROWS - 2) * LANES + lane]
+            r, m = gradient_of(strains_in(w, lane), 1.0 / h4), w[CONSTANTS + (ROWS - 2) * LANES + lane]
             turns = determinant(r, cofactors(r)) > ONSET
             if not turns:
                 r = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
@@ -55,8 +57,7 @@ def turned_state(blocks: Blocks, h4: float, q: Positions, state: Rows) -> None:
                 for i in range(9):
                     w[AT_STATE + LANES * i + lane] = 0.5 * r[i] + over * n[i]
                     change = max(change, abs(0.5 * r[i] - over * n[i]))
-                s = AT_STATE + lane
-                r = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
+                r = kept_gradient(w, AT_STATE + lane)
                 if not change > TURNED:
                     break
             w[AT_STATE + (STATE - 2) * LANES + lane] = -m if turns else 0.0

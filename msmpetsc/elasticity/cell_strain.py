@@ -1,0 +1,95 @@
+"""Strain within one cell, and the forces that it asks of the corners: formulas for lanes of vectors and for threads.
+
+Rows of numbers hold LANES cells: number i of the cell at k is c[k + LANES * i]. A component's strain is the three mean
+slopes and the four modes of lattice.cell_moments.
+"""
+
+from typing import TypeAlias
+
+import numba
+
+from msmpetsc.backend.arrays import Floats
+from msmpetsc.elasticity.springs import Four, Vector
+
+LANES = 8
+
+Six: TypeAlias = tuple[float, float, float, float, float, float]
+Seven: TypeAlias = tuple[float, float, float, float, float, float, float]
+Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+Strains: TypeAlias = tuple[Seven, Seven, Seven]  # of x, y and z
+
+
+@numba.njit(cache=True, inline="always")
+def form_of(c: Floats, k: int) -> Six:
+    """Return the first six constants of a cell, which mean slopes depend on."""
+    return c[k], c[k + 8], c[k + 16], c[k + 24], c[k + 32], c[k + 40]
+
+
+@numba.njit(cache=True, inline="always")
+def strain(u: Eight, form: Six) -> Seven:
+    """Return 4 h times a component's mean slope, and its modes, by the corners' values, x fastest."""
+    a, b, c, d, e, f, g, h = u
+    s0, d0, s1, d1, s2, d2, s3, d3 = a + b, b - a, c + d, d - c, e + f, f - e, g + h, h - g
+    x0, y0, xy0, x1, y1, xy1 = d0 + d1, s1 - s0, d1 - d0, d2 + d3, s3 - s2, d3 - d2
+    x, y, z, xy, xz, yz, xyz = x0 + x1, y0 + y1, (s2 + s3) - (s0 + s1), xy0 + xy1, x1 - x0, y1 - y0, xy1 - xy0
+    cx, cy, cz, mxy, mxz, myz = form
+    return (
+        x + xy * cy + xz * cz + xyz * myz,
+        y + xy * cx + yz * cz + xyz * mxz,
+        z + xz * cx + yz * cy + xyz * mxy,
+        xy + xyz * cz,
+        xz + xyz * cy,
+        yz + xyz * cx,
+        xyz,
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def corner_strain(a: int, form: Six) -> Seven:
+    """Return 4 h times the mean slopes, and the modes, of what is 1 at corner a and 0 at the others."""
+    x, y, z = 2.0 * (a & 1) - 1.0, 1.0 * (a & 2) - 1.0, 0.5 * (a & 4) - 1.0
+    cx, cy, cz, mxy, mxz, myz = form
+    return (
+        x * (1.0 + y * cy + z * cz + y * z * myz),
+        y * (1.0 + x * cx + z * cz + x * z * mxz),
+        z * (1.0 + x * cx + y * cy + x * y * mxy),
+        x * y * (1.0 + z * cz),
+        x * z * (1.0 + y * cy),
+        y * z * (1.0 + x * cx),
+        x * y * z,
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def modes_forces(c: Floats, k: int, e: Seven) -> Four:
+    """Return the slopes of the modes' energy by the modes of a strain."""
+    xy, xz, yz, of_yz, of_xz, of_xy = c[k + 48], c[k + 56], c[k + 64], c[k + 72], c[k + 80], c[k + 88]
+    return (
+        xy * e[3] + of_yz * e[4] + of_xz * e[5],
+        of_yz * e[3] + xz * e[4] + of_xy * e[5],
+        of_xz * e[3] + of_xy * e[4] + yz * e[5],
+        c[k + 96] * e[6],
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def write_forces(store: Floats, at: int, c: Floats, k: int, slopes: Nine, e: Strains) -> None:
+    """Write a cell's forces on its corners into 24 numbers: ``slopes`` by 4 h times the mean slopes, and the modes'."""
+    _write_component(store, at, c, k, (slopes[0], slopes[1], slopes[2]), e[0])
+    _write_component(store, at + 8, c, k, (slopes[3], slopes[4], slopes[5]), e[1])
+    _write_component(store, at + 16, c, k, (slopes[6], slopes[7], slopes[8]), e[2])
+
+
+@numba.njit(cache=True, inline="always")
+def _write_component(w: Floats, at: int, c: Floats, k: int, slopes: Vector, e: Seven) -> None:
+    p, q, r = slopes
+    m, n, o, v = modes_forces(c, k, e)
+    cx, cy, cz, mxy, mxz, myz = form_of(c, k)
+    xyz = v + m * cz + n * cy + o * cx + p * myz + q * mxz + r * mxy
+    xy, xz, yz = m + p * cy + q * cx, n + p * cz + r * cx, o + q * cz + r * cy
+    x0, x1, y0, y1, xy0, xy1 = p - xz, p + xz, q - yz, q + yz, xy - xyz, xy + xyz
+    s0, s1, d0, d1 = -r - y0, y0 - r, x0 - xy0, x0 + xy0
+    s2, s3, d2, d3 = r - y1, r + y1, x1 - xy1, x1 + xy1
+    w[at], w[at + 24], w[at + 48], w[at + 72] = s0 - d0, s0 + d0, s1 - d1, s1 + d1
+    w[at + 96], w[at + 120], w[at + 144], w[at + 168] = s2 - d2, s2 + d2, s3 - d3, s3 + d3

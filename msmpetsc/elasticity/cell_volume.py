@@ -20,6 +20,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.elasticity.cell_strain import Six, strain
 from msmpetsc.elasticity.springs import Product, Vector, between, dot
 from msmpetsc.lattice.lattice import Lattice
 
@@ -166,6 +167,25 @@ def least_volumes(q: Positions, cells: Indices) -> Floats:
     least = np.empty(len(cells), like=q)
     _least_volume_of(len(cells), q, cells, least)
     return least
+
+
+@numba.njit(cache=True, inline="always")
+def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
+    corners = q[c[0], k], q[c[1], k], q[c[3], k], q[c[2], k], q[c[4], k], q[c[5], k], q[c[7], k], q[c[6], k]
+    x, y, z, _, _, _, _ = strain(corners, form)
+    return x, y, z
+
+
+@numba.njit(cache=True)
+def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -> Floats:
+    """Return J (c,) of a solid's cells: det of the mean slope of q (l, 3) [m] over what is inside, 1 at rest [-]."""
+    ratios, volume = np.empty(len(cells)), (4.0 * cell_size) ** 3
+    for i in range(len(cells)):
+        f = forms[i]
+        form = f[0], f[1], f[2], f[3], f[4], f[5]
+        c = cells[i]
+        ratios[i] = _volume(_mean_slope(q, c, 0, form), _mean_slope(q, c, 1, form), _mean_slope(q, c, 2, form)) / volume
+    return ratios
 
 
 class Resistance(NamedTuple):

@@ -4,8 +4,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, to_host
-from msmpetsc.elasticity.cell_volume import least_volumes
-from msmpetsc.lattice.cell_moments import volume_ratios
+from msmpetsc.elasticity.cell_volume import least_volumes, volume_ratios
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -33,7 +32,7 @@ def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool
     if solid is None or corners:
         volumes = least_volumes(q, cells)
     else:
-        volumes = volume_ratios(solid.forms[: len(cells)], q[cells], lattice.cell_size)
+        volumes = volume_ratios(q, cells, solid.forms, lattice.cell_size)
     total = comm.allreduce(int((volumes <= 0).sum()))
     if not total:
         return 0, ""

@@ -55,33 +55,17 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
     return np.concatenate([2 * middle, 4 * products, own, coupled, 16 * (x * y + x * z + y * z)[:, None]], axis=1)
 
 
-def _slopes(forms: Rows, sums: Rows) -> tuple[Rows, Rows, Rows]:
-    """Return 4 h times the mean slopes (c, k) along x, y and z of values, by their seven sums (7, c or 1, k)."""
+def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:
+    """Return, of corner values, 4 times the mean slopes (c, 3, 8) of cells in cell units, and their modes (c, 4, 8)."""
     (cx, cy, cz), (xy, xz, yz) = forms[:, :3].T[:, :, None], forms[:, 3:6].T[:, :, None]
-    x, y, z, of_xy, of_xz, of_yz, of_xyz = sums
-    return (
+    x, y, z, of_xy, of_xz, of_yz, of_xyz = SUMS
+    slopes = (
         x + (cy * of_xy + cz * of_xz + yz * of_xyz),
         y + (cx * of_xy + cz * of_yz + xz * of_xyz),
         z + (cx * of_xz + cy * of_yz + xy * of_xyz),
     )
-
-
-def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:
-    """Return, of corner values, 4 times the mean slopes (c, 3, 8) of cells in cell units, and their modes (c, 4, 8)."""
-    cx, cy, cz = forms[:, :3].T[:, :, None]
-    of_xyz = SUMS[6]
-    modes = SUMS[3] + cz * of_xyz, SUMS[4] + cy * of_xyz, SUMS[5] + cx * of_xyz, of_xyz + 0 * cx
-    return np.stack(_slopes(forms, SUMS[:, None]), axis=1), np.stack(modes, axis=1)
-
-
-def volume_ratios(forms: Rows, corners: Rows, cell_size: float) -> Floats:
-    """Return J (c,) of cells: det of the mean slope of positions over what is inside, 1 at rest [-].
-
-    corners : (c, 8, 3) positions [m]
-    """
-    x, y, z = _slopes(forms, (SUMS @ corners.transpose(1, 0, 2).reshape(8, -1)).reshape(7, -1, 3))
-    ratios: Floats = (x * np.cross(y, z)).sum(axis=1) / (4 * cell_size) ** 3
-    return ratios
+    modes = of_xy + cz * of_xyz, of_xz + cy * of_xyz, of_yz + cx * of_xyz, of_xyz + 0 * cx
+    return np.stack(slopes, axis=1), np.stack(modes, axis=1)
 
 
 def laplacians(forms: Rows, volume: Floats) -> Rows:

@@ -88,7 +88,6 @@ class RunRequest:
     true_error: int | None = given(
         None, Option("also solve every N-th step to rounding, and store its true error", "N", int)
     )
-    trace: int | None = given(None, Option("follow the iterates of step K (needs --measure)", "K", int))
     measure: File | None = given(
         None, Option("write what the run cost: times, products, memory, machine", "OUT.json", checked_file)
     )
@@ -119,8 +118,6 @@ class RunRequest:
             raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
         if self.scene is not None and not (self.file or self.output or self.resume):
             raise InputError("a scene that is no file gives its result no name: say output")
-        if self.trace is not None and self.measure is None:
-            raise InputError("--trace needs --measure, the file that it is written to")
 
     @property
     def file(self) -> Path | None:

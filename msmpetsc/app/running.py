@@ -28,7 +28,6 @@ from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import Solver
-from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import find_preset, shown_options
@@ -45,7 +44,6 @@ class RunPlan:
 
     request: RunRequest
     scene: Scene
-    probes: Probes
     resumed: Resumed | None
     began: float
 
@@ -79,12 +77,11 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     began = perf_counter()
     if request.measure:
         PETSc.Log.begin()
-    probes = Probes(request.true_error, request.trace)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
-    refuse_bad_options(scene, probes)
+    refuse_bad_options(scene, request.true_error)
     on_root(comm, lambda: refuse_unwritable(request.measured))
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
-    return RunPlan(request, scene, probes, resumed, began)
+    return RunPlan(request, scene, resumed, began)
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
@@ -96,7 +93,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
         Signals(comm) as signals,
         begun(SETUP) as set_up,
         open_output(comm, plan) as file,
-        TimeLoop(comm, plan.scene, model := described_model(comm, plan), plan.probes) as simulation,
+        TimeLoop(comm, plan.scene, model := described_model(comm, plan), plan.request.true_error) as simulation,
     ):
         try:
             with ending_together(comm):
@@ -157,7 +154,7 @@ def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier 
     choose(comm, request.device)
     if request.scene or earlier:
         scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
-        solvers = solvers_of(scene, Probes(request.true_error, request.trace))
+        solvers = solvers_of(scene, request.true_error)
     elif request.set or request.frames:
         raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
     else:

@@ -171,7 +171,7 @@ class Simulation:
     def _begin(self, scene: Scene, until_the_end: ExitStack) -> Iterator[Frame]:
         """Build what the run needs, or keep it, and return its steps (collective)."""
         start_for_runs(self.comm, self._words)
-        from msmpetsc.solve import instrumentation, presets, refused_options, simulate
+        from msmpetsc.solve import presets, refused_options, simulate
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
 
         words = [*self._words, f"-{OPTION}", AIJCUSPARSE] if self.device == "cuda" else self._words
@@ -183,7 +183,7 @@ class Simulation:
         if alone:
             refused_options.refuse_early(self.comm)
         choose(self.comm, self.device)
-        simulate.refuse_bad_options(scene, instrumentation.Probes())
+        simulate.refuse_bad_options(scene)
         if self._shape is None or not self._shape.fits(scene):
             self._shape = Geometry(self.comm, scene)
         self.model = model = build_model(self.comm, scene, self._shape)

@@ -156,7 +156,6 @@ class Cost:
             "time": time,
             "products": sum(self.products.values()),
             "memory": comm.allreduce(peak_memory()),
-            "trace": simulation.true_errors.trace,
             "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),
             "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
         }  # fmt: skip

@@ -26,7 +26,7 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Probes, TrueErrors
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, TrueErrors
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
@@ -47,28 +47,31 @@ INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verl
 REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
 
 
-def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
-    """The solvers of a run: prefix of their PETSc options -> preset and budget of iterations."""
+def solvers_of(scene: Scene, true_error: int | None = None) -> dict[str, tuple[Preset, int]]:
+    """The solvers of a run: prefix of their PETSc options -> preset and budget of iterations.
+
+    true_error : every so many steps the true error is measured; None for never
+    """
     solvers = {}
     if scene.time.integrator != "verlet":
         solvers[""] = find_preset(scene.solver.preset), scene.solver.max_iterations or 0
     if scene.safety.on_failure == "fallback":
         solvers[FALLBACK] = find_preset(ROBUST), 0
-    if probes != Probes():
+    if true_error:
         solvers[REFERENCE_PREFIX] = find_preset(REFERENCE_PRESET), 0
     return solvers
 
 
-def refuse_bad_options(scene: Scene, probes: Probes) -> None:
-    """Raise InputError for a preset that is unknown or not for this scene, and for steps and probes that cannot be."""
-    solvers = solvers_of(scene, probes)
+def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
+    """Raise InputError for a preset that is unknown or not for this scene, and for steps that cannot be as asked."""
+    solvers = solvers_of(scene, true_error)
     refuse_bad_steps(scene.time)
     if scene.touching and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(f"contact of surfaces is for newton's presets, not {scene.solver.preset}")
-    if scene.time.error and probes != Probes():
-        raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
-    if "" not in solvers and probes != Probes():
-        raise InputError("the true error and the trace are of a step that is solved: verlet has none")
+    if scene.time.error and true_error:
+        raise InputError("the true error is of a step as the scene has it: time.error has others")
+    if "" not in solvers and true_error:
+        raise InputError("the true error is of a step that is solved: verlet has none")
 
 
 @dataclass
@@ -92,15 +95,14 @@ class TimeLoop:
     state         : that goes with the last frame, or the last step
     step          : steps taken
     steps         : steps of the whole run; those taken, once that is at rest
-    true_errors   : of the steps that the probes ask for
     stored        : number of frames of the whole run; ``stored_until(step)`` of a part
     """
 
-    def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, probes: Probes = Probes()):
+    def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, true_error: int | None = None):
         model = to_device(model, sender(comm))
         if model.collision and not on_host(model.lattice.nodes):
             raise InputError("contact of surfaces is computed on CPUs: --device cpu")
-        self.comm, self.model, self.probes, self.time_step = comm, model, probes, scene.time.step
+        self.comm, self.model, self.true_error, self.time_step = comm, model, true_error, scene.time.step
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
         points = [probe.point for probe in scene.output.probe]
@@ -161,8 +163,6 @@ class TimeLoop:
     def _advance(self, index: int) -> Frame | None:
         """Take the next step (collective); its frame if it is stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
-        if index == self.probes.trace:
-            self.true_errors.follow(self._stepper)
         self._overlaps(index, time)
         begin = perf_counter()
         try:
@@ -177,8 +177,9 @@ class TimeLoop:
         before, self.state = self.state, after
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
-        if self.probes.asks(index) and not result.cost.substeps + result.cost.fallbacks:  # not of recovery
-            self.effort.measure(self.true_errors.measure(index, self._stepper, result))
+        is_recovered = result.cost.substeps + result.cost.fallbacks > 0
+        if self.true_error and index % self.true_error == 0 and result.problem and not is_recovered:
+            self.effort.measure(self.true_errors.errors(self._stepper, result.problem, result.position))
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
@@ -232,7 +233,7 @@ class TimeLoop:
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
         awaited = self.recovery.awaited
-        if self.probes != Probes() and not at_end:
+        if self.true_error and not at_end:
             awaited = (*awaited, REFERENCE_PREFIX)
         refuse_unused(self.comm, at_end, awaited)
 

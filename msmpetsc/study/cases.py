@@ -59,7 +59,6 @@ class Case:
     ranks: int = 1
     repeats: int = 1
     true_error: int | None = None  # every so many steps the true step error is measured
-    trace: int | None = None  # the step that is followed
     label: str = ""
     timeout: float = 300.0  # [s]
     reference: "Case | None" = None  # the run its motion is measured against
@@ -93,9 +92,8 @@ class Case:
 def run_arguments(case: Case) -> list[str]:
     """Return the arguments of ``msmpetsc`` for a case, without its outputs."""
     changes = [word for change in case.set for word in ("--set", change)]
-    for argument, step in (("--true-error", case.true_error), ("--trace", case.trace)):
-        if step is not None:
-            changes += [argument, str(step)]
+    if case.true_error is not None:
+        changes += ["--true-error", str(case.true_error)]
     return ["run", os.path.relpath(case.file), *changes, *shlex.split(case.options)]
 
 
@@ -221,7 +219,7 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
         method = values["preset"] if base.integrator == "implicit-euler" else f"{base.integrator} {values['preset']}"
         case = replace(
             base, **values.pop("goal"), **values, label=_label(sweep, method, values["options"], values["ranks"]),
-            true_error=scene.true_error, trace=scene.trace if sweep.trace else None,
+            true_error=scene.true_error,
         )  # fmt: skip
         yield _timed(with_solver(case, as_given), scene, sweep, as_given)
 
@@ -240,8 +238,6 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
     steps = sweep.steps or (scene.steps if scene.duration is None else None)
     duration = steps * case.time_step if steps else scene.duration or as_given.time.duration
     steps = max(1, round(duration / case.time_step))
-    if case.trace and case.trace > steps:
-        raise InputError(f"scene {case.scene}: trace = {case.trace}, but {case.label} takes {steps} steps")
     case = replace(case, true_error=case.true_error and min(case.true_error, steps))
     every = 1
     if case.reference is not None:

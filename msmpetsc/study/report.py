@@ -14,7 +14,7 @@ from pandas import DataFrame, option_context
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.curves import convergence_charts, growth_charts, pareto_charts, size_charts
+from msmpetsc.study.charts.curves import growth_charts, pareto_charts, size_charts
 from msmpetsc.study.charts.plot import Chart, curve_styles, save_png, svg_text
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.metrics import counted
@@ -26,7 +26,6 @@ from msmpetsc.study.table import (
     is_repeated,
     mapped,
     read_table,
-    read_traces,
     swept,
     timed,
 )
@@ -37,7 +36,7 @@ OF_FAILURES = ["scene", "label", "time_step", "error", "status", "reason", "comm
 
 
 def write_report(folder: Path) -> Path:
-    """Draw a folder's table and traces as PNG files and report.html, whose path is returned. Raises InputError."""
+    """Draw a folder's table as PNG files and report.html, whose path is returned. Raises InputError."""
     table = read_table(folder)
     file = folder / "study.toml"
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
@@ -47,7 +46,6 @@ def write_report(folder: Path) -> Path:
         *size_charts(sweeps, styles),
         *pareto_charts(sweeps, styles),
         *growth_charts(sweeps, styles),
-        *convergence_charts(sweeps, styles, read_traces(folder)),
     ]
     for chart in charts:
         save_png(chart, folder)

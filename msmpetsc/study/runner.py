@@ -1,6 +1,5 @@
 """The study runner: runs each case and writes the table after each."""
 
-import json
 import os
 import shutil
 import sys
@@ -20,17 +19,9 @@ from msmpetsc.study.cases import Case, command, shown_command, study_cases
 from msmpetsc.study.metrics import costs, of_frames, outcome, read_record, surface_error, together, trajectory_error
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.study_file import Study, load_study
-from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
+from msmpetsc.study.table import Row, read_table, records, require_extra, write_table
 
 PARTS = "parts"  # folder of the parts' folders
-
-
-@dataclass(frozen=True)
-class CaseResult:
-    """The row of a case, and its trace if one was asked for."""
-
-    row: Row
-    trace: dict[str, Any] | None
 
 
 @dataclass
@@ -48,23 +39,21 @@ class Bench:
         """Return the path of the result of a case."""
         return self.folder / "runs" / f"{case.id}.h5"
 
-    def measure(self, case: Case, keep: bool = False) -> CaseResult:
+    def measure(self, case: Case, keep: bool = False) -> Row:
         """Run a case with its repeats; return its row, with the reason if it failed."""
         runs: list[Row] = []
-        path, trace = self.result_of(case), None
+        path = self.result_of(case)
         known = case.columns | {"study": self.study, "command": shown_command(case)}
         reference, why = self._reference(case)
         for repeat in range(case.repeats):
             if repeat == 1:
-                case = replace(case, true_error=None, trace=None)
+                case = replace(case, true_error=None)
             ended = self._run(case, path)
             record = read_record(path.with_suffix(".json"))
             row, problem = _figures(case, path, record)
-            if repeat == 0:
-                trace = record.get("trace")
-                if reference is not None and not ended.reason:
-                    errors, why = _distance(case, path, reference)
-                    row |= errors
+            if repeat == 0 and reference is not None and not ended.reason:
+                errors, why = _distance(case, path, reference)
+                row |= errors
             if not keep or ended.reason:
                 _remove_files(path, log=not ended.reason)
             runs.append(row)
@@ -77,7 +66,7 @@ class Bench:
             row["outcome"] = outcome(ended.status, kind, row, case.point.recovers)
         if time := row.get("time_frame"):
             row |= {"fps": 1 / time, "time_second": time / case.time_step}
-        return CaseResult(row, trace)
+        return row
 
     def _run(self, case: Case, path: Path) -> Ended:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -136,28 +125,22 @@ def _remove_files(path: Path, log: bool) -> None:
 
 @dataclass
 class StudyResults:
-    """The rows and traces of a study so far, written in the order of its cases."""
+    """The rows of a study so far, written in the order of its cases."""
 
     folder: Path
     order: Sequence[str]
     rows: dict[str, Row] = field(default_factory=dict)
-    traces: dict[str, dict[str, Any]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
-    def add(self, result: CaseResult) -> None:
-        """Add the result of a case and write all, of several threads one after the other."""
-        case = result.row["case"]
+    def add(self, row: Row) -> None:
+        """Add the row of a case and write all, of several threads one after the other."""
         with self._lock:
-            self.rows[case] = result.row
-            if result.trace:
-                self.traces[case] = result.trace
+            self.rows[row["case"]] = row
             self.write()
 
     def write(self) -> None:
-        """Write table and traces, each replaced whole."""
+        """Write the table, replaced whole."""
         write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
-        traces = {case: self.traces[case] for case in self.order if case in self.traces}
-        write_whole(self.folder / "traces.json", json.dumps(traces))
 
 
 @dataclass(frozen=True)
@@ -185,7 +168,7 @@ def run_study(
 ) -> list[Row]:
     """Run the cases of a study file that are not done, ``jobs`` at a time; return all rows.
 
-    The folder gets table.csv, traces.json, study.toml, references/. Cases that are done and still in the
+    The folder gets table.csv, study.toml, references/. Cases that are done and still in the
     file are kept, those of its parts too; ``restart`` forgets them. With a ``part`` only that is run, in a folder of
     its own, and only its rows are returned. Raises InputError before anything is run.
     """
@@ -196,8 +179,7 @@ def run_study(
     own = part.folder(folder) if part else folder
     own.mkdir(parents=True, exist_ok=True)
     if restart:
-        for name in ("table.csv", "traces.json"):
-            (own / name).unlink(missing_ok=True)
+        (own / "table.csv").unlink(missing_ok=True)
         for name in ("runs", "references", PARTS):
             shutil.rmtree(own / name, ignore_errors=True)
     known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
@@ -232,8 +214,7 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
         with bar:
             futures = [pool.submit(_carry_out_one, bench, case, results) for case in todo]
             for count, future in enumerate(as_completed(futures), done + 1):
-                result = future.result()
-                bar.write(f"case {count}/{bar.total}  {described(result.row)}", file=sys.stderr)
+                bar.write(f"case {count}/{bar.total}  {described(future.result())}", file=sys.stderr)
                 bar.update()
     finally:  # what ends this early ends the runs under way
         bench.processes.close()
@@ -242,12 +223,12 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
             (bench.folder / "runs").rmdir()
 
 
-def _carry_out_one(bench: Bench, case: Case, results: StudyResults) -> CaseResult:
-    """Run a case and add its result, so that its row is in the file when the next one begins."""
-    result = bench.measure(case)
+def _carry_out_one(bench: Bench, case: Case, results: StudyResults) -> Row:
+    """Run a case and add its row, so that its row is in the file when the next one begins."""
+    row = bench.measure(case)
     if not bench.processes.stopped:
-        results.add(result)
-    return result
+        results.add(row)
+    return row
 
 
 def described(row: Row) -> str:
@@ -270,7 +251,6 @@ def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
         rows = {row["case"]: row for row in _earlier_rows(folder) if row["case"] in by_id}
         new = {case: row for case, row in rows.items() if not _is_done(by_id[case], results.rows)}
         results.rows |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
-        results.traces |= {case: trace for case, trace in read_traces(folder).items() if case in new}
     return results
 
 

@@ -89,7 +89,6 @@ class StudyScene(Length):
     frame: Positive | None = None  # [s] between moments compared with the reference; the scene's time step if absent
     reference: ReferenceRun | None = None
     true_error: Count | None = None  # every so many steps the true step error is measured
-    trace: Count | None = None  # the step whose iterates are followed, in sweeps with trace = true
     full: bool = False  # only with --full
 
 
@@ -110,7 +109,6 @@ class Sweep(Table):
     steps: Count | None = None  # in place of the scene's
     set: ListOf[Override] = ()  # further changes of the scenes
     label: str = ""  # what curves are called, in place of preset and options
-    trace: bool = False  # follow the iterates of the scene's trace step
     full: bool = False  # only with --full
 
     @model_validator(mode="after")

@@ -3,7 +3,6 @@
 pandas is imported where it is used: the commands that need no table do not wait for it.
 """
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
@@ -65,16 +64,6 @@ def read_table(folder: Path) -> "DataFrame":
     except ValueError as error:  # of pandas' parser, of text that is not UTF-8
         raise InputError(f"{path} is not the table of a study: {str(error).splitlines()[0]}") from None
     return typed(texts.to_dict("records"))  # type: ignore[arg-type]  # columns are called by text
-
-
-def read_traces(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return the traces of traces.json by case, empty without the file. Raises InputError."""
-    path = folder / "traces.json"
-    try:
-        traces = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        return dict(traces.items())
-    except (ValueError, AttributeError):
-        raise InputError(f"{path} is not what a study left: --restart begins anew") from None
 
 
 def as_table(rows: Sequence[Row]) -> "DataFrame":

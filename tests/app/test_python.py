@@ -71,7 +71,6 @@ WRONG = {
     "--frames must be at least 1": {"frames": 0},
     "material.dens": {"set": {"material.dens": 1}},
     "is no name of an option": {"petsc_options": {"ksp rtol": 1e-3}},
-    "--trace needs --measure": {"trace": 1},
 }
 
 

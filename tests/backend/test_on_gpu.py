@@ -30,7 +30,6 @@ import msmpetsc
 from msmpetsc.build import build_model
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -102,9 +101,9 @@ def real() -> Iterator[None]:
 on_a_gpu = pytest.mark.parametrize("on_gpu", [pretended, pytest.param(real, marks=pytest.mark.cuda)])
 
 
-def play(path: Path, measured: Probes | None = None) -> list[Frame]:
+def play(path: Path) -> list[Frame]:
     scene = load_scene(path)
-    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), measured or Probes()) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         return list(simulation.frames())
 
 

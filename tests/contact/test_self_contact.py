@@ -19,7 +19,6 @@ from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.simulate import refuse_bad_options
 
 COMM = MPI.COMM_SELF
@@ -215,7 +214,7 @@ def test_what_would_move_the_surface_past_itself_is_refused(tmp_path, override: 
 def test_presets_of_a_are_refused(tmp_path):
     scene = load_scene(pinch_scene(tmp_path), ("solver.preset=anderson",))
     with pytest.raises(InputError, match="is for newton's presets, not anderson"):
-        refuse_bad_options(scene, Probes())
+        refuse_bad_options(scene)
 
 
 def sliding(folder: Path, angle: float, **given: float) -> Path:

@@ -58,7 +58,7 @@ def main() -> None:
     if comm.rank == 0:
         kind = words[words.index("-ksp_kind") + 1] if "-ksp_kind" in words else None
         failure = {"failure": kind and {"kind": kind, "frame": 3, "says": "planted"}}
-        measure.write_text(json.dumps(told(comm.size, count, "--trace" in words) | failure))
+        measure.write_text(json.dumps(told(comm.size, count) | failure))
     if "-ksp_exit" in words:
         sys.exit(int(words[words.index("-ksp_exit") + 1]))
 
@@ -87,18 +87,11 @@ def blank_frame(**given) -> Frame:
     return Frame(**blank | given)
 
 
-def told(ranks: int, count: int, traced: bool) -> dict:
+def told(ranks: int, count: int) -> dict:
     times = dict.fromkeys(("setup", "factor", "local", "ksp", "output", "stepping"), float(count))
     machine = {"cpu": "a CPU", "cores": 2, "memory": 2**33, "system": "Linux"}
     counts = {"cells": 1, "nodes": 8, "unknowns": 8, "springs": 28, "ranks": ranks, "memory": 1000 - count}
-    trace = {"frame": 2, "iteration": [0, 1], "ksp_its": [0, 5], "seconds": [0, 1], "position_error": [1, 0.1]}
-    return {
-        "machine": machine,
-        "versions": {"msmpetsc": "x"},
-        "time": times,
-        "trace": trace if traced else None,
-        **counts,
-    }
+    return {"machine": machine, "versions": {"msmpetsc": "x"}, "time": times, **counts}
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from msmpetsc.results.reader import Result
 from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.study.charts.plot import COUNT, Chart, curve_styles, log_axis, save_png
 from msmpetsc.study.report import write_report
-from msmpetsc.study.runner import StudyResults
+from msmpetsc.study.runner import run_study
 from msmpetsc.study.sizing.answer import put_into, tables
 from msmpetsc.study.sizing.choice import Candidate
 from msmpetsc.study.table import write_table
@@ -74,6 +74,13 @@ def chart(path: Path) -> None:
     save_png(made, path.parent)
 
 
+def ask_for_no_cases(path: Path) -> None:
+    """Write a study file all of whose cases are for --full: run_study notes what it was asked, and runs nothing."""
+    scene = ROOT / "scenes" / "studies" / "beam_soft.toml"
+    text = f'[[scene]]\nname = "a"\nfile = "{scene}"\n[[sweep]]\nfull = true\n'
+    path.parent.with_name("asked.toml").write_text(text)
+
+
 def writers(sources: Path) -> dict[str, Writer]:
     """The table, by names of files."""
     bar, ball = sources / "bar.h5", sources / "ball.h5"
@@ -92,9 +99,10 @@ def writers(sources: Path) -> dict[str, Writer]:
             lambda path: path.write_text("[time] # mine\nstep = 0.1\nduration = 1.0\n"),
         ),
         "table.csv": Writer("study/table.py", lambda path: write_table(path.parent, [])),
-        "traces.json": Writer(
+        "study.toml": Writer(
             "study/runner.py",
-            lambda path: StudyResults(path.parent, ["a"], traces={"a": {"trace": [0] * 5000}}).write(),
+            lambda path: run_study(path.parent.with_name("asked.toml"), path.parent),
+            ask_for_no_cases,
         ),
         "report.html": Writer(
             "study/report.py", lambda path: write_report(path.parent), lambda path: write_table(path.parent, [])

@@ -10,7 +10,6 @@ from one_process import input_error
 
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.adaptive import METHODS
 from msmpetsc.solve.simulate import refuse_bad_options
 
@@ -162,4 +161,4 @@ def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monk
 )
 def test_what_has_no_meaning_is_refused_in_a_line(tmp_path: Path, more: dict, says: str):
     scene = load_scene(beam(tmp_path, **more))
-    assert says in input_error(lambda: refuse_bad_options(scene, Probes()))
+    assert says in input_error(lambda: refuse_bad_options(scene))

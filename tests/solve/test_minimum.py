@@ -22,7 +22,6 @@ from msmpetsc.build import build_model
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear import preconditioning
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -68,8 +67,8 @@ def write_case(folder: Path, name: str, **solver) -> Path:
 def play(path: Path, *overrides: str) -> list[Frame]:
     """The frames, true errors measured, until the end or a step that fails."""
     scene, frames = load_scene(path, overrides), []
-    model, probes = build_model(MPI.COMM_SELF, scene), Probes(true_error=1)
-    with TimeLoop(MPI.COMM_SELF, scene, model, probes) as simulation, suppress(StepFailed):
+    model = build_model(MPI.COMM_SELF, scene)
+    with TimeLoop(MPI.COMM_SELF, scene, model, true_error=1) as simulation, suppress(StepFailed):
         frames.extend(simulation.frames())
     return frames[1:]
 

@@ -10,7 +10,6 @@ from conftest import ROOT
 from one_process import command_error, input_error
 from study_files import ONE_SCENE, all_cases, carry_out, own_log, stand_in, study_file  # noqa: F401 (fixtures)
 
-from msmpetsc.errors import InputError
 from msmpetsc.study.cases import shown_command, study_cases
 from msmpetsc.study.study_file import load_study
 
@@ -50,7 +49,7 @@ def test_a_wrong_scene_is_told_before_anything_is_run(tmp_path: Path, stand_in, 
 def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path, own_log):
     path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
     (tmp_path / "file").touch()
-    (tmp_path / "taken" / "traces.json").mkdir(parents=True)
+    (tmp_path / "taken" / "table.csv").mkdir(parents=True)
     for folder in ("file/out", "taken", "file"):
         assert str(tmp_path / folder) in command_error("study", path, "-o", tmp_path / folder)
 
@@ -84,13 +83,9 @@ def test_what_has_no_meaning_for_verlet_is_not_multiplied(tmp_path: Path):
 
 def test_nothing_is_measured_beyond_the_end_of_a_case(tmp_path: Path):
     """The scene's steps are of 0.01 s: 3 of them, or 1."""
-    scene = ONE_SCENE + "duration = 0.03\ntrue_error = 2\ntrace = 3\n"
-    sweep = "[[sweep]]\ntrace = true\ntime_steps = "
+    scene = ONE_SCENE + "duration = 0.03\ntrue_error = 2\n"
     study = load_study(study_file(tmp_path, scene + "[[sweep]]\ntime_steps = [0.01, 0.03]"))
     assert [case.true_error for case in study_cases(study, tmp_path, False)] == [2, 1]
-    assert study_cases(load_study(study_file(tmp_path, scene + sweep + "[0.01]")), tmp_path, False)[0].trace == 3
-    with pytest.raises(InputError, match="scene a: trace = 3, but newton takes 1 steps"):
-        study_cases(load_study(study_file(tmp_path, scene + sweep + "[0.03]")), tmp_path, False)
 
 
 def test_full_cases_are_for_full_studies_and_none_comes_twice(tmp_path: Path):

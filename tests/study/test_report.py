@@ -1,6 +1,5 @@
 """The report of a study: charts and page from the table alone."""
 
-import json
 import re
 from html import unescape
 from pathlib import Path
@@ -15,7 +14,6 @@ from msmpetsc.study.charts.curves import (
     STEP,
     TRAJECTORY,
     cheapest,
-    convergence_charts,
     front,
     front_rows,
     growth_charts,
@@ -42,24 +40,12 @@ SWEEP = [
     )
     for n, time in zip((1000, 10000, 100000), times, strict=True)
 ]
-TRACES = {
-    label: {
-        "frame": 7,
-        "iteration": [0, 1, 2],
-        "ksp_its": [0, 5, 9],
-        "seconds": [0.0, 0.011, 0.023],
-        "position_error": [0.3, rate, rate**2],
-        "energy_error": [0.1, None, rate**4],
-    }
-    for label, rate in (("newton", 0.012), ("anderson", 0.17))
-}
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory) -> Path:
-    """A folder with a report that has all three kinds of charts."""
+    """A folder with a report that has two kinds of charts."""
     folder = write_rows(tmp_path_factory.mktemp("study"), ERRORS + SWEEP)
-    (folder / "traces.json").write_text(json.dumps(TRACES))
     (folder / "study.toml").write_text('title = "Fast & exact"\n')
     assert write_report(folder) == folder / "report.html"
     return folder
@@ -163,8 +149,8 @@ def test_curves_of_one_label_are_told_apart_by_what_varies():
 
 
 def test_the_page_is_well_formed_and_png_files_stand_beside_it(study: Path, text: str):
-    assert Balance(text).open == [] and len(svgs(text)) == 3
-    names = {"pareto_block.png", "growth_bunny_0.01.png", "convergence_block.png"}
+    assert Balance(text).open == [] and len(svgs(text)) == 2
+    names = {"pareto_block.png", "growth_bunny_0.01.png"}
     assert {path.name for path in study.glob("*.png")} == names
     assert all((study / name).read_bytes().startswith(b"\x89PNG") for name in names)
     ids = re.findall(r"""\sid=["']([^"']+)["']""", text)
@@ -174,18 +160,10 @@ def test_the_page_is_well_formed_and_png_files_stand_beside_it(study: Path, text
 
 def test_every_point_tells_its_numbers(text: str):
     tips = tooltips(text)
-    assert len(tips) == (4 + 5) + 4 * 6 + 2 * 6  # pareto's panels, growth's panels, two traces in two panels
+    assert len(tips) == (4 + 5) + 4 * 6  # pareto's panels, growth's panels
     for row in (row for row in ERRORS + SWEEP if row["status"] == "ok"):
         assert any(row["label"] in tip and row["command"] in tip for tip in tips), row
     assert any("true error 3e-5\ntime frame 80 ms\ntime step 10 ms\n" in tip for tip in tips)
-    assert any("iteration 1\nseconds 11 ms\nposition error 1.7e-1\nksp its 5\n" in tip for tip in tips)
-
-
-def test_of_several_traces_of_a_method_the_furthest_is_shown():
-    errors = {"x": (0.5, 0.1), "y": (0.5, 1e-6), "z": (0.5, 1e-3)}
-    traces = {case: {"iteration": [0, 1], "seconds": [0, 1], "position_error": of} for case, of in errors.items()}
-    (chart,) = convergence_charts(typed([row_of("b", case=case) for case in traces]), curve_styles(["b"]), traces)
-    assert {value["y"] for value in values(chart.panels[0], "curve")} == {0.5, 1e-6}
 
 
 def test_the_report_needs_nothing_beside_itself(text: str):

@@ -1,7 +1,6 @@
 """What a study runs, how often, and what it does about what goes wrong. The runs are stand-ins."""
 
 # ruff: noqa: F811 (fixtures are imported)
-import json
 import os
 import signal
 import subprocess
@@ -23,7 +22,7 @@ from msmpetsc.study.table import COLUMNS, read_table, records, write_table
 
 def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     text = "repeats = 3\n" + ONE_SCENE + 'frame = 0.02\nreference = { integrator = "implicit-euler", step = 0.001 }\n'
-    text += 'trace = 2\n[[sweep]]\npresets = ["newton"]\nerrors = [0.1]\nranks = [2]\ntrace = true'
+    text += '[[sweep]]\npresets = ["newton"]\nerrors = [0.1]\nranks = [2]'
     (row,) = carry_out(tmp_path, text)
     assert set(row) == set(COLUMNS)
     # run 1 is the reference, 2, 3 and 4 are the repeats
@@ -36,10 +35,8 @@ def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     assert row["trajectory_error"] == pytest.approx(1.01 / 1.001 - 1)
     assert row["memory"] == 1000 - 4  # of the leanest run
     assert row["command"].startswith("mpiexec -n 2 msmpetsc run ")
-    assert sum("--trace 2" in call for call in calls(tmp_path)) == 1  # in the first repeat alone
-    assert json.loads((tmp_path / "out" / "traces.json").read_text())[row["case"]]["frame"] == 2
     left = [path.name for path in (tmp_path / "out").rglob("*") if path.is_file() and "references" not in str(path)]
-    assert sorted(left) == ["calls.txt", "study.toml", "table.csv", "traces.json"]
+    assert sorted(left) == ["calls.txt", "study.toml", "table.csv"]
 
 
 def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):

@@ -1,4 +1,4 @@
-"""Curves of methods: speed against accuracy, surface error over cost, growth with cells, convergence of a step.
+"""Curves of methods: speed against accuracy, surface error over cost, growth with cells.
 
 The errors are never mixed. The step error says how far a step is from the exact minimiser of its energy: methods can be
 compared by it where the time step is the same. The trajectory error says how far the run is from the true motion of the
@@ -6,10 +6,10 @@ lattice: explicit and implicit runs of any time step can be compared by it.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pandas import DataFrame, concat, to_numeric
+from pandas import DataFrame, concat
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import (
@@ -23,7 +23,6 @@ from msmpetsc.study.charts.plot import (
     Chart,
     CurveStyle,
     Styles,
-    axis_from_zero,
     log_axis,
     points,
 )
@@ -286,62 +285,4 @@ def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
         if timed:
             panel.whiskers(shown, ("cells", column), "curve")
         panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TIP), "curve")
-    return chart
-
-
-# ---- convergence within one step
-
-CONVERGENCE = "Convergence within one step"
-CONVERGENCE_CAPTION = (
-    "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second "
-    "number on. Of several cases of a method the one that went furthest is shown."
-)
-CONVERGENCE_PANELS = (
-    ("iteration", "iteration", "over the iterations", COUNT),
-    ("seconds", "computing time within the step", "over the computing time", SECONDS),
-)
-ITERATE = ("iteration", "seconds", "position_error", "energy_error", "ksp_its")
-
-
-def iterates(trace: dict[str, Any], row: Row) -> DataFrame:
-    """Return the iterates of a case that have a positive error, one row each."""
-    length = len(trace.get("position_error") or [])
-    columns = {name: (trace.get(name) or [None] * length)[:length] for name in ITERATE}
-    rows = DataFrame(columns, dtype=object).apply(to_numeric, errors="coerce").astype(float)
-    rows = rows.assign(label=row["label"], command=row["command"])
-    kept: DataFrame = rows[(rows["position_error"] > 0) & (rows["position_error"] < 1e300)]
-    return kept
-
-
-def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict[str, Any]]) -> list[Chart]:
-    """Return one chart for each scene that has traces, which are given by case."""
-    charts = []
-    for scene, rows in grouped(table[table["case"].isin(traces.keys())], "scene").items():
-        curves = furthest([iterates(traces[row["case"]], row) for row in records(rows)])
-        frames = {traces[case].get("frame") for case in rows["case"]}
-        step = f", step {frames.pop()}" if len(frames) == 1 else ""
-        if curves:
-            charts.append(
-                convergence_chart(f"convergence_{scene}", f"{CONVERGENCE}: {scene}{step}", concat(curves), styles)
-            )
-    return charts
-
-
-def furthest(curves: list[DataFrame]) -> list[DataFrame]:
-    """Return the trace of each method that ends with the least error, of which looser ones are parts."""
-    known = sorted((curve for curve in curves if len(curve)), key=lambda rows: -rows["position_error"].iloc[-1])
-    best = {rows["label"].iloc[0]: rows for rows in known}
-    return [best[label] for label in dict.fromkeys(rows["label"].iloc[0] for rows in curves if len(rows))]
-
-
-def convergence_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
-    """Return a chart of errors over iterations and over computing time, with one vertical scale."""
-    chart = Chart(
-        name, CONVERGENCE, title, CONVERGENCE_CAPTION, {label: styles[label] for label in dict.fromkeys(rows["label"])}
-    )
-    y = log_axis("true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|", rows["position_error"], ERROR)
-    for column, axis, title, words in CONVERGENCE_PANELS:
-        shown = rows.dropna(subset=[column])
-        panel = chart.panel(title, axis_from_zero(axis, list(shown[column]), words), y)
-        panel.curves(shown, (column, "position_error"), ITERATE)
     return chart

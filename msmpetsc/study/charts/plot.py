@@ -51,7 +51,6 @@ UNIT = "replace(format(datum.value, '~s'), regexp('([^0-9.]?)$'), '\N{NO-BREAK S
 # how the number of a tick is written, as an expression of Vega's
 ERROR = "replace(format(datum.value, '~e'), '+', '')"
 COUNT = "format(datum.value, '~s')"
-PLAIN = "format(datum.value, '~g')"
 SECONDS, BYTES = UNIT.format("s"), UNIT.format("B")
 
 
@@ -94,18 +93,6 @@ def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
     steps = (1, 2, 5) if high - low < 2.5 else (1,)
     ticks = [step * 10.0**decade for decade in range(math.floor(low), math.ceil(high)) for step in steps]
     return channel(title, words, ticks, type="log", domain=[10**low, 10**high])
-
-
-def axis_from_zero(title: str, values: Iterable[float], words: str) -> dict[str, Any]:
-    """Return an axis with 0 at the left, logarithmic from the least positive value on."""
-    positive = [value for value in values if value > 0]
-    if not positive:
-        return channel(title, words, [0], domain=[0, 1])
-    first = 10.0 ** math.floor(math.log10(min(positive)))
-    decades = round(math.log10(max(positive) / first)) + 1
-    steps = (1, 2, 5) if decades <= 2 else (1,)
-    ticks = [0.0, *(first * 10**decade * step for decade in range(decades) for step in steps)]
-    return channel(title, words, ticks, type="symlog", constant=first, domain=[0, 1.3 * max(positive)])
 
 
 @dataclass

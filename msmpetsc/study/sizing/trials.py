@@ -317,7 +317,7 @@ class Sizer:
         if done is not None:
             return done
         case = self.case(method, cells)
-        row = self.bench.measure(case, keep=True).row
+        row = self.bench.measure(case, keep=True)
         if row["status"] != "ok" or not row.get("time_second"):
             self.report(f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}")
             return None

@@ -40,10 +40,7 @@ class StepStopped(MsmpetscError):
 PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
 NO_ROOM = ENOSPC, EDQUOT, EFBIG
 EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by
-    "run": (
-        *("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w"),
-        *("trimesh", "igl", "pooch", "psutil", "tqdm", "shtab"),
-    ),
+    "run": ("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w", "trimesh", "igl", "pooch", "psutil", "tqdm"),
     "mesh": ("meshio", "manifold3d", "fast_simplification"),
     "render": ("pyvista", "scipy", "pydantic", "tomli_w", "trimesh", "igl", "tqdm"),
     "study": ("pandas", "vl_convert", "jinja2", "tomlkit"),

@@ -92,7 +92,6 @@ def whole(name: str, value: str, about: str, **keywords: Any) -> Argument:
     return argument(name, type=at_least_1, metavar=value, help=about, **keywords)
 
 
-SHELLS = ("bash", "zsh", "fish")
 SCENE = argument("scene", type=checked_path, metavar="SCENE", help="scene file (TOML)")
 SET = argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000")
 JSON = switch("--json", "print one JSON object and nothing else")
@@ -304,13 +303,5 @@ COMMANDS = {
         ("msmpetsc doctor",),
         description="Examine PETSc, MPI, the device, HDF5 and the packages of each extra. "
         "Exit status 1: a run lacks something that it needs.",
-    ),
-    "completion": Command(
-        "print the script by which a shell completes commands, options and files",
-        (
-            "msmpetsc completion bash > ~/.local/share/bash-completion/completions/msmpetsc",
-            "msmpetsc completion fish > ~/.config/fish/completions/msmpetsc.fish",
-        ),
-        (argument("shell", choices=SHELLS),),
     ),
 }  # fmt: skip

@@ -1,9 +1,8 @@
-"""What is about the program itself: doctor, completion, examples, quiet and verbose, mistaken words."""
+"""What is about the program itself: doctor, examples, quiet and verbose, mistaken words."""
 
 import json
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from block_scene import block_scene
 from conftest import ENVIRONMENT, python
 from one_process import command_error
 
-from msmpetsc.cli.arguments import option_names, parsed
+from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.commands import doctor
 from msmpetsc.cli.main import main
@@ -80,33 +79,6 @@ def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):
     assert "Traceback" in shown and "InputError" in shown, "where the refusal arose"
     assert main(["run", scene, "-o", str(tmp_path / "v.h5"), "--quiet", "--verbose"]) == 2
     assert "not allowed with" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_knows_all_commands_and_options_and_the_shell_takes_it(shell: str, tmp_path: Path, capsys):
-    assert main(["completion", shell]) == 0
-    script = capsys.readouterr().out
-    assert all(name in script for name in COMMANDS)
-    dashes = (name.removeprefix("--") if shell == "fish" else name for name in option_names("run"))
-    assert all(name in script for name in dashes if not name.startswith("-h"))
-    if shutil.which(shell):
-        (tmp_path / "script").write_text(script)
-        assert subprocess.run([shell, "-n", str(tmp_path / "script")]).returncode == 0
-
-
-def test_bash_completes_commands_and_files(tmp_path: Path, capsys):
-    assert main(["completion", "bash"]) == 0
-    (tmp_path / "script").write_text(capsys.readouterr().out)
-    (tmp_path / "my_scene.toml").write_text("")
-    function = "source ./script; complete -p msmpetsc | sed 's/.*-F \\([^ ]*\\).*/\\1/'"
-    ask = f"f=$({function}); source ./script; COMP_WORDS=(msmpetsc run my_); COMP_CWORD=2; $f; echo ${{COMPREPLY[@]}}"
-    done = subprocess.run(["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout.split() == ["my_scene.toml"], done.stderr
-    done = subprocess.run(
-        ["bash", "-c", ask.replace("run my_", "insp").replace("COMP_CWORD=2", "COMP_CWORD=1")],
-        cwd=tmp_path, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.stdout.split() == ["inspect"], done.stderr
 
 
 @pytest.mark.parametrize("command", ["schema", "--help", "keys"])

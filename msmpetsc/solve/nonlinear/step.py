@@ -2,9 +2,8 @@
 options (solve.presets)."""
 
 import ctypes
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -78,7 +77,6 @@ class Stepper:
 
     error          : relative error at which a step is done; None for the preset's own rule
     max_iterations : a budget instead of a promise: the step is taken as it is then
-    observer       : called with the positions (l, 3) [m] of each iterate, when its error is known
 
     Raises InputError for PETSc options that do not go together (collective).
     """
@@ -93,7 +91,6 @@ class Stepper:
     prefix: str = ""  # of its PETSc options
     static: bool = False  # what is looked for is an equilibrium: M weighs errors and nothing else
     softer: float = 9.0  # how far |F| may rise at first; then lambda, from one solid that leads on to the next
-    observer: Callable[[Positions], None] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.budget = self.max_iterations or 0
@@ -319,8 +316,6 @@ class Stepper:
         solved = self.outcome.is_enough
         if not solved:
             self._adapt()
-        elif self.observer:
-            self.observer(iterate.q)
         return solved
 
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
@@ -404,8 +399,6 @@ class Stepper:
         outcome = self.outcome
         if self.ksp.reason == INDEFINITE:
             self.outcome = outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
-        if self.observer:
-            self.observer(iterate.q)
         if not np.isfinite(outcome.residual):
             return NOT_FINITE
         if self.is_first and self._overshoots(its):

@@ -269,7 +269,6 @@ COMMANDS = {
         ),
         (
             argument("scenes", type=checked_file, nargs="+", metavar="SCENE", help="scene files (TOML)"),
-            argument("--baseline", type=checked_file, metavar="FILE.json", help="default: SCENE.baseline.json"),
             ranks("MPI ranks of the runs (1)"),
             switch("--update", "store the numbers, in place of those stored before"),
             whole("--cells", "N", "of --update: cages.count; the scene's if not given"),

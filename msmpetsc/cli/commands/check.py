@@ -24,7 +24,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import msmpetsc
-from msmpetsc.app.checks import MEASURE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError, printable
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import load_scene
@@ -80,13 +79,10 @@ class Numbers(_Strict):
 
 def run(args: argparse.Namespace) -> int:
     """Run each scene, and compare or store its numbers; return the exit status."""
-    refuse_other_format("--baseline", args.baseline, MEASURE_NAMES)
-    if args.baseline and len(args.scenes) > 1:
-        raise InputError("--baseline names the numbers of one scene: of several, each has its own beside it")
     asked = None
     if args.frames or args.cells or args.set:
         asked = Recipe(cells=args.cells, steps=min(args.frames or STEPS, MOST_STEPS), changes=args.set)
-    files = {scene: args.baseline or scene.with_suffix(".baseline.json") for scene in args.scenes}
+    files = {scene: scene.with_suffix(".baseline.json") for scene in args.scenes}
     if not args.update:
         if asked:
             raise InputError("--cells, --frames and --set are for --update: the numbers stored say how they were made")

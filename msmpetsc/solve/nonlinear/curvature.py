@@ -2,7 +2,6 @@
 
 F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H
 is positive definite for certain, which one pass over the springs tells.
-
 Elsewhere the load factor nu may say so, the greatest with H v = (1 - nu) H+ v, H+ the projected Hessian, which has
 nothing negative and all of M: no eigenvalue of M^(-1) H is below 1 - nu. It is 1 where a body buckles, and grows as
 what presses the body does (linear buckling analysis), so that one that was found serves for many steps. Where it is not
@@ -37,7 +36,7 @@ SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones l
 MORE = 1.25  # times the compression of the last long search, or its mode's curvature: another mode may be lowest
 ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
-DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
+DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none; a compression that is none
 
 Block = tuple[Rows, ...]  # directions (k, n), what H makes of them, and what M or the projected Hessian does
 Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
@@ -66,7 +65,6 @@ EFFORT = SearchEffort(4, 12, 2)
 UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 UNCHANGED = 0.1  # of its curvature: a mode that is followed by multigrid is taken as it is
 LIGHT = 0.5  # load factor: up to there no mode need be known
-LOADED = 3  # iterations of its search; one less where a mode is known
 UNSEEN = 1.2  # times the load factor that a few iterations find, which is no more than the true one
 GROWN = 4.0  # times the compression that it was found at: so far a body is taken to be loaded alike
 NEGLIGIBLE = 0.3  # of the greatest compression: nodes of less do not say how it has grown
@@ -74,9 +72,7 @@ NEGLIGIBLE = 0.3  # of the greatest compression: nodes of less do not say how it
 
 @dataclass(frozen=True)
 class Compression:
-    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m, that of
-    its contacts with itself included; whether a cell resists.
-    """
+    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
 
     greatest: float
     total: float
@@ -84,13 +80,8 @@ class Compression:
     inertia: bool = True  # M is part of H, which outweighs what is not positive in the rest
 
     @property
-    def is_harmless(self) -> bool:
-        """H is positive definite for certain: M outweighs all that is negative in it."""
-        return self.least_curvature > 0
-
-    @property
     def least_curvature(self) -> float:
-        """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
+        """No eigenvalue of M^(-1) H is less; 0 where M does not outweigh all that is negative for certain."""
         return max(1 - self.greatest, 0.0) if self.inertia and not self.resists else 0.0
 
 
@@ -194,9 +185,8 @@ class LowestCurvature:
     def _load(self, q: Positions) -> float:
         """The load factor at positions q (l, 3) [m], at the most: as far as the body is loaded as it was when that was
         found, it grows as the compression does."""
-        floor = NEGLIGIBLE * self.comm.allreduce(greatest(self.loads), MPI.MAX)
-        growth = np.inf if floor == 0.0 else greatest(self.ratios / np.maximum(self.loads, floor))
-        growth = self.comm.allreduce(growth, MPI.MAX)
+        floor = NEGLIGIBLE * max(self.comm.allreduce(greatest(self.loads), MPI.MAX), DEPENDENT)
+        growth = self.comm.allreduce(greatest(self.ratios / np.maximum(self.loads, floor)), MPI.MAX)
         load: float = UNSEEN * self.load * growth
         is_heavy = MORE * UNSEEN * self.load > LIGHT  # so nearly that a search would soon be due again
         if not np.isfinite(load) or (not is_heavy and (growth > GROWN or load > LIGHT)):
@@ -210,7 +200,7 @@ class LowestCurvature:
         self.projected.linearise(q, self.functional.problem.contact, True)
         known = [] if self.load_mode is None else [self.load_mode[None]]
         start = np.concatenate([*known, self._random(2 - len(known))])
-        values, modes = self._iterate(start, 2, MOST, LOADED - len(known), self.projected.mult)
+        values, modes = self._iterate(start, 2, MOST, UNIFORM_EFFORT.least - len(known), self.projected.mult)
         self.load_mode = modes[0].copy()
         self.hessian.products += self.projected.products
         self.projected.products = 0
@@ -297,12 +287,7 @@ class LowestCurvature:
         if len(span) <= size:
             return values[:size], (best, None)
         rest = like(span, parts[:, size:])
-        return values[:size], (best, self._scaled(tuple(rest @ rows[size:] for rows in block)))
-
-    def _scaled(self, block: Block) -> Block:
-        """A block whose directions have unit length in the norm of M."""
-        lengths = like(block[0], np.maximum(self._lengths(block[0]), TINY))[:, None]
-        return tuple(rows / lengths for rows in block)
+        return values[:size], (best, tuple(rest @ rows[size:] for rows in block))
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal

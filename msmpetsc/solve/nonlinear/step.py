@@ -289,7 +289,7 @@ class Stepper:
         """Whether x is a minimum, and how far from it (collective)."""
         control, functional, q = self.control, self.functional, self.functional.positions(self.x)
         compression = self.minimum.curvature.compression(q)
-        if compression.is_harmless:
+        if compression.least_curvature > 0:
             return Verdict(outcome.error, is_minimum=True)
         enough = control.target * functional.distance(q) if control.target else np.inf
         verdict = self.minimum.examine(self.x, outcome.corrected, compression, outcome.alarm, enough)
@@ -313,10 +313,9 @@ class Stepper:
             return False
         iterate = self._evaluate(self.x)
         self.outcome = self.control.judge(iterate, self.outcome)
-        solved = self.outcome.is_enough
-        if not solved:
+        if not self.outcome.is_enough:
             self._adapt()
-        return solved
+        return self.outcome.is_enough
 
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
         with LOCAL:

@@ -21,12 +21,12 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import Case
 from msmpetsc.study.metrics import surface_error
-from msmpetsc.study.runner import CaseResult
 from msmpetsc.study.sizing import trials
 from msmpetsc.study.sizing.answer import SizePlan, overrides, put_into, tables
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 from msmpetsc.study.sizing.trials import Asked, Sizer
+from msmpetsc.study.table import Row
 
 STATIC = 'integrator = "static"'
 
@@ -159,22 +159,22 @@ class Bodies:
         stuck = 0.3 * (len(self.errors) % 2) if self.impacts else 0.0
         return min(self.most, self.cell_error * cells**-0.5) + time + 0.1 * (case.error or 0) + stuck
 
-    def measure(self, case: Case, keep: bool) -> CaseResult:
+    def measure(self, case: Case, keep: bool) -> Row:
         assert keep and case.stores_surface
         explicit = case.integrator == "verlet"
         steps = 1 if case.integrator == "static" else max(0.01 / case.time_step, case.time_step / 0.01)
         assert steps == pytest.approx(round(steps))  # so that frames come at the same times
         if explicit and (not self.explicit or self.slow(case.time_step)):
-            return CaseResult({"status": "timeout", "reason": "took longer than 1 s"}, None)
+            return {"status": "timeout", "reason": "took longer than 1 s"}
         (cells,) = (int(text.partition("count = ")[2].strip(" }")) for text in case.set if text.startswith("cages="))
         if self.fails(case.integrator, cells):
-            return CaseResult({"status": "failed", "reason": "planted"}, None)
+            return {"status": "failed", "reason": "planted"}
         self.errors[self.result_of(case)] = self.error_of(case, cells)
         substeps = math.ceil(case.time_step / 1e-3) if explicit else 3
         cost = 1e-6 * cells * (substeps if explicit else 5) / case.time_step
         row = {"status": "ok", "reason": "", "cells": float(cells), "time_second": cost, "iterations": substeps - 0.3}
         row["inverted"] = self.inverted(cells)
-        return CaseResult(row, None)
+        return row
 
 
 def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
@@ -327,9 +327,7 @@ def test_a_law_is_not_advised_to_a_scene_that_has_it(tmp_path: Path, monkeypatch
 def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monkeypatch):
     said: list = []
     bench = Bodies()
-    monkeypatch.setattr(
-        bench, "measure", lambda case, keep: CaseResult({"status": "failed", "reason": "planted"}, None)
-    )
+    monkeypatch.setattr(bench, "measure", lambda case, keep: {"status": "failed", "reason": "planted"})
     (tmp_path / "scene.toml").write_text(SCENE)
     sizer = Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10, None), said.append)
     with pytest.raises(InputError, match="the trials failed"):

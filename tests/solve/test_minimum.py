@@ -136,6 +136,25 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     simulation.destroy()
 
 
+def test_a_load_factor_serves_until_the_body_is_pressed_much_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(preconditioning, "LARGE", 1)
+    simulation, q = squashed(tmp_path, 0.97)
+    stepper = simulation.integrator.stepper
+    curvature = stepper.minimum.curvature
+
+    def look(share: float) -> tuple[float, int]:
+        at = q * [1, 1, share / 0.97]
+        stepper.functional.begin(StepProblem(at, at, np.zeros((len(at), 3))))
+        stepper.jacobian.hessian.linearise(at, None)
+        before = curvature.products
+        return curvature.lowest(at, curvature.compression(at), Alarm.NOWHERE, None)[0], curvature.products - before
+
+    (first, searched), (second, free), (third, again) = look(0.97), look(0.94), look(0.6)
+    assert searched > 0 and free == 0 and again > 0
+    assert 1 > first > second > third > 0.5, "each a bound, and pressed more"
+    simulation.destroy()
+
+
 def dense_hessian(stepper: Stepper) -> np.ndarray:
     x, y = stepper.jacobian.operator.createVecs()
     columns = []

@@ -106,7 +106,6 @@ class LowestCurvature:
         self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
         self.value = 0.0  # its curvature when it was found
         self.knows_mode = False  # in the last checkpoint
-        self.projected = TrueHessian(self.unknowns, functional.elasticity, functional.time_step, hessian.contact)
         self.load = np.inf  # load factor found last; infinite where none was
         self.loads = np.zeros_like(functional.lattice.mass[self.unknowns.free])  # compression (m,) that it was found at
         self.load_mode: Floats | None = None  # and its mode (n,)
@@ -197,13 +196,14 @@ class LowestCurvature:
 
     def _load_factor(self, q: Positions) -> float:
         """The greatest nu with H v = (1 - nu) H+ v, H+ the projected Hessian, found by a few iterations."""
-        self.projected.linearise(q, self.functional.problem.contact, True)
+        functional, hessian = self.functional, self.hessian
+        projected = TrueHessian(self.unknowns, functional.elasticity, functional.time_step, hessian.contact)
+        projected.linearise(q, functional.problem.contact, True)
         known = [] if self.load_mode is None else [self.load_mode[None]]
         start = np.concatenate([*known, self._random(2 - len(known))])
-        values, modes = self._iterate(start, 2, MOST, UNIFORM_EFFORT.least - len(known), self.projected.mult)
+        values, modes = self._iterate(start, 2, MOST, UNIFORM_EFFORT.least - len(known), projected.mult)
         self.load_mode = modes[0].copy()
-        self.hessian.products += self.projected.products
-        self.projected.products = 0
+        hessian.products += projected.products
         return 1 - float(values[0])
 
     def _followed(self) -> tuple[Floats, Rows] | None:

@@ -38,6 +38,7 @@ from msmpetsc.solve.presets import Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
+SOFTER = 9.0  # how far |F| may rise at first; then lambda, from one solid that leads on to the next
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 CLIMBS = (  # PETSc takes it for a minimum where |H F| / |F| < 1e-4, as any is in small units
@@ -90,7 +91,6 @@ class Stepper:
     touches: bool = False  # whether steps may have a ``contact``
     prefix: str = ""  # of its PETSc options
     static: bool = False  # what is looked for is an equilibrium: M weighs errors and nothing else
-    softer: float = 9.0  # how far |F| may rise at first; then lambda, from one solid that leads on to the next
 
     def __post_init__(self) -> None:
         self.budget = self.max_iterations or 0
@@ -274,7 +274,7 @@ class Stepper:
                 self.forget(modes=False)
                 self.solve_once(Outcome(max(self.control.target, DEFAULT_ERROR)))
                 self.slopes = solid.hessian_at(self.functional.positions(self.x), False).slopes
-            ratio *= self.softer
+            ratio *= SOFTER
         self.forget(modes=False)
         return self.solve_once(outcome)
 
@@ -420,7 +420,7 @@ class Stepper:
         self.is_first = its == 0
         if self.is_first:
             self.begun = self.outcome.residual
-        return self.outcome.residual > self.softer * self.begun
+        return self.outcome.residual > SOFTER * self.begun
 
     def _iterate(self, snes: PETSc.SNES) -> Iterate:
         """Return SNES's iterate, and F there."""

@@ -203,7 +203,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
     What only prepares steps stays in the memory of the CPU.
     """
 
-    lattice, (positions, velocities) = model.lattice, model.start
+    lattice, (positions, velocities), solid = model.lattice, model.start, model.lattice.solid
     return replace(
         model,
         lattice=replace(
@@ -212,6 +212,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
             mass=send(lattice.mass),
             pinned=send(lattice.pinned),
             local_cells=send(lattice.local_cells),
+            solid=solid and solid._replace(forms=send(solid.forms)),
         ),
         loads=[replace(load, force=send(load.force)) for load in model.loads],
         anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],

@@ -1,22 +1,30 @@
-"""Strains of eight cells at once, in the lanes of vectors: the loops over cells that a law of solids is made of.
+"""The loops over cells that a neo-Hookean solid is made of, on a CPU: eight cells at once, in the lanes of vectors.
 
 numba makes vectors of loops over the lanes of one work array with constant offsets. It holds, LANES numbers each, the
 values at a cell's 8 corners (3 components each), its constants, what a law keeps of it, and 3 components of the result
-at 8 corners. The formulas are those of elasticity.cell_strain.
+at 8 corners. The formulas are those of elasticity.cell_strain and elasticity.neo_hookean.
 """
-
-from typing import NamedTuple
 
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Rows
-from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain
-from msmpetsc.lattice.cell_moments import FORM
-
-ROWS = FORM + 2  # of a cell's constants: its form, modes times m = mu V / (16 h^2); m; lambda V / (16 h^2)
-STATE = 11  # F by rows, V U' / (16 h^2), V U'' / (16 h^2)
-BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of VTK's order, x fastest, then y
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks
+from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
+from msmpetsc.elasticity.neo_hookean import (
+    changes,
+    cofactors,
+    determinant,
+    gradient_of,
+    pull,
+    quadratic,
+    quadratic_change,
+    slopes_at,
+    turned_pull,
+    volume_change,
+    volume_energy,
+    write_state,
+)
 
 # where things stand in the work array, after the corners' values
 CONSTANTS = 24 * LANES
@@ -27,37 +35,24 @@ WORK = RESULT + 24 * LANES
 FAST = {"contract", "nsz", "reassoc", "arcp"}  # numba: sums may be reordered, for lanes
 
 
-class Blocks(NamedTuple):
-    """Cells of a rank, eight a block; the last block of a kind is filled up with cells of no stiffness.
-
-    nodes     : (b, LANES, 8) local corner nodes, x fastest; unsigned, so that no index is looked at for being negative
-    which     : (b,) row of the constants
-    constants : (k, ROWS * LANES), LANES of each number
-    """
-
-    nodes: Indices
-    which: Indices
-    constants: Rows
-
-
 @numba.njit(cache=True, inline="always")
-def component_in(w: Floats, at: int) -> Eight:
+def _component_in(w: Floats, at: int) -> Eight:
     return w[at], w[at + 24], w[at + 48], w[at + 72], w[at + 96], w[at + 120], w[at + 144], w[at + 168]
 
 
 @numba.njit(cache=True, inline="always")
-def strains_in(w: Floats, lane: int, at: int = 0) -> Strains:
+def _strains_in(w: Floats, lane: int, at: int = 0) -> Strains:
     """Return the strains of the cell in a lane, by the corners' values from ``at`` on."""
     form = form_of(w, CONSTANTS + lane)
     return (
-        strain(component_in(w, at + lane), form),
-        strain(component_in(w, at + lane + 8), form),
-        strain(component_in(w, at + lane + 16), form),
+        strain(_component_in(w, at + lane), form),
+        strain(_component_in(w, at + lane + 8), form),
+        strain(_component_in(w, at + lane + 16), form),
     )
 
 
 @numba.njit(cache=True, inline="always")
-def gather(nodes: Indices, b: int, q: Rows, w: Floats, at: int = 0) -> None:
+def _gather(nodes: Indices, b: int, q: Rows, w: Floats, at: int = 0) -> None:
     for lane in range(LANES):
         for a in range(8):
             i, k = nodes[b, lane, a], at + 24 * a + lane
@@ -65,7 +60,7 @@ def gather(nodes: Indices, b: int, q: Rows, w: Floats, at: int = 0) -> None:
 
 
 @numba.njit(cache=True, inline="always")
-def scatter(nodes: Indices, b: int, w: Floats, rows: Rows) -> None:
+def _scatter(nodes: Indices, b: int, w: Floats, rows: Rows) -> None:
     for lane in range(LANES):
         for a in range(8):
             i = nodes[b, lane, a]
@@ -75,21 +70,111 @@ def scatter(nodes: Indices, b: int, w: Floats, rows: Rows) -> None:
 
 
 @numba.njit(cache=True, inline="always")
-def load(rows: Rows, row: int, w: Floats, at: int) -> None:
+def _load(rows: Rows, row: int, w: Floats, at: int) -> None:
     for i in range(rows.shape[1]):
         w[at + i] = rows[row, i]
 
 
-def in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
-    """Return cells in blocks (b, LANES, 8) and their constants (b, ROWS * LANES); the last is filled up by no cells."""
-    lacking = -len(nodes) % LANES
-    nodes = np.concatenate([nodes, np.repeat(nodes[-1:], lacking, axis=0)]).astype(np.uint32)
-    rows = np.concatenate([constants, np.zeros((lacking, ROWS))]).reshape(-1, LANES, ROWS)
-    return nodes.reshape(-1, LANES, 8), rows.transpose(0, 2, 1).reshape(-1, ROWS * LANES)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _product_lanes(w: Floats) -> None:
+    for lane in range(LANES):
+        k, e = CONSTANTS + lane, _strains_in(w, lane)
+        write_forces(w, RESULT + lane, w, k, turned_pull(e, w[k + 104], w, AT_STATE + lane), e)
 
 
-def shared(rows: Rows) -> tuple[Indices, Rows]:
-    """Return the row (b,) of each block's constants, and the constants: those equal to the first are kept once."""
-    own = (rows != rows[:1]).any(axis=1)
-    which = np.where(own, np.cumsum(own), 0)
-    return which.astype(np.int32), np.concatenate([rows[:1], rows[own]])
+@numba.njit(cache=True)
+def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
+    """Add (Hessian) v [N] to ``product`` (l, 3), its ``state`` that of ``linearise``; all of one dtype."""
+    w = np.zeros(WORK, v.dtype)
+    for b in range(len(blocks.nodes)):
+        _gather(blocks.nodes, b, v, w)
+        _load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _load(state, b, w, AT_STATE)
+        _product_lanes(w)
+        _scatter(blocks.nodes, b, w, product)
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _gradient_lanes(w: Floats, h4: float) -> None:
+    for lane in range(LANES):
+        k, e = CONSTANTS + lane, _strains_in(w, lane)
+        write_forces(w, RESULT + lane, w, k, pull(e, w[k + 104], w[k + 112], h4), e)
+
+
+@numba.njit(cache=True)
+def add_gradient(blocks: Blocks, h4: float, q: Positions, gradient: Rows) -> None:
+    """Add grad E [N] at q (l, 3) [m] to ``gradient`` (l, 3); ``h4`` is 4 h [m]."""
+    w = np.zeros(WORK)
+    for b in range(len(blocks.nodes)):
+        _gather(blocks.nodes, b, q, w)
+        _load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _gradient_lanes(w, h4)
+        _scatter(blocks.nodes, b, w, gradient)
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _state_lanes(w: Floats, over: float, projected: bool) -> None:
+    for lane in range(LANES):
+        f = gradient_of(_strains_in(w, lane), over)
+        slope, curvature = slopes_at(f, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane], projected)
+        write_state(w, AT_STATE + lane, f, slope, curvature)
+
+
+@numba.njit(cache=True)
+def linearise(blocks: Blocks, h4: float, q: Positions, projected: bool, state: Rows) -> None:
+    """Write what a Hessian keeps of each cell into ``state`` (b, STATE * LANES)."""
+    w = np.zeros(WORK)
+    for b in range(len(blocks.nodes)):
+        _gather(blocks.nodes, b, q, w)
+        _load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _state_lanes(w, 1.0 / h4, projected)
+        for i in range(STATE * LANES):
+            state[b, i] = w[AT_STATE + i]
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _energy_lanes(w: Floats, over: float) -> None:
+    for lane in range(LANES):
+        e, s = _strains_in(w, lane), AT_STATE + lane
+        f = gradient_of(e, over)
+        w[s] = determinant(f, cofactors(f))
+        w[s + 8] = 0.5 * quadratic(w, CONSTANTS + lane, e, e)
+
+
+@numba.njit(cache=True)
+def cell_energies(blocks: Blocks, h4: float, q: Positions, energies: Rows) -> None:
+    """Write the energy of cells [J] at q (l, 3) [m], 0 at rest, into ``energies`` (b, LANES), of the first b blocks."""
+    w = np.zeros(WORK)
+    for b in range(len(energies)):
+        _gather(blocks.nodes, b, q, w)
+        _load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _energy_lanes(w, 1.0 / h4)
+        for lane in range(LANES):  # logarithms, which are no lanes'
+            s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
+            volume = volume_energy(w[s], m, lame) if m > 0.0 else 0.0
+            energies[b, lane] = w[s + 8] + h4 * h4 * (volume - 1.5 * m)
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _change_lanes(w: Floats, over: float) -> None:
+    for lane in range(LANES):
+        moved, base, s = _strains_in(w, lane), _strains_in(w, lane, RESULT), AT_STATE + lane
+        w[s], w[s + 8] = changes(gradient_of(moved, over), gradient_of(base, over))
+        w[s + 16] = quadratic_change(w, CONSTANTS + lane, moved, base)
+
+
+@numba.njit(cache=True)
+def elastic_change(blocks: Blocks, owned: int, h4: float, q: Positions, base: Positions) -> float:
+    """Return E(q) - E(base) [J] of the first ``owned`` blocks, by how the nodes moved, so that it keeps its digits."""
+    moved, w, change = q - base, np.zeros(WORK), 0.0
+    for b in range(owned):
+        _gather(blocks.nodes, b, moved, w)
+        _gather(blocks.nodes, b, base, w, RESULT)
+        _load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _change_lanes(w, 1.0 / h4)
+        for lane in range(LANES):
+            s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
+            before, more = w[s], w[s + 8]
+            if m > 0.0:
+                change += w[s + 16] + h4 * h4 * volume_change(before + more, before, more, m, lame)
+    return change

@@ -20,6 +20,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.elasticity.cell_blocks import rows_of
 from msmpetsc.elasticity.cell_strain import Six, strain
 from msmpetsc.elasticity.springs import Product, Vector, between, dot
 from msmpetsc.lattice.lattice import Lattice
@@ -176,15 +177,20 @@ def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
     return x, y, z
 
 
-@numba.njit(cache=True)
+@kernel
+def _volume_ratio_of(
+    first: int, count: int, step: int, q: Positions, cells: Indices, forms: Rows, volume: float, ratios: Floats,
+) -> None:  # fmt: skip
+    for i in range(first, count, step):
+        f, c = forms[i], cells[i]
+        form = f[0], f[1], f[2], f[3], f[4], f[5]
+        ratios[i] = _volume(_mean_slope(q, c, 0, form), _mean_slope(q, c, 1, form), _mean_slope(q, c, 2, form)) / volume
+
+
 def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -> Floats:
     """Return J (c,) of a solid's cells: det of the mean slope of q (l, 3) [m] over what is inside, 1 at rest [-]."""
-    ratios, volume = np.empty(len(cells)), (4.0 * cell_size) ** 3
-    for i in range(len(cells)):
-        f = forms[i]
-        form = f[0], f[1], f[2], f[3], f[4], f[5]
-        c = cells[i]
-        ratios[i] = _volume(_mean_slope(q, c, 0, form), _mean_slope(q, c, 1, form), _mean_slope(q, c, 2, form)) / volume
+    ratios = np.empty(len(cells), like=q)
+    _volume_ratio_of(len(cells), q, cells, forms, (4.0 * cell_size) ** 3, ratios)
     return ratios
 
 
@@ -294,12 +300,7 @@ class Cells:
         laws = Resistance(cells, stiffness, volume), Resistance(cells[owned], stiffness[owned], volume)
         if on_host(lattice.nodes):
             return cls(*laws)
-        nodes = to_host(cells).ravel()
-        by_node = np.argsort(nodes, kind="stable")
-        by_node = by_node[: np.searchsorted(nodes[by_node], lattice.owned)]
-        node = nodes[by_node]
-        around = np.full((8, lattice.owned), len(nodes))
-        around[np.arange(len(node)) - np.searchsorted(node, node), node] = by_node
+        around = rows_of(to_host(cells).ravel(), lattice.owned)
         return cls(*laws, like(lattice.nodes, around))
 
     def energy(self, q: Positions) -> float:

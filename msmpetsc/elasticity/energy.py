@@ -6,10 +6,9 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host, to_host
 from msmpetsc.elasticity.cell_volume import Cells
-from msmpetsc.elasticity.neo_hookean import NeoHookean
+from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.springs import Product, SpringGather, SpringScatter
 from msmpetsc.elasticity.viscosity import Viscosity
-from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
@@ -69,7 +68,7 @@ class Flops:
 class Elasticity:
     """E of this rank's part of a lattice, its gradient and its Hessian.
 
-    It is that of a neo-Hookean solid (elasticity.neo_hookean), or of Hooke's springs (elasticity.springs), or, where
+    It is that of a neo-Hookean solid (elasticity.solid), or of Hooke's springs (elasticity.springs), or, where
     that law stiffens, of stiffening ones and of cells that resist being turned inside out (elasticity.cell_volume).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the owned
@@ -82,12 +81,10 @@ class Elasticity:
         on_cpu = on_host(lattice.nodes)
         self.springs: SpringScatter | SpringGather | None = None
         self.cells: Cells | None = None
-        if lattice.solid is not None and not on_cpu:
-            raise InputError('material.law = "neo-hookean" is computed on CPUs: --device cpu')
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
         self.viscosity: Viscosity | None = None
         if self.solid and lattice.viscous:
-            self.viscosity = Viscosity.of_solid(self.solid, lattice.viscous, lattice.nodes)
+            self.viscosity = Viscosity.of_solid(self.solid, lattice.viscous, lattice.owned, lattice.nodes)
         if self.solid is None:
             self.springs = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
         if lattice.stiffening > 0:

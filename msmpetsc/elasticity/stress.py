@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows
-from msmpetsc.elasticity.cell_lanes import STATE
+from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
+from msmpetsc.elasticity.cell_blocks import STATE
 from msmpetsc.elasticity.cell_strain import LANES
-from msmpetsc.elasticity.neo_hookean import ONSET, NeoHookean, cell_energies
+from msmpetsc.elasticity.neo_hookean import ONSET
+from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.lattice.lattice import Lattice
 
 UPPER = np.array([0, 4, 8, 1, 5, 2])  # xx, yy, zz, xy, yz, xz of a tensor's nine
@@ -33,8 +34,8 @@ class StressField:
     def __init__(self, lattice: Lattice, solid: NeoHookean):
         assert lattice.solid is not None
         self.solid, self.cells, self.cells_owned = solid, lattice.solid, lattice.cells_owned
-        corners = lattice.local_cells
-        first, lanes = np.unique(solid.blocks.nodes[:, :, 0], return_index=True)  # before the lanes that fill up
+        corners, of_blocks = to_host(lattice.local_cells), to_host(solid.blocks.nodes)
+        first, lanes = np.unique(of_blocks[:, :, 0], return_index=True)  # before the lanes that fill up
         self.lanes = lanes[np.searchsorted(first, corners[:, 0])]
         weights, number = np.repeat(self.cells.volume, 8), np.repeat(np.arange(len(corners)), 8)
         around = csr_array((weights, (corners.ravel(), number)), shape=(len(lattice.nodes), len(corners)))
@@ -47,13 +48,13 @@ class StressField:
         A stress is a row (6,) of xx, yy, zz, xy, yz, xz [Pa]; strain energies are [J/m^3] of volume at rest. Below J_0,
         where U is no solid's any more, J_0 stands for J, so that the stress stays finite.
         """
-        state = self.solid.state(q, False).reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
+        rows = to_host(self.solid.hessian_at(q, False).state)
+        state = rows.reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
         f, slope = state[:, :9].reshape(-1, 3, 3), state[:, 9] * self.solid.h4**2 / self.cells.volume
         share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
         stress: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
         stress[:, :3] += slope[:, None]
-        energy = np.empty((len(self.solid.blocks.nodes), LANES))
-        cell_energies(self.solid.blocks, self.solid.h4, q, energy)
+        energy = to_host(self.solid.energies(q, len(self.solid.blocks.nodes)))
         energies = energy.ravel()[self.lanes] / self.cells.volume
         own = slice(self.cells_owned)
         of_nodes = _fields(self.around @ stress, self.around @ energies)

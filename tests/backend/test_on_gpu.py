@@ -48,8 +48,19 @@ LED = {
                 "path": [{"time": 4 * T, "by": [0.05, 0, 0]}]}]
 }  # fmt: skip
 STIFFENING = {"material": {"young_modulus": 2e4, "density": 1000.0, "law": "stiffening"}}
+SOLID = {"material": {"young_modulus": 2e4, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.4}}
+VISCOUS = {"material": {**SOLID["material"], "retardation_time": 0.01}}
 CASES = {
     "newton": FALL,
+    "solid": {**FALL, **SOLID, **HELD, **LED},
+    "solid, pressed, viscous": {**FALL, **VISCOUS, "obstacle": [{**FLOOR, "response": "penalty"}, PLATE]},
+    "solid, bdf2": {**FALL, **VISCOUS, **HELD, "time": {**FALL["time"], "integrator": "bdf2"}},
+    "solid, static": {
+        "time": {**FALL["time"], "integrator": "static"}, "gravity": {"acceleration": [0, 0, -40.0]}, **HELD,
+        "material": {**SOLID["material"], "poisson_ratio": 0.499}, "output": {"stress": True},
+    },
+    "solid, verlet": {**FALL, **SOLID, **LED, "time": {**FALL["time"], "integrator": "verlet"}},
+    "solid, multigrid": {**FALL, **VISCOUS, **HELD, "solver": {"preset": "newton-multigrid", "error": 1e-9}},
     "held, led and let go": {**FALL, **HELD, **LED},
     "reflected": {**FALL, "obstacle": [{**FLOOR, "response": "reflect"}]},
     "pressed, rubbed and stiffening": {**FALL, **STIFFENING, "obstacle": [{**FLOOR, "response": "penalty"}, PLATE]},
@@ -172,6 +183,7 @@ SIMULATED = {
         "obstacle": [{**FLOOR, "point": [0, 0, 0.01], "response": "penalty", "friction": 0.3}],  # it begins in touch
     },
     "verlet": {**CASES["verlet"], "time": {"step": T, "duration": T, "integrator": "verlet"}},
+    "solid": {**CASES["solid, multigrid"], "time": {"step": T, "duration": 2 * T}},
 }  # fmt: skip
 
 

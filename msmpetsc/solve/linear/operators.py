@@ -12,7 +12,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, lik
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
-from msmpetsc.elasticity.neo_hookean import CellHessians
+from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.petsc.device import Memory
@@ -113,7 +113,7 @@ class TrueHessian:
             self.surface = contact.surface.hessian(q, projected) if contact and contact.surface else None
 
     def take_slopes(self, slopes: Array) -> None:
-        """Take other V U' of a solid's cells (elasticity.neo_hookean.CellHessians) than those at q."""
+        """Take other V U' of a solid's cells (elasticity.solid.CellHessians) than those at q."""
         for part in self.elastic.parts if self.elastic else ():
             if isinstance(part, CellHessians):
                 part.slopes[:] = slopes

@@ -15,9 +15,12 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.elasticity.cell_strain import form_of, modes_forces, strain
+from msmpetsc.elasticity.cell_threads import constants_at, flat, state_at
 from msmpetsc.elasticity.cell_volume import FRAMES, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.elasticity.neo_hookean import add_coarse
+from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_gradient
+from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import SYMMETRIC, spring_block
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
@@ -133,16 +136,17 @@ class GalerkinSum:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes
         [N/m] (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
-        law, mass, solid = (*self.law, self.unknowns.lattice.stiffening), self.unknowns.ballast, self.elasticity.solid
+        law, mass = (*self.law, self.unknowns.lattice.stiffening), self.unknowns.ballast
+        solid, viscosity = self.elasticity.solid, self.elasticity.viscosity
         if solid is None:
             add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
         add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]
         weights = self.t2**0.5 * self.weights  # a Hessian is of second degree in them
-        if solid:
-            add_coarse(self.cells, solid.blocks, solid.state(q, True), weights, self.places, values)
-        if viscosity := self.elasticity.viscosity:
-            add_coarse(self.cells, viscosity.blocks, viscosity.state, weights, self.places, values)
+        hessians: list[CellHessians] = [solid.hessian_at(q, True)] if solid else []
+        for hessian in hessians + ([viscosity.hessian] if viscosity else []):
+            state, scratch = hessian.state.ravel(), np.empty((1 if on_host(q) else count, 8, 14), like=q)
+            add_solid(count, *self.cells, *flat(hessian.blocks)[1:], state, weights, scratch, self.places, values)
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
@@ -303,6 +307,66 @@ def add_nodes(
                     block[3] += f * t2 * c[4]
                     block[4] += f * t2 * c[5]
                     block[5] += f * t2 * c[8]
+
+
+@kernel
+def add_solid(
+    first: int, count: int, step: int, start: Indices, order: Indices, code: Array, which: Indices, constants: Floats,
+    state: Floats, weights: Rows, scratch: Array, places: Indices, values: Rows,
+) -> None:  # fmt: skip
+    """Add t^2 times the Hessians of cells, whose corners follow coarse cells; ``weights`` are times t [s].
+
+    scratch : (s, 8, 14) of each coarse corner the strain of one component and what it does; cell i has row i % s
+    """
+    for i in range(first, count, step):
+        e = scratch[i % len(scratch)]
+        for at in range(start[i], start[i + 1]):
+            k, s = constants_at(which, order[at]), state_at(order[at])
+            _write_coarse(e, code[at], constants, k, state, s, weights)
+            pair = -1
+            for a in range(8):
+                for c in range(a, 8):
+                    pair += 1
+                    if places[i, pair] >= 0:
+                        own = constants[k + 104] * (e[a, 0] * e[c, 0] + e[a, 1] * e[c, 1] + e[a, 2] * e[c, 2])
+                        for mode in range(4):
+                            own += e[a, 3 + mode] * e[c, 7 + mode]
+                        _add_block(values[places[i, pair]], own, state, s, e[a], e[c])
+
+
+@numba.njit(cache=True, inline="always")
+def _write_coarse(
+    rows: Rows, code: Array, constants: Floats, k: int, state: Floats, s: int, weights: Rows,
+) -> None:  # fmt: skip
+    """Write, of each coarse corner, the strain g, h of a cell (7), what the modes h push (4), and cof F g (3)."""
+    for a in range(8):
+        u = (
+            weights[code[0], a], weights[code[1], a], weights[code[2], a], weights[code[3], a],
+            weights[code[4], a], weights[code[5], a], weights[code[6], a], weights[code[7], a],
+        )  # fmt: skip
+        e, row = strain(u, form_of(constants, k)), rows[a]
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6] = e
+        row[7], row[8], row[9], row[10] = modes_forces(constants, k, e)
+        row[11], row[12], row[13] = along_cofactors(state, s, e)
+
+
+@numba.njit(cache=True, inline="always")
+def _add_block(block: Floats, own: float, state: Floats, s: int, g: Floats, h: Floats) -> None:
+    """Add own I + U'' m n^T + U' [t]_x with t = F (h x g), what v . (F x (u (x) h)) g is of u and v."""
+    f, slope, curvature = kept_gradient(state, s), state[s + 72], state[s + 80]
+    x, y, z = h[1] * g[2] - h[2] * g[1], h[2] * g[0] - h[0] * g[2], h[0] * g[1] - h[1] * g[0]
+    for r in range(3):
+        block[4 * r] += own
+        for c in range(3):
+            block[3 * r + c] += curvature * g[11 + r] * h[11 + c]
+    a, b = slope * (f[0] * x + f[1] * y + f[2] * z), slope * (f[3] * x + f[4] * y + f[5] * z)
+    c = slope * (f[6] * x + f[7] * y + f[8] * z)
+    block[7] += a
+    block[5] -= a
+    block[2] += b
+    block[6] -= b
+    block[3] += c
+    block[1] -= c
 
 
 @kernel

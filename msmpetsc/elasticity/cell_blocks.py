@@ -1,0 +1,80 @@
+"""The cells of a solid around a rank's nodes, in blocks of eight, as loops and threads take them.
+
+Numbers of a block's cells stand beside each other: number i of the cell in a lane is row[lane + LANES * i].
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Indices, Rows, like, on_host, to_host
+from msmpetsc.elasticity.cell_strain import LANES
+from msmpetsc.lattice.cell_moments import FORM
+from msmpetsc.lattice.lattice import Lattice
+
+ROWS = FORM + 2  # of a cell's constants: its form, modes times m = mu V / (16 h^2); m; lambda V / (16 h^2)
+STATE = 11  # F by rows, V U' / (16 h^2), V U'' / (16 h^2)
+BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of VTK's order, x fastest, then y
+
+
+class Blocks(NamedTuple):
+    """Cells, those first that a rank owns; the last block of a kind is filled up with cells of no stiffness.
+
+    nodes     : (b, LANES, 8) local corner nodes, x fastest; unsigned, so that no index is looked at for being negative
+    which     : (b,) row of the constants
+    constants : (k, ROWS * LANES), LANES of each number
+    around    : (8, owned) on a GPU the corners at each owned node, by their number in (b, 8, LANES), past all of them
+        where a node has fewer; (8, 0) on a CPU
+    """
+
+    nodes: Indices
+    which: Indices
+    constants: Rows
+    around: Indices
+
+
+def blocks_of(lattice: Lattice, constants: Rows) -> tuple[Blocks, int]:
+    """Return the lattice's cells with their constants (c, ROWS), in the memory that its nodes are in, and the number of
+    blocks of cells that this rank owns."""
+    cells, kinds, number = to_host(lattice.local_cells)[:, BY_AXIS], [], np.arange(len(constants))
+    for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
+        own = np.flatnonzero(kind)
+        order = own[np.argsort((constants[own] != constants[:1]).any(axis=1), kind="stable")]
+        kinds.append(_in_blocks(cells[order], constants[order]))
+    nodes, rows = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
+    which, distinct = _shared(rows)
+    around = np.empty((8, 0), np.int64)
+    if not on_host(lattice.nodes):
+        around = _around(nodes, rows.reshape(-1, ROWS, LANES)[:, -2] > 0, lattice.owned)
+    return Blocks(*(like(lattice.nodes, part) for part in (nodes, which, distinct, around))), len(kinds[0][0])
+
+
+def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
+    """Return cells in blocks (b, LANES, 8) and their constants (b, ROWS * LANES); the last is filled up by no cells."""
+    lacking = -len(nodes) % LANES
+    nodes = np.concatenate([nodes, np.repeat(nodes[-1:], lacking, axis=0)]).astype(np.uint32)
+    rows = np.concatenate([constants, np.zeros((lacking, ROWS))]).reshape(-1, LANES, ROWS)
+    return nodes.reshape(-1, LANES, 8), rows.transpose(0, 2, 1).reshape(-1, ROWS * LANES)
+
+
+def _shared(rows: Rows) -> tuple[Indices, Rows]:
+    """Return the row (b,) of each block's constants, and the constants: those equal to the first are kept once."""
+    own = (rows != rows[:1]).any(axis=1)
+    which = np.where(own, np.cumsum(own), 0)
+    return which.astype(np.int32), np.concatenate([rows[:1], rows[own]])
+
+
+def _around(nodes: Indices, is_cell: Indices, owned: int) -> Indices:
+    """Return ``Blocks.around``; is_cell (b, LANES) is false of what fills up the last blocks."""
+    corners = np.where(is_cell[:, None], nodes.transpose(0, 2, 1), owned).ravel().astype(np.int64)
+    return rows_of(corners, owned)
+
+
+def rows_of(nodes: Indices, owned: int) -> Indices:
+    """Return (8, owned) which of the rows that have these ``nodes`` (n,) are each owned node's; n past the last."""
+    by_node = np.argsort(nodes, kind="stable")
+    by_node = by_node[: np.searchsorted(nodes[by_node], owned)]
+    node = nodes[by_node]
+    rows = np.full((8, owned), len(nodes))
+    rows[np.arange(len(node)) - np.searchsorted(node, node), node] = by_node
+    return rows

@@ -31,12 +31,13 @@ SCALARS = {bool: "?7x", int: "q", float: "d"}  # as the driver takes them (struc
 TYPES = {"?7x": numba.types.boolean, "q": numba.types.int64, "d": numba.types.float64}
 
 Words = tuple[float, ...]  # of an argument, as the kernel takes them
+Kind = Any  # of an argument: a scalar's format, an array's description, or a NamedTuple's class and its fields' kinds
 
 
 @cache
 def launcher(body: Callable[..., None]) -> Callable[..., None]:
     """Return what backend.kernel calls: one thread for each index below a count, in CuPy's current stream."""
-    known: dict[tuple[str, ...], Launch] = {}
+    known: dict[tuple[Kind, ...], Launch] = {}
 
     def launch(count: int, *arguments: Any) -> None:
         if count:
@@ -48,12 +49,15 @@ def launcher(body: Callable[..., None]) -> Callable[..., None]:
     return launch
 
 
-def as_argument(value: Array | float) -> tuple[str, Words]:
+def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
     """Return an argument's kind, which its type and its words' format follow from, and the words."""
+    if isinstance(value, tuple):
+        kinds, words = zip(*map(as_argument, value), strict=True)
+        return (type(value), *kinds), tuple(chain.from_iterable(words))
     if isinstance(value, cupy.ndarray):
         return described(value.data.ptr, value.shape, value.strides, value.dtype.str)
     number = value.item() if isinstance(value, np.generic) else value
-    return SCALARS[type(number)], (number,)  # type: ignore[return-value]  # no array
+    return SCALARS[type(number)], (number,)  # type: ignore[index, return-value]  # no array
 
 
 @lru_cache(maxsize=KEPT)
@@ -65,27 +69,31 @@ def described(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dt
     size = np.dtype(dtype).itemsize
     by_row = tuple(np.cumprod((size, *shape[:0:-1]))[::-1])
     by_column = tuple(np.cumprod((size, *shape[:-1])))
-    layout = "C" if strides == by_row else "F" if strides == by_column else "A"
+    layout = "C" if strides == by_row or 0 in shape else "F" if strides == by_column else "A"
     return f"{dtype} {len(shape)} {layout}", (0, 0, int(np.prod(shape)), size, pointer, *shape, *strides)
 
 
-def type_of(kind: str) -> object:
+def type_of(kind: Kind) -> object:
     """Return numba's type of a kind of argument."""
+    if isinstance(kind, tuple):
+        return numba.types.NamedTuple([type_of(one) for one in kind[1:]], kind[0])  # type: ignore[no-untyped-call]
     if kind in TYPES:
         return TYPES[kind]
     dtype, dimensions, layout = kind.split()
     return numba.types.Array(numba.from_dtype(np.dtype(dtype)), int(dimensions), layout)  # type: ignore[call-overload]
 
 
-def format_of(kind: str) -> str:
+def format_of(kind: Kind) -> str:
     """Return how the words of an argument are packed (struct)."""
+    if isinstance(kind, tuple):
+        return "".join(map(format_of, kind[1:]))
     return kind if kind in TYPES else f"{5 + 2 * int(kind.split()[1])}q"
 
 
 class Launch:
     """A body compiled for arguments of some types, and the memory that its words are handed over in."""
 
-    def __init__(self, body: Callable[..., None], kinds: tuple[str, ...]):
+    def __init__(self, body: Callable[..., None], kinds: tuple[Kind, ...]):
         self.module = cupy.cuda.function.Module()
         ptx = compiled(body, kinds)
         self.module.load(ptx.encode())
@@ -106,7 +114,7 @@ class Launch:
             raise MsmpetscError(f"the GPU refused a kernel: CUDA error {status}")
 
 
-def compiled(body: Callable[..., None], kinds: tuple[str, ...]) -> str:
+def compiled(body: Callable[..., None], kinds: tuple[Kind, ...]) -> str:
     """Return the PTX of a body for these arguments and this GPU; kept beside numba's cache."""
     capability = cupy.cuda.Device().compute_capability
     target = f"{body.__module__}.{body.__name__} {kinds} {capability} {version('numba-cuda')}"
@@ -121,7 +129,7 @@ def compiled(body: Callable[..., None], kinds: tuple[str, ...]) -> str:
     return ptx
 
 
-def ptx_of(body: Callable[..., None], kinds: tuple[str, ...], capability: tuple[int, int]) -> str:
+def ptx_of(body: Callable[..., None], kinds: tuple[Kind, ...], capability: tuple[int, int]) -> str:
     """Return the PTX of a body for arguments of these kinds."""
     arguments = numba.types.Tuple([type_of(kind) for kind in kinds])  # type: ignore[no-untyped-call]
     signature = numba.types.void(numba.types.int64, arguments)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Indices, Rows, like, on_host, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Rows, like, on_host, to_host
 from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
@@ -23,19 +23,46 @@ class Blocks(NamedTuple):
     nodes     : (b, LANES, 8) local corner nodes, x fastest; unsigned, so that no index is looked at for being negative
     which     : (b,) row of the constants
     constants : (k, ROWS * LANES), LANES of each number
-    around    : (8, owned) on a GPU the corners at each owned node, by their number in (b, 8, LANES), past all of them
-        where a node has fewer; (8, 0) on a CPU
+    around    : (8, n) on a GPU the corners at each node that the rank owns, by their number in (b, 8, LANES), one past
+        the last where a node has fewer; (8, 0) on a CPU
+    owned     : number of blocks of cells that the rank owns
+    h4        : four times the side of a cell [m]
     """
 
     nodes: Indices
     which: Indices
     constants: Rows
     around: Indices
+    owned: int
+    h4: float
 
 
-def blocks_of(lattice: Lattice, constants: Rows) -> tuple[Blocks, int]:
-    """Return the lattice's cells with their constants (c, ROWS), in the memory that its nodes are in, and the number of
-    blocks of cells that this rank owns."""
+class CellRows(NamedTuple):
+    """The same cells one after another, as kernels take them: cell i is in lane i % LANES of block i // LANES.
+
+    nodes     : (c, 8)
+    constants : rows of ``Blocks.constants``, one after another
+    by_node   : a corner adds to the row of its node; on a GPU to one of its own, of which Blocks.around has the number
+    state     : what a Hessian keeps of each (b, STATE, LANES), one row of numbers; none where nothing asks for it
+    """
+
+    nodes: Indices
+    which: Indices
+    constants: Floats
+    h4: float
+    by_node: bool
+    state: Floats
+
+
+def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
+    """Return cells as kernels take them."""
+    constants, by_node = blocks.constants.ravel(), on_host(blocks.nodes)
+    own = constants[:0] if state is None else state.ravel()
+    return CellRows(blocks.nodes.reshape(-1, 8), blocks.which, constants, blocks.h4, by_node, own)
+
+
+def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
+    """Return the lattice's cells with their constants (c, ROWS), in the memory that its nodes are in."""
     cells, kinds, number = to_host(lattice.local_cells)[:, BY_AXIS], [], np.arange(len(constants))
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
         own = np.flatnonzero(kind)
@@ -46,7 +73,8 @@ def blocks_of(lattice: Lattice, constants: Rows) -> tuple[Blocks, int]:
     around = np.empty((8, 0), np.int64)
     if not on_host(lattice.nodes):
         around = _around(nodes, rows.reshape(-1, ROWS, LANES)[:, -2] > 0, lattice.owned)
-    return Blocks(*(like(lattice.nodes, part) for part in (nodes, which, distinct, around))), len(kinds[0][0])
+    nodes, which, distinct, around = (like(lattice.nodes, part) for part in (nodes, which, distinct, around))
+    return Blocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size)
 
 
 def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:

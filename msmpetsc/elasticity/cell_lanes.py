@@ -102,13 +102,13 @@ def _gradient_lanes(w: Floats, h4: float) -> None:
 
 
 @numba.njit(cache=True)
-def add_gradient(blocks: Blocks, h4: float, q: Positions, gradient: Rows) -> None:
-    """Add grad E [N] at q (l, 3) [m] to ``gradient`` (l, 3); ``h4`` is 4 h [m]."""
+def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
+    """Add grad E [N] at q (l, 3) [m] to ``gradient`` (l, 3)."""
     w = np.zeros(WORK)
     for b in range(len(blocks.nodes)):
         _gather(blocks.nodes, b, q, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        _gradient_lanes(w, h4)
+        _gradient_lanes(w, blocks.h4)
         _scatter(blocks.nodes, b, w, gradient)
 
 
@@ -121,13 +121,13 @@ def _state_lanes(w: Floats, over: float, projected: bool) -> None:
 
 
 @numba.njit(cache=True)
-def linearise(blocks: Blocks, h4: float, q: Positions, projected: bool, state: Rows) -> None:
+def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> None:
     """Write what a Hessian keeps of each cell into ``state`` (b, STATE * LANES)."""
     w = np.zeros(WORK)
     for b in range(len(blocks.nodes)):
         _gather(blocks.nodes, b, q, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        _state_lanes(w, 1.0 / h4, projected)
+        _state_lanes(w, 1.0 / blocks.h4, projected)
         for i in range(STATE * LANES):
             state[b, i] = w[AT_STATE + i]
 
@@ -142,17 +142,17 @@ def _energy_lanes(w: Floats, over: float) -> None:
 
 
 @numba.njit(cache=True)
-def cell_energies(blocks: Blocks, h4: float, q: Positions, energies: Rows) -> None:
+def cell_energies(blocks: Blocks, q: Positions, energies: Rows) -> None:
     """Write the energy of cells [J] at q (l, 3) [m], 0 at rest, into ``energies`` (b, LANES), of the first b blocks."""
     w = np.zeros(WORK)
     for b in range(len(energies)):
         _gather(blocks.nodes, b, q, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        _energy_lanes(w, 1.0 / h4)
+        _energy_lanes(w, 1.0 / blocks.h4)
         for lane in range(LANES):  # logarithms, which are no lanes'
             s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
             volume = volume_energy(w[s], m, lame) if m > 0.0 else 0.0
-            energies[b, lane] = w[s + 8] + h4 * h4 * (volume - 1.5 * m)
+            energies[b, lane] = w[s + 8] + blocks.h4**2 * (volume - 1.5 * m)
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -164,17 +164,17 @@ def _change_lanes(w: Floats, over: float) -> None:
 
 
 @numba.njit(cache=True)
-def elastic_change(blocks: Blocks, owned: int, h4: float, q: Positions, base: Positions) -> float:
-    """Return E(q) - E(base) [J] of the first ``owned`` blocks, by how the nodes moved, so that it keeps its digits."""
+def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
+    """Return E(q) - E(base) [J] of the cells that the rank owns, by how the nodes moved: it keeps its digits."""
     moved, w, change = q - base, np.zeros(WORK), 0.0
-    for b in range(owned):
+    for b in range(blocks.owned):
         _gather(blocks.nodes, b, moved, w)
         _gather(blocks.nodes, b, base, w, RESULT)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        _change_lanes(w, 1.0 / h4)
+        _change_lanes(w, 1.0 / blocks.h4)
         for lane in range(LANES):
             s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
             before, more = w[s], w[s + 8]
             if m > 0.0:
-                change += w[s + 16] + h4 * h4 * volume_change(before + more, before, more, m, lame)
+                change += w[s + 16] + blocks.h4**2 * volume_change(before + more, before, more, m, lame)
     return change

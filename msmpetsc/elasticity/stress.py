@@ -50,7 +50,7 @@ class StressField:
         """
         rows = to_host(self.solid.hessian_at(q, False).state)
         state = rows.reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
-        f, slope = state[:, :9].reshape(-1, 3, 3), state[:, 9] * self.solid.h4**2 / self.cells.volume
+        f, slope = state[:, :9].reshape(-1, 3, 3), state[:, 9] * self.solid.blocks.h4**2 / self.cells.volume
         share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
         stress: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
         stress[:, :3] += slope[:, None]

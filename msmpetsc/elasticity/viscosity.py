@@ -13,29 +13,25 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks
+from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES
-from msmpetsc.elasticity.cell_threads import constants_at, flat, state_at, strains_at
-from msmpetsc.elasticity.neo_hookean import gradient_of, rotation_of, write_state
+from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
+from msmpetsc.elasticity.neo_hookean import rotation_of, write_state
 from msmpetsc.elasticity.solid import CellHessians, NeoHookean
 
 
 @kernel
-def _turned_states(
-    first: int, count: int, step: int, q: Positions, nodes: Indices, which: Indices, constants: Floats, h4: float,
-    state: Floats,
-) -> None:  # fmt: skip
+def _turned_states(first: int, count: int, step: int, q: Positions, cells: CellRows, state: Floats) -> None:
     """Write what a Hessian keeps of cells at rest, turned as those at q (l, 3) [m].
 
     Cells that are flat or inside out have no rotation: K is not turned then, nor does it forgive a turn.
     """
     for i in range(first, count, step):
-        k = constants_at(which, i)
-        r, turns = rotation_of(gradient_of(strains_at(q, nodes[i], constants, k), 1.0 / h4))
-        m = constants[k + 104]
-        write_state(state, state_at(i), r, -m if turns else 0.0, m + constants[k + 112])
+        k, (r, turns) = constants_at(cells, i), rotation_of(gradient_at(q, cells, i))
+        m = cells.constants[k + 104]
+        write_state(state, state_at(i), r, -m if turns else 0.0, m + cells.constants[k + 112])
 
 
 @dataclass(eq=False)
@@ -48,7 +44,6 @@ class Viscosity:
 
     blocks: Blocks
     owned: int
-    h4: float
     before: Positions  # x^
     hessian: CellHessians = field(init=False)
 
@@ -62,12 +57,12 @@ class Viscosity:
         constants[:, 6 : ROWS - 2] = 0.0
         constants[:, ROWS - 2 :] *= factor
         blocks = solid.blocks._replace(constants=constants.reshape(len(constants), -1))
-        return cls(blocks, owned, solid.h4, rest)
+        return cls(blocks, owned, rest)
 
     def begin(self, before: Positions, turned: Positions) -> None:
         """Take the data of a new step: x^ (l, 3) [m], and positions (l, 3) whose cells have turned as in the step."""
         state = np.empty((len(self.blocks.nodes), STATE * LANES), like=before)
-        _turned_states(LANES * len(state), turned, *flat(self.blocks), self.h4, state.ravel())
+        _turned_states(LANES * len(state), turned, one_by_one(self.blocks), state.ravel())
         self.before, self.hessian = before, CellHessians(self.blocks, state)
 
     def energy(self, q: Positions) -> float:

@@ -116,7 +116,8 @@ def bare(value):
         return value.values
     if isinstance(value, np.ndarray) and value.ndim:
         raise TypeError("Unsupported type <class 'numpy.ndarray'>")
-    return type(value)(map(bare, value)) if isinstance(value, (tuple, list)) else value
+    make = getattr(value, "_make", type(value))  # of a NamedTuple
+    return make(map(bare, value)) if isinstance(value, (tuple, list)) else value
 
 
 def dressed(value):

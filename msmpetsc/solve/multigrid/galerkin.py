@@ -15,8 +15,9 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import form_of, modes_forces, strain
-from msmpetsc.elasticity.cell_threads import constants_at, flat, state_at
+from msmpetsc.elasticity.cell_threads import constants_at, state_at
 from msmpetsc.elasticity.cell_volume import FRAMES, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_gradient
@@ -145,8 +146,9 @@ class GalerkinSum:
         weights = self.t2**0.5 * self.weights  # a Hessian is of second degree in them
         hessians: list[CellHessians] = [solid.hessian_at(q, True)] if solid else []
         for hessian in hessians + ([viscosity.hessian] if viscosity else []):
-            state, scratch = hessian.state.ravel(), np.empty((1 if on_host(q) else count, 8, 14), like=q)
-            add_solid(count, *self.cells, *flat(hessian.blocks)[1:], state, weights, scratch, self.places, values)
+            cells = one_by_one(hessian.blocks, hessian.state)
+            scratch = np.empty((1 if on_host(q) else count, 8, 14), like=q)
+            add_solid(count, values, self.places, self.cells, cells, weights, scratch)
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
@@ -311,8 +313,8 @@ def add_nodes(
 
 @kernel
 def add_solid(
-    first: int, count: int, step: int, start: Indices, order: Indices, code: Array, which: Indices, constants: Floats,
-    state: Floats, weights: Rows, scratch: Array, places: Indices, values: Rows,
+    first: int, count: int, step: int, values: Rows, places: Indices, by_cell: ByCell, cells: CellRows, weights: Rows,
+    scratch: Array,
 ) -> None:  # fmt: skip
     """Add t^2 times the Hessians of cells, whose corners follow coarse cells; ``weights`` are times t [s].
 
@@ -320,34 +322,33 @@ def add_solid(
     """
     for i in range(first, count, step):
         e = scratch[i % len(scratch)]
-        for at in range(start[i], start[i + 1]):
-            k, s = constants_at(which, order[at]), state_at(order[at])
-            _write_coarse(e, code[at], constants, k, state, s, weights)
+        for at in range(by_cell.start[i], by_cell.start[i + 1]):
+            k, s = constants_at(cells, by_cell.order[at]), state_at(by_cell.order[at])
+            m = cells.constants[k + 104]
+            _write_coarse(e, weights, by_cell.code[at], cells, k, s)
             pair = -1
             for a in range(8):
                 for c in range(a, 8):
                     pair += 1
                     if places[i, pair] >= 0:
-                        own = constants[k + 104] * (e[a, 0] * e[c, 0] + e[a, 1] * e[c, 1] + e[a, 2] * e[c, 2])
+                        own = m * (e[a, 0] * e[c, 0] + e[a, 1] * e[c, 1] + e[a, 2] * e[c, 2])
                         for mode in range(4):
                             own += e[a, 3 + mode] * e[c, 7 + mode]
-                        _add_block(values[places[i, pair]], own, state, s, e[a], e[c])
+                        _add_block(values[places[i, pair]], own, cells.state, s, e[a], e[c])
 
 
 @numba.njit(cache=True, inline="always")
-def _write_coarse(
-    rows: Rows, code: Array, constants: Floats, k: int, state: Floats, s: int, weights: Rows,
-) -> None:  # fmt: skip
+def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: int, s: int) -> None:
     """Write, of each coarse corner, the strain g, h of a cell (7), what the modes h push (4), and cof F g (3)."""
     for a in range(8):
         u = (
             weights[code[0], a], weights[code[1], a], weights[code[2], a], weights[code[3], a],
             weights[code[4], a], weights[code[5], a], weights[code[6], a], weights[code[7], a],
         )  # fmt: skip
-        e, row = strain(u, form_of(constants, k)), rows[a]
+        e, row = strain(u, form_of(cells.constants, k)), rows[a]
         row[0], row[1], row[2], row[3], row[4], row[5], row[6] = e
-        row[7], row[8], row[9], row[10] = modes_forces(constants, k, e)
-        row[11], row[12], row[13] = along_cofactors(state, s, e)
+        row[7], row[8], row[9], row[10] = modes_forces(cells.constants, k, e)
+        row[11], row[12], row[13] = along_cofactors(cells.state, s, e)
 
 
 @numba.njit(cache=True, inline="always")

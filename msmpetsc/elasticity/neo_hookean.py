@@ -26,7 +26,7 @@ import math
 import numba
 
 from msmpetsc.backend.arrays import Floats
-from msmpetsc.elasticity.cell_strain import Nine, Seven, Strains, corner_strain, form_of, modes_forces
+from msmpetsc.elasticity.cell_strain import Nine, Seven, Strains, modes_forces
 from msmpetsc.elasticity.springs import Vector
 
 ONSET = 0.2  # J_0: below it U is a parabola
@@ -254,9 +254,14 @@ def changes(d: Nine, f: Nine) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, inline="always")
-def along_cofactors(state: Floats, s: int, g: Seven) -> Vector:
-    """Return cof F g of the mean slope g of a strain, F as a Hessian keeps it."""
-    n = cofactors(kept_gradient(state, s))
+def kept_cofactors(state: Floats, s: int) -> Nine:
+    """Return cof F of the F that a Hessian keeps."""
+    return cofactors(kept_gradient(state, s))
+
+
+@numba.njit(cache=True, inline="always")
+def along_cofactors(n: Nine, g: Seven) -> Vector:
+    """Return cof F g of the mean slope g of a strain."""
     return (
         n[0] * g[0] + n[1] * g[1] + n[2] * g[2],
         n[3] * g[0] + n[4] * g[1] + n[5] * g[2],
@@ -265,9 +270,8 @@ def along_cofactors(state: Floats, s: int, g: Seven) -> Vector:
 
 
 @numba.njit(cache=True, inline="always")
-def corner_block(a: int, c: Floats, k: int, state: Floats, s: int) -> tuple[float, float, Vector]:
-    """Return a, b and e of the Hessian's block a I + b e e^T of corner a."""
-    g = corner_strain(a, form_of(c, k))
+def corner_stiffness(g: Seven, c: Floats, k: int) -> float:
+    """Return what a Hessian has of mu on the diagonal at the corner whose strain ``corner_strain`` gives."""
     x, y, z, v = modes_forces(c, k, g)
-    own = c[k + 104] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2]) + x * g[3] + y * g[4] + z * g[5] + v * g[6]
-    return own, state[s + 80], along_cofactors(state, s, g)
+    own: float = c[k + 104] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    return own + x * g[3] + y * g[4] + z * g[5] + v * g[6]

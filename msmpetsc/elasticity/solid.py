@@ -15,7 +15,7 @@ from msmpetsc.elasticity import cell_lanes, cell_threads
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, blocks_of, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
-from msmpetsc.elasticity.neo_hookean import corner_block, lost
+from msmpetsc.elasticity.neo_hookean import along_cofactors, corner_stiffness, kept_cofactors, lost
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -46,9 +46,14 @@ def _add_concavity(first: int, count: int, step: int, concavity: Rows, cells: Ce
 @kernel
 def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: CellRows) -> None:
     for i in range(first, count, step):
+        k, n, curvature = (
+            constants_at(cells, i),
+            kept_cofactors(cells.state, state_at(i)),
+            cells.state[state_at(i) + 80],
+        )
         for a in range(8):
-            own, curvature, e = corner_block(a, cells.constants, constants_at(cells, i), cells.state, state_at(i))
-            block = diagonal[_row_of(cells, i, a)]
+            g, block = corner_strain(a, form_of(cells.constants, k)), diagonal[_row_of(cells, i, a)]
+            own, e = corner_stiffness(g, cells.constants, k), along_cofactors(n, g)
             for r in range(3):
                 block[4 * r] += own
             block[0] += curvature * e[0] * e[0]

@@ -233,6 +233,9 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
 
     def as_launched(argument):
         array = pretend_gpu.bare(argument)
+        if isinstance(array, tuple):
+            kinds, words = zip(*map(as_launched, argument), strict=True)
+            return (type(array), *kinds), tuple(chain.from_iterable(words))
         if not isinstance(array, np.ndarray):
             return launcher.as_argument(array)
         return launcher.described(array.ctypes.data, array.shape, array.strides, array.dtype.str)

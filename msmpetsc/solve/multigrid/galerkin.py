@@ -20,7 +20,7 @@ from msmpetsc.elasticity.cell_strain import form_of, modes_forces, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
 from msmpetsc.elasticity.cell_volume import FRAMES, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_gradient
+from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import SYMMETRIC, spring_block
 from msmpetsc.geometry.grid import decode_morton, encode_morton
@@ -340,6 +340,7 @@ def add_solid(
 @numba.njit(cache=True, inline="always")
 def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: int, s: int) -> None:
     """Write, of each coarse corner, the strain g, h of a cell (7), what the modes h push (4), and cof F g (3)."""
+    n = kept_cofactors(cells.state, s)
     for a in range(8):
         u = (
             weights[code[0], a], weights[code[1], a], weights[code[2], a], weights[code[3], a],
@@ -348,7 +349,7 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
         e, row = strain(u, form_of(cells.constants, k)), rows[a]
         row[0], row[1], row[2], row[3], row[4], row[5], row[6] = e
         row[7], row[8], row[9], row[10] = modes_forces(cells.constants, k, e)
-        row[11], row[12], row[13] = along_cofactors(cells.state, s, e)
+        row[11], row[12], row[13] = along_cofactors(n, e)
 
 
 @numba.njit(cache=True, inline="always")

@@ -1,4 +1,4 @@
-"""The loops over cells that a neo-Hookean solid is made of, on a CPU: eight cells at once, in the lanes of vectors.
+"""The loops over cells that steps spend their time in, on a CPU: eight cells at once, in the lanes of vectors.
 
 numba makes vectors of loops over the lanes of one work array with constant offsets. It holds, LANES numbers each, the
 values at a cell's 8 corners (3 components each), its constants, what a law keeps of it, and 3 components of the result
@@ -13,17 +13,11 @@ from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
     changes,
-    cofactors,
-    determinant,
     gradient_of,
     pull,
-    quadratic,
     quadratic_change,
-    slopes_at,
     turned_pull,
     volume_change,
-    volume_energy,
-    write_state,
 )
 
 # where things stand in the work array, after the corners' values
@@ -110,49 +104,6 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
         _gradient_lanes(w, blocks.h4)
         _scatter(blocks.nodes, b, w, gradient)
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _state_lanes(w: Floats, over: float, projected: bool) -> None:
-    for lane in range(LANES):
-        f = gradient_of(_strains_in(w, lane), over)
-        slope, curvature = slopes_at(f, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane], projected)
-        write_state(w, AT_STATE + lane, f, slope, curvature)
-
-
-@numba.njit(cache=True)
-def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> None:
-    """Write what a Hessian keeps of each cell into ``state`` (b, STATE * LANES)."""
-    w = np.zeros(WORK)
-    for b in range(len(blocks.nodes)):
-        _gather(blocks.nodes, b, q, w)
-        _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        _state_lanes(w, 1.0 / blocks.h4, projected)
-        for i in range(STATE * LANES):
-            state[b, i] = w[AT_STATE + i]
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _energy_lanes(w: Floats, over: float) -> None:
-    for lane in range(LANES):
-        e, s = _strains_in(w, lane), AT_STATE + lane
-        f = gradient_of(e, over)
-        w[s] = determinant(f, cofactors(f))
-        w[s + 8] = 0.5 * quadratic(w, CONSTANTS + lane, e, e)
-
-
-@numba.njit(cache=True)
-def cell_energies(blocks: Blocks, q: Positions, energies: Rows) -> None:
-    """Write the energy of cells [J] at q (l, 3) [m], 0 at rest, into ``energies`` (b, LANES), of the first b blocks."""
-    w = np.zeros(WORK)
-    for b in range(len(energies)):
-        _gather(blocks.nodes, b, q, w)
-        _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        _energy_lanes(w, 1.0 / blocks.h4)
-        for lane in range(LANES):  # logarithms, which are no lanes'
-            s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
-            volume = volume_energy(w[s], m, lame) if m > 0.0 else 0.0
-            energies[b, lane] = w[s + 8] + blocks.h4**2 * (volume - 1.5 * m)
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")

@@ -14,7 +14,7 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity import cell_lanes, cell_threads
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, blocks_of, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
-from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
+from msmpetsc.elasticity.cell_threads import cell_energies, constants_at, gradient_at, linearise, state_at
 from msmpetsc.elasticity.neo_hookean import along_cofactors, corner_stiffness, kept_cofactors, lost
 from msmpetsc.lattice.lattice import Lattice
 
@@ -149,7 +149,7 @@ class NeoHookean:
     def energies(self, q: Positions, blocks: int) -> Rows:
         """Return E [J] by cell (blocks, LANES), of the first blocks."""
         energies = np.empty((blocks, LANES), like=q)
-        _loops(q).cell_energies(self.blocks, q, energies)
+        cell_energies(self.blocks, q, energies)
         return energies
 
     def energy(self, q: Positions) -> float:
@@ -171,7 +171,7 @@ class NeoHookean:
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
         """Return what adds (Hessian of E at q) v [N] to its second argument: of F, V U' and V U'' of all cells."""
         state: Rows = np.empty((len(self.blocks.nodes), STATE * LANES), dtype, like=q)
-        _loops(q).linearise(self.blocks, q, projected, state)
+        linearise(self.blocks, q, projected, state)
         constants: Rows = self.blocks.constants.astype(dtype, copy=False)
         return CellHessians(self.blocks._replace(constants=constants), state)
 

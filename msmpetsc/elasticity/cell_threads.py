@@ -1,5 +1,5 @@
-"""Loops over cells one by one: on a CPU those that are rare, on a GPU all. There a thread a cell writes what it adds at its
-corners, and a thread a node sums what the cells around it have written, so that sums come out the same every time.
+"""Loops over cells one by one: on a CPU those that are rare, on a GPU all. There a thread a cell writes what it adds at
+its corners, and a thread a node sums what the cells around it have written, so that sums come out the same every time.
 
 What a kernel writes at corner a of a cell has the place (block, a, component, lane).
 """

@@ -64,9 +64,11 @@ def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
 def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
     """Return the lattice's cells with their constants (c, ROWS), in the memory that its nodes are in."""
     cells, kinds, number = to_host(lattice.local_cells)[:, BY_AXIS], [], np.arange(len(constants))
+    _, alike, count = np.unique(_keys(constants), return_inverse=True, return_counts=True)
+    rank = np.where(count[alike] < LANES, len(count), alike)  # those that fill no block stay where they are
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
         own = np.flatnonzero(kind)
-        order = own[np.argsort((constants[own] != constants[:1]).any(axis=1), kind="stable")]
+        order = own[np.argsort(rank[own], kind="stable")]
         kinds.append(_in_blocks(cells[order], constants[order]))
     nodes, rows = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
     which, distinct = _shared(rows)
@@ -85,11 +87,17 @@ def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
     return nodes.reshape(-1, LANES, 8), rows.transpose(0, 2, 1).reshape(-1, ROWS * LANES)
 
 
+def _keys(rows: Rows) -> Floats:
+    """Return a number (n,) for each row: the same for equal rows, and almost never for others."""
+    return rows @ np.random.default_rng(0).random(rows.shape[1])
+
+
 def _shared(rows: Rows) -> tuple[Indices, Rows]:
-    """Return the row (b,) of each block's constants, and the constants: those equal to the first are kept once."""
-    own = (rows != rows[:1]).any(axis=1)
-    which = np.where(own, np.cumsum(own), 0)
-    return which.astype(np.int32), np.concatenate([rows[:1], rows[own]])
+    """Return the row (b,) of each block's constants, and the constants, equal ones once."""
+    _, first, which = np.unique(_keys(rows), return_index=True, return_inverse=True)
+    own = np.flatnonzero((rows != rows[first[which]]).any(axis=1))
+    which[own] = len(first) + np.arange(len(own))
+    return which.astype(np.int32), rows[np.concatenate([first, own])]
 
 
 def _around(nodes: Indices, is_cell: Indices, owned: int) -> Indices:

@@ -68,6 +68,23 @@ def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool
         np.testing.assert_allclose(curved, product, rtol=1e-4, atol=1e-5 * np.abs(product).max())
 
 
+def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
+    """Of 96 cells the first and every seventh are cut; two materials."""
+    lattice = solid(6, 4, 4, poisson=0.3)
+    assert lattice.solid is not None
+    cut, hard = np.arange(96) % 7 == 0, lattice.nodes[lattice.local_cells].mean(axis=1)[:, 0] > 3 * H
+    forms, shear = lattice.solid.forms.copy(), np.where(hard, 9.0, 1.0) * lattice.solid.shear
+    forms[cut] *= RNG.uniform(0.5, 1.0, size=(cut.sum(), 1))
+    of_cells = lattice.solid._replace(forms=forms, shear=shear)
+    blocks = NeoHookean.of_lattice(Lattice(**(vars(lattice) | {"solid": of_cells}))).blocks
+    assert len(blocks.nodes) == 12 and len(blocks.constants) <= 2 + 2 + 2  # two whole, two in part, two of cut cells
+    kept = blocks.constants[blocks.which].reshape(12, 15, 8).transpose(0, 2, 1).reshape(96, 15)
+    order = [np.flatnonzero(lattice.local_cells[:, 0] == first)[0] for first in blocks.nodes[:, :, 0].ravel()]
+    m = (shear * of_cells.volume / (4 * H) ** 2)[order]
+    assert np.array_equal(kept[:, :6], forms[order, :6]) and np.allclose(kept[:, 13], m, rtol=1e-14)
+    assert np.allclose(kept[:, 6:13], m[:, None] * forms[order, 6:], rtol=1e-14)
+
+
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
     """lambda = 49 mu, no more than mu meanwhile: as that of Poisson's ratio 1/4, by its mu. A Hessian with the pressure

@@ -64,18 +64,19 @@ def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
 def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
     """Return the lattice's cells with their constants (c, ROWS), in the memory that its nodes are in."""
     cells, kinds, number = to_host(lattice.local_cells)[:, BY_AXIS], [], np.arange(len(constants))
-    _, alike, count = np.unique(_keys(constants), return_inverse=True, return_counts=True)
+    _, alike, count = np.unique(_whole_rows(constants), return_inverse=True, return_counts=True)
     rank = np.where(count[alike] < LANES, len(count), alike)  # those that fill no block stay where they are
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
         own = np.flatnonzero(kind)
         order = own[np.argsort(rank[own], kind="stable")]
         kinds.append(_in_blocks(cells[order], constants[order]))
     nodes, rows = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
-    which, distinct = _shared(rows)
+    _, first, which = np.unique(_whole_rows(rows), return_index=True, return_inverse=True)
     around = np.empty((8, 0), np.int64)
     if not on_host(lattice.nodes):
         around = _around(nodes, rows.reshape(-1, ROWS, LANES)[:, -2] > 0, lattice.owned)
-    nodes, which, distinct, around = (like(lattice.nodes, part) for part in (nodes, which, distinct, around))
+    arrays = nodes, which.astype(np.int32), rows[first], around
+    nodes, which, distinct, around = (like(lattice.nodes, array) for array in arrays)
     return Blocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size)
 
 
@@ -87,17 +88,9 @@ def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
     return nodes.reshape(-1, LANES, 8), rows.transpose(0, 2, 1).reshape(-1, ROWS * LANES)
 
 
-def _keys(rows: Rows) -> Floats:
-    """Return a number (n,) for each row: the same for equal rows, and almost never for others."""
-    return rows @ np.random.default_rng(0).random(rows.shape[1])
-
-
-def _shared(rows: Rows) -> tuple[Indices, Rows]:
-    """Return the row (b,) of each block's constants, and the constants, equal ones once."""
-    _, first, which = np.unique(_keys(rows), return_index=True, return_inverse=True)
-    own = np.flatnonzero((rows != rows[first[which]]).any(axis=1))
-    which[own] = len(first) + np.arange(len(own))
-    return which.astype(np.int32), rows[np.concatenate([first, own])]
+def _whole_rows(rows: Rows) -> Array:
+    """Return rows as one thing each, (n,), which are sorted and compared bit by bit."""
+    return np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
 
 
 def _around(nodes: Indices, is_cell: Indices, owned: int) -> Indices:

@@ -20,6 +20,7 @@ from msmpetsc.contact.obstacles.friction import Friction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
+SHALLOW = 1e-3  # of the depth that a node would come to, where it is stopped
 Secants = list[Mask | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
 
@@ -95,6 +96,14 @@ class ContactState:
         if self.friction:
             self.friction.add_gradient(q, gradient)
 
+    def stopped(self, q: Positions, base: Positions) -> tuple[Indices, Rows]:
+        """Return the nodes (a,) that are pressed at q but not at base (n, 3), and by what to move them (a, 3) [m] to
+        where they all but cease to: the Hessian there knows of them."""
+        depths, face = self.depths(q)
+        rows = np.flatnonzero((depths > 0) & (self.depths(base)[0] <= 0))
+        normals = self.obstacle.normals_at(q[rows], self.time, face[rows])
+        return rows, (1 - SHALLOW) * depths[rows][:, None] * normals
+
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy of the push at q less that at base (n, 3) [J]."""
         (depths, face), (base_depths, base_face) = self.depths(q), self.depths(base)
@@ -139,6 +148,15 @@ class Contact:
             if state.friction:
                 total += state.friction.change(q, base)
         return total
+
+    def stopped(self, q: Positions, base: Positions) -> Positions | None:
+        """Return q with the nodes that come into obstacles on the way from base stopped there; None if none does."""
+        stopped, count = q.copy(), 0
+        for state in self.states:
+            rows, way = state.stopped(q[: self.owned], base[: self.owned])
+            stopped[rows] += way
+            count += len(rows)
+        return stopped if count else None
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""

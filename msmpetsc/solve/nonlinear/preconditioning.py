@@ -33,6 +33,7 @@ USUAL = 0.1  # ksp_rtol
 LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
 USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
 WORTH = 10.0  # iterations that a new hierarchy takes the time of
+PATIENCE = 15.0  # iterations beyond its pace that a solve with an old one is given: one took 2,300 else
 MANY = 150  # iterations of a solve that contact is to blame for: from there on it joins nodes
 POINTS = 200  # in contact, that join nodes in the cycle: the stiffest
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
@@ -115,7 +116,7 @@ class LatticePreconditioner:
         self.is_first = True
         self.pace: float | None = None
         self.wasted = 0.0
-        self.is_stale, self.is_free = True, False
+        self.is_stale, self.is_new, self.is_free = True, False, False
         self.joins = False
         self.joining: SurfaceHessian | None = None
 
@@ -126,6 +127,7 @@ class LatticePreconditioner:
         joining = surface if self.joins else None
         is_other = joining is not self.joining
         self.joining, self.is_free, due = joining, self._is_free(q, contact), self.is_stale
+        self.is_new = due
         if due or is_other:
             joined, held = joining.split(POINTS) if joining else (None, surface)
             if due:
@@ -141,6 +143,10 @@ class LatticePreconditioner:
             columns = self.unknowns.columns_to_write(x)
             columns -= self.translations.of(self.unknowns.columns(f))
 
+    def most_iterations(self, rtol: float) -> int | None:
+        """Iterations of a solve to a relative tolerance that this hierarchy is given; None where it is of this x."""
+        return None if self.is_new or self.pace is None else int(self.pace * _digits(rtol) + PATIENCE - self.wasted)
+
     def learn(self, its: int, rtol: float) -> None:
         """Take note of the iterations that a linear solve took to a relative tolerance.
 
@@ -148,7 +154,7 @@ class LatticePreconditioner:
         """
         if its == 0:
             return
-        digits = max(-np.log10(rtol), 0.1)
+        digits = _digits(rtol)
         if self.pace is None:
             self.pace = its / digits
         self.joins |= its > MANY
@@ -197,6 +203,10 @@ class LatticePreconditioner:
 
     def destroy(self) -> None:
         self.multigrid.destroy()
+
+
+def _digits(rtol: float) -> float:
+    return max(-float(np.log10(rtol)), 0.1)
 
 
 def expected_iterations(ratio: float) -> float:
@@ -278,6 +288,10 @@ class StepPreconditioner:
         """The multigrid that moves free bodies as wholes to where forces balance; None where there is none."""
         multigrid = self.multigrid if self.is_chosen else None
         return multigrid if multigrid and multigrid.translations else None
+
+    def most_iterations(self, rtol: float) -> int | None:
+        """Iterations that a linear solve to a relative tolerance is given; None: what PETSc's options say."""
+        return self.multigrid.most_iterations(rtol) if self.multigrid and self.is_chosen else None
 
     def learn(self, its: int, rtol: float) -> None:
         """Take note of the iterations that a linear solve took to a relative tolerance."""

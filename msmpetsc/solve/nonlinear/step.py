@@ -97,6 +97,7 @@ class Stepper:
         if self.error is None and not self.budget:
             self.budget = self.preset.iterations or 0
         self.projected = False  # whether newton's Hessian is, at the moment
+        self.is_detour = False  # the way to the last iterate is not what the linear solve has led to
         self.outcome = Outcome()  # of the solve in progress, as its last iterate has it
         self.is_first, self.begun = False, np.inf  # iteration, of which softer solids may follow; |F| before it
         self.slopes: Array | None = None  # V U' of a softer solid, for the next Hessian
@@ -141,7 +142,7 @@ class Stepper:
         snes.setJacobian(self._linearise, self.jacobian.operator)
         snes.setObjective(self._objective)
         if self.touches:
-            snes.setLineSearchPreCheck(self._shorten)
+            snes.setLineSearchPreCheck(self._change_way)
         snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
             ksp.setInitialGuessNonzero(True)
@@ -159,7 +160,7 @@ class Stepper:
         error = self.error
         if error is None and not self.budget:
             error = DEFAULT_ERROR
-        tightest = self.ksp.getTolerances()[0]
+        tightest, _, _, self.most_its = self.ksp.getTolerances()
         return ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest), minimum
 
     def set_up(self) -> None:
@@ -341,18 +342,41 @@ class Stepper:
         is_flat = outcome.bound < FULL_STEP_ERROR and (outcome.corrected or not outcome.doubts)
         return -1.0 if is_flat and distance > 0 else change
 
-    def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Shorten the way from x to x - y, which a line search is to try, where the surface would meet itself on it."""
-        if self.functional.surface is None:
-            return False
+    def _change_way(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Change the way from x to x - y, which a line search is to try, where it leads into obstacles or the surface
+        meets itself on it; whether it was."""
+        end = x.copy()
+        end.axpy(-1.0, y)
         with LOCAL:
-            end = x.copy()
-            end.axpy(-1.0, y)
+            stops = self.preset.true_hessian and self._stop_at_obstacles(x, end)
+            if stops:
+                x.copy(y)
+                y.axpy(-1.0, end)
             share = self.functional.free_share(self.functional.positions(x), self.functional.positions(end))
-            end.destroy()
+        end.destroy()
         if share < 1.0:
             y.scale(share)
-        return share < 1.0
+        self.is_detour = stops or share < 1.0
+        return self.is_detour
+
+    def _stop_at_obstacles(self, x: PETSc.Vec, end: PETSc.Vec) -> bool:
+        """Let nodes that come into an obstacle on the way from x to ``end`` end at its surface, if g is less there.
+
+        H at x knows nothing of obstacles that are not touched yet: nodes run deep into them, and a line search that
+        shortens the whole way for it would let them come in one by one.
+        """
+        functional, contact = self.functional, self.functional.problem.contact
+        before, after = functional.positions(x), functional.positions(end)
+        stopped = contact.stopped(after, before) if contact and contact.states else None
+        if not self.comm.allreduce(stopped is not None, MPI.LOR):
+            return False
+        full, _ = functional.change(after, before)
+        self.unknowns.from_nodes(after if stopped is None else stopped, end)
+        change, _ = functional.change(functional.positions(end), before)
+        if change < min(full, 0.0):
+            return True
+        self.unknowns.from_nodes(after, end)
+        return False
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Take the Jacobian at x, and the start of the linear solve (SNES calls it before each)."""
@@ -371,6 +395,9 @@ class Stepper:
             self.kinks.is_awaited = True
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
+            if self.preset.inexact and not self.options.is_given("ksp_max_it"):
+                most = self.jacobian.preconditioner.most_iterations(self.ksp.getTolerances()[0])
+                self.ksp.setTolerances(max_it=most or self.most_its)
         if self.preset.start_from_b:  # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
             z = snes.getSolutionUpdate()
             self.jacobian.operator.mult(x, z)
@@ -391,8 +418,10 @@ class Stepper:
         reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
-            is_true = self.preset.true_hessian and not self.projected
-            self.outcome = self.control.led_by(self.ksp, self.outcome) if is_true else self.outcome
+            if self.is_detour:
+                self.outcome = replace(self.outcome, left=np.inf)  # of another x
+            elif self.preset.true_hessian and not self.projected:
+                self.outcome = self.control.led_by(self.ksp, self.outcome)
         if its > 0 or not self.has_npc:  # else known since _is_solved
             self.outcome = self.control.judge(iterate, self.outcome)
         outcome = self.outcome

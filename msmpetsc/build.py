@@ -14,7 +14,7 @@ from msmpetsc.constraints.coverage import Regions, taken
 from msmpetsc.constraints.holders import Holders, clamped
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
-from msmpetsc.contact.obstacles.friction import STICK
+from msmpetsc.contact.obstacles.friction import STICK, smallest
 from msmpetsc.contact.obstacles.from_scene import build_obstacles
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.penalty import Penalty
@@ -345,7 +345,7 @@ def _contacts(
     """
     exchanges, penalties = [], []
     if tables:
-        usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
+        usual, stick = PENALTY * lattice.stiffest(comm), STICK * smallest(bounds)
     for obstacle, table in zip(obstacles, tables, strict=True):
         restitution = 1.0 if table.restitution is None else table.restitution
         if table.response == BARRIER:

@@ -6,6 +6,7 @@ from itertools import compress
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
 from msmpetsc.build import Model
@@ -16,6 +17,8 @@ from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
 from msmpetsc.contact.obstacles.reflection import StepTaken, slowed
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
 from msmpetsc.contact.surface.term import SurfaceContact
+
+GROWN = 4.0  # times more or less than the push that friction went by: then the step is solved again
 
 Placed = tuple[Positions, Indices | None]  # q (owned, 3) [m] and sides (o, owned or more), if any
 
@@ -37,6 +40,10 @@ class Environment:
         self.penalties, self.exchanges = model.penalties, model.exchanges
         self.self_contact = NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
         self._contacts = Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None  # of the last step begun
+        self.has_friction = any(p.friction > 0 for p in self.penalties) or bool(
+            self.self_contact and self.self_contact.law.friction > 0
+        )
+        self._ended: tuple[Positions, Contact] | None = None  # the last step, if it had contact, and what there was
         self.touches = bool(self.penalties or self.self_contact)
         self.standing = model.obstacles
         self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
@@ -160,22 +167,51 @@ class Environment:
         )
 
     def contact(
-        self, q: Positions, end: Positions, time: float, time_step: float, sides: Indices | None, last: Positions | None
+        self,
+        q: Positions,
+        way: tuple[Positions, Positions | None],
+        time: float,
+        time_step: float,
+        sides: Indices | None,
+        end: Positions | None = None,
     ) -> Contact | None:
-        """Return what presses in the step from q to about ``end``, with friction; None if nothing does.
+        """Return what presses in the step from q, with friction; None if nothing does (collective).
 
-        last : (l, 3) [m] positions one step before q, of a step that looks back to them
+        way : about where it ends, and (l, 3) [m] positions one step before q, of a step that looks back to them
+        end : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
         """
-        owned, surface = self.lattice.owned, None
-        pressing = self._pressing(time, sides)
-        states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
+        owned, surface, before, (about, last) = self.lattice.owned, None, self._before(q), way
+        states, held = [], before.states if before else []
+        for p, side in self._pressing(time, sides):
+            ended = None if end is None else end[:owned]
+            states.append(p.during(q[:owned], time, time_step, side[:owned], last, ended).after(held, q[:owned]))
         if self.self_contact:
-            self._contacts = self.self_contact.step(q, end, max(time - time_step, 0.0), time)
-            surface = SurfaceContact(self._contacts, q, time_step)
+            self._contacts = self.self_contact.step(q, about, max(time - time_step, 0.0), time)
+            surface = SurfaceContact(self._contacts, q, time_step, last, end, before.surface if before else None)
         return Contact(states, owned, surface) if states or surface else None
+
+    def _before(self, q: Positions) -> Contact | None:
+        """Return the contact of the step that ended at q; None if the last one known did not."""
+        if self._ended is None:
+            return None
+        ended, contact = self._ended
+        is_there = bool(np.array_equal(q[: self.lattice.owned], ended))
+        return contact if self.lattice.table.comm.allreduce(is_there, MPI.LAND) else None
+
+    def end_step(self, x: Positions, contact: Contact | None) -> None:
+        """A step has come to x (l, 3) [m]: friction of the next one goes on from there."""
+        self._ended = (x[: self.lattice.owned].copy(), contact) if contact and self.has_friction else None
+
+    def friction_lags(self, x: Positions, contact: Contact | None) -> bool:
+        """Return whether friction of a step to x (l, 3) [m] went by a push far from the one there (collective)."""
+        if not (contact and self.has_friction):
+            return False
+        by, at_end = self.lattice.table.comm.allreduce(contact.friction_limits(x))
+        return bool(max(at_end, by) > GROWN * min(at_end, by))
 
     def forget(self) -> None:
         """Forget what earlier steps showed (collective)."""
+        self._ended = None
         if self.self_contact:
             self.self_contact.forget()
             self._contacts = Contacts(self.self_contact, 0.0, 0.0)

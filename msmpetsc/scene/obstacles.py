@@ -10,8 +10,8 @@ from msmpetsc.scene.problems import rule
 from msmpetsc.scene.values import Box, FunctionName, NotNegative, Positive, Table, UnitVector, Vector, after_start
 
 FRICTION_SPEED = (
-    "slip speed below which friction fades, so that what it holds creeps; "
-    "1% of the largest body's longest side a second if absent [m/s]"
+    "how far a second what friction holds gives way before friction is whole: times a step, its elastic slip; "
+    "1% of the smallest body's longest side a second if absent [m/s]"
 )
 
 BARRIER = "barrier"  # response

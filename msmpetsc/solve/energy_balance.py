@@ -187,7 +187,8 @@ class EnergyBalance:
         contact = environment.push(when, sides)
         known = self.known if self.known and q is self.known[0] else None  # whose elastic energy is known
         ended = result.position[owned], after.sides
-        pressing = result.problem and result.problem.contact and result.problem.contact.surface
+        pressing = result.problem and result.problem.contact
+        surface = pressing and pressing.surface
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
@@ -195,7 +196,8 @@ class EnergyBalance:
             np.vdot(environment.load(time), result.position[owned] - q[owned])
             + environment.friction_work_bound((q[owned], sides), ended, time, time_step)
             + result.viscous_work
-            + (pressing.of_obstacles(result.position)[1] / self.comm.size if pressing else 0.0),
+            + (surface.of_obstacles(result.position)[1] / self.comm.size if surface else 0.0)
+            + (pressing.released(result.position) if pressing else 0.0),
             result.work,
             result.swing,
         )

@@ -162,7 +162,7 @@ class Rest:
         preset = find_preset(REST_PRESET)
         stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=REST_PREFIX)
         try:
-            contact = self.environment.contact(state.q, state.q, time, self.time_step, state.sides, None)
+            contact = self.environment.contact(state.q, (state.q, None), time, self.time_step, state.sides)
             stepper.functional.begin(StepProblem(state.q, state.q, self.environment.load(time), contact))
             functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
             stepper.unknowns.from_nodes(state.q, stepper.x)

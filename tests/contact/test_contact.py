@@ -223,10 +223,48 @@ def slide(folder: Path, slope: float, steps: int = 60, t: float = 0.01, speed: d
 
 @pytest.mark.parametrize("given, error", [({}, 1e-9), ({"friction_speed": 1e-3}, 1e-6)])
 def test_friction_holds_a_block_on_a_gentle_slope(tmp_path: Path, given: dict, error: float):
-    """It creeps where f'(u) = 2 s - s^2 = tan / mu = 0.6: at s = 0.37 of a hundredth side a second, or of a speed."""
-    speed = slide(tmp_path, 0.3, 80, 0.02, given, solver={"error": error})[-20:, 0]
+    """It gives way by f'(u / e) = 2 s - s^2 = tan / mu = 0.6: s = 0.37, once, and again after 20 steps: not in each."""
+    speed = slide(tmp_path, 0.3, 80, 0.02, given, solver={"error": error})[:, 0]
     stick = given.get("friction_speed", 0.01 * SIDES.max())
-    assert speed == pytest.approx((1 - np.sqrt(0.4)) * stick, rel=0.03)
+    creep = (1 - np.sqrt(0.4)) * stick
+    assert speed[61:].mean() == pytest.approx(creep / 20, rel=0.15)
+    assert abs(speed[70:].mean()) < 0.01 * creep
+
+
+def test_friction_goes_on_from_the_slip_that_the_last_step_ended_with():
+    """By e at most, and the energy that it stores is that which it gives back."""
+    ground, stick = Penalty(plane([0, 0, 0], [0, 0, 1]), 100.0, 0.5, 0.01), 0.01 * T
+    start = np.array([[0.0, 0.0, -0.02], [0.0, 0.0, -0.01]])
+    first = ground.during(start, T, T)
+    end = start + stick * np.array([[0.3, 0, 0], [5.0, 0, 0]])  # one holds, one slips
+    then = ground.during(end, 2 * T, T).after([first], end)
+    u, _ = then.friction.slip(end)
+    np.testing.assert_allclose(u, stick * np.array([[0.3, 0, 0], [1, 0, 0]]), atol=1e-15)
+    back = end - u
+    assert then.friction.released(end) == pytest.approx(0, abs=1e-18)
+    assert then.friction.released(back) == pytest.approx(then.friction.change(end, back), rel=1e-9)
+    shorter = ground.during(end, 1.5 * T, T / 2).after([first], end)  # with the same force
+    np.testing.assert_allclose(shorter.friction.force(end), then.friction.force(end), rtol=1e-9)
+
+
+@pytest.mark.parametrize("beyond", [-1.0, 1.0])
+def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_it_from_the_first_step_on(
+    tmp_path: Path, beyond: float
+):
+    """By a degree. Friction of no push in the first step let it go 4.7 mm; then it crept at 0.8 mm/s."""
+    angle = np.arctan(0.5) + np.radians(beyond)
+    scene = {"cages": {"cell_size": 0.05}, "material": {"young_modulus": 1e6, "density": 1000.0}}
+    scene |= {"obstacle": [GROUND | {"friction": 0.5}], "time": {"step": 0.01, "duration": 1.0}}
+    gravity = {"acceleration": [G * np.sin(angle), 0, -G * np.cos(angle)]}
+    sides = np.array([0.1, 0.1, 0.1])
+    model, frames = play(block_scene(tmp_path, sides, gravity=gravity, solver={"error": 1e-6}, **scene))
+    x = model.lattice.mass @ np.array([frame.position[:, 0] for frame in frames]).T / model.lattice.mass.sum()
+    if beyond < 0:
+        assert x[-1] - x[0] < 3e-4 and x[-1] - x[40] < 0.6 * 1e-4
+    else:
+        acceleration = G * (np.sin(angle) - 0.5 * np.cos(angle))
+        assert (x[-1] - 2 * x[50] + x[0]) / 0.25 == pytest.approx(acceleration, rel=0.02)
+        assert x[-1] - x[0] == pytest.approx(acceleration / 2, rel=0.1)
 
 
 def test_a_block_slides_down_a_steep_slope_as_coulomb_says(tmp_path: Path):
@@ -278,8 +316,8 @@ SLIDES = {  # it falls on the ground, slides a little and is pressed
 
 
 def test_secants_of_friction_save_iterations(tmp_path: Path):
-    """Newton takes 73 in all; with true curvatures alone it is 83, with secants alone 256."""
-    assert sum(frame.iterations for frame in play(block_scene(tmp_path, **SLIDES))[1]) < 78
+    """Newton takes 87 in all; with true curvatures alone it is 108, with secants alone 175."""
+    assert sum(frame.iterations for frame in play(block_scene(tmp_path, **SLIDES))[1]) < 93
 
 
 # ---- a press

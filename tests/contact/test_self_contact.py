@@ -98,6 +98,33 @@ def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: flo
         assert np.vdot(v, product) > 0
 
 
+def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_ends_with(model):
+    q = closed(model)
+    came = np.where(q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0)  # the left arm, nearer to the right one and along it
+    contacts = NearPairs(COMM, model.collision).step(q - came, q, 0.0, T)
+    now, before = (SurfaceContact(contacts, at, T).friction for at in (q, q - came))
+    friction = SurfaceContact(contacts, q, T, q - came).friction
+    expected = np.clip(2 * now.limit - now.values_of(before.pairs, before.limit), 0, 2 * now.limit)
+    np.testing.assert_allclose(friction.limit, expected, atol=1e-6 * expected.max())
+    assert 1.05 < friction.limit.sum() / now.limit.sum() < 2
+    points = model.collision.points
+    np.testing.assert_allclose(friction.slip(points(q + came, T))[0], 2 / 3 * now.along(points.moved(came)), atol=1e-15)
+    assert friction.stick == pytest.approx(2 / 3 * now.stick)
+
+
+def test_friction_goes_on_from_the_slip_that_pairs_held(model):
+    q = closed(model)
+    contacts = NearPairs(COMM, model.collision).step(q, q, 0.0, T)
+    first = SurfaceContact(contacts, q, T)
+    stick, end = first.friction.stick, q.copy()
+    end[q[:, 0] < 0, 1] += 0.4 * stick
+    then = SurfaceContact(contacts, end, T, None, None, first).friction
+    held = first.friction.values_of(then.pairs, then.begin)
+    np.testing.assert_allclose(held, first.friction.along(model.collision.points.moved(end - q)), atol=1e-12 * stick)
+    assert np.linalg.norm(held, axis=1).max() > 0.2 * stick
+    assert then.released(model.collision.points(end, T)) == pytest.approx(0, abs=1e-15)
+
+
 def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
     term, q = contact(model)
     hessian = term.hessian(q, False)
@@ -245,11 +272,11 @@ def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
     return np.diff(along)[50:] / 0.01, frames[51:]
 
 
-@pytest.mark.parametrize("given, settled", [({}, 0), ({"friction_speed": 1.5e-3}, 10)])
-def test_a_block_sticks_to_a_tilted_one_but_for_the_creep_of_its_friction(tmp_path, given: dict, settled: int):
-    """Friction below the stick speed v_s is mu N (2 v / v_s - (v / v_s)^2): what holds mu N tan(tilt) / mu creeps."""
-    speed, frames = along_and_frames(sliding(tmp_path, 20.0, **given))
-    stick = given.get("friction_speed", 1e-2 * 1.5)  # of the plate's longest side [m/s]
+def test_a_block_holds_on_a_tilted_one(tmp_path):
+    """It gives way once in the 20 steps for which that is remembered, as far as it would in each, were it not."""
+    speed, frames = along_and_frames(sliding(tmp_path, 20.0))
+    stick = 1e-2 * 1.5  # of the longest side of both, which are one mesh [m/s]
     creep = stick * (1 - np.sqrt(1 - np.tan(np.radians(20.0)) / 0.5))
-    np.testing.assert_allclose(speed[settled:], creep, rtol=0.02)  # the slower it creeps, the later it settles
-    assert max(frame.iterations for frame in frames) <= 6  # a step starts where the last one ended, not in mid-air
+    assert speed.mean() == pytest.approx(creep / 20, rel=0.3)  # steps 51 to 70 forget once
+    assert abs(speed[:9].mean()) < 0.01 * creep
+    assert max(frame.iterations for frame in frames) <= 8  # a step starts where the last one ended, not in mid-air

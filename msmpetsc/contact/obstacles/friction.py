@@ -1,12 +1,16 @@
-"""Coulomb's friction of nodes on obstacles.
+"""Coulomb's friction of nodes on obstacles, and its law.
 
-It opposes the slip u, the way along the surface during the step, with mu N once |u| passes a small
-e; N is the push on the node at the step's start, so that friction has a potential, mu N f(|u|),
-with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020, Incremental
-Potential Contact, Eq. 12 to 15). It is convex. Explicit substeps take it as a change of velocity.
+It opposes the slip u with mu N once |u| passes a small e, and has a potential, mu N f(|u|), with f(u) = u^2 / e -
+u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020, Incremental Potential Contact, Eq. 12 to 15), for N is
+known before the step is solved. It is convex.
+
+There the slip is that of one step, so that what holds creeps. Here it goes on from step to step, by e at most, as an
+elastic slip does (Wriggers 2006, Computational Contact Mechanics, section 5.2.3): what holds stays where it is.
+
+Explicit substeps take friction as a change of velocity.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,37 +18,39 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.contact.obstacles.solids import TINY
 
-STICK = 1e-2  # longest sides a second: friction holds but for a creep below this; 1e-3 took Newton 5 times as long
+STICK = 1e-2  # of the smallest body, longest sides a second: what friction holds gives way so far in a step
 
 Pressed = tuple[Indices, Floats, Rows]
 
 
 @dataclass(frozen=True)
 class Friction:
-    """Friction of one step.
+    """Friction of one step: what is the same of nodes on an obstacle and of parts of surfaces on each other.
 
-    nodes   : (a,) those in contact; normal (a, 3) of the faces
-    carried : (a, 3) where they are if they do not slip [m]
-    limit   : (a,) mu N [N]
-    stick   : e [m]
+    limit : (a,) mu N [N]
+    stick : e [m]
+    begin : (a or 1, 3) elastic slips with which the step begins [m]
     """
 
-    nodes: Indices
-    normal: Rows
-    carried: Positions
     limit: Floats
     stick: float
+    begin: Rows
+
+    def along(self, moved: Rows) -> Rows:
+        """Return the slip (a, 3) [m] that positions' moves (n, 3) [m] are."""
+        raise NotImplementedError
 
     def slip(self, q: Positions) -> tuple[Rows, Floats]:
-        """Return the slip u (a, 3) and its length (a,) [m]."""
-        moved = q[self.nodes] - self.carried
-        u = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
-        return u, np.linalg.norm(u, axis=1)
+        """Return the slip u (a, 3) of positions (n, 3) and its length (a,) [m]."""
+        raise NotImplementedError
 
-    def change(self, q: Positions, base: Positions) -> float:
-        """Return mu N (f(u) - f(u_0)) [J], from how far q is from base, so that a small change keeps its digits."""
+    def change(self, q: Positions, base: Positions, moved: Rows | None = None) -> float:
+        """Return mu N (f(u) - f(u_0)) [J], by how far q is from base, so that a small change keeps its digits.
+
+        moved : (n, 3) [m] q - base, where more digits of it are known
+        """
         (u, length), (u_0, length_0), e = self.slip(q), self.slip(base), self.stick
-        moved = (q - base)[self.nodes]  # u - u_0, but for a part along the normal, where u + u_0 has none
+        moved = self.along(q - base if moved is None else moved)
         longer = (moved * (u + u_0)).sum(axis=1) / np.maximum(length + length_0, np.finfo(float).tiny)
         low, low_0 = np.minimum(length, e), np.minimum(length_0, e)
         beyond = np.maximum(length, e) - np.maximum(length_0, e)
@@ -58,30 +64,43 @@ class Friction:
         """Return f'(u) / u, (a,) [1/m]."""
         return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
 
-    def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
+    def held(self, q: Positions, stick: float) -> Rows:
+        """Return the elastic slips (a, 3) [m] that a step from positions q (n, 3) begins with, whose e is ``stick``."""
         u, length = self.slip(q)
-        gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
+        return u * (stick / np.maximum(length, self.stick))[:, None]
+
+    def released(self, q: Positions) -> float:
+        """Return how much less energy [J] elastic slips store at q than where the step begins."""
+        ends = np.linalg.norm(self.begin, axis=1), np.minimum(self.slip(q)[1], self.stick)
+        begin, end = (length**2 / self.stick - length**3 / (3 * self.stick**2) for length in ends)
+        return float(self.limit @ (begin - end))
+
+    def force(self, q: Positions) -> Rows:
+        """Return the gradient by the slip, mu N f'(|u|) u / |u|, (a, 3) [N]."""
+        u, length = self.slip(q)
+        return (self.limit * self.slope(length))[:, None] * u
 
     def all_secant(self) -> Mask:
-        """Return what ``blocks`` takes for all nodes to have their secants, (a,) bool."""
+        """Return what ``blocks`` takes for all slips to have their secants, (a,) bool."""
         return self.limit >= 0
 
     def passes_kink(self, q: Positions, base: Positions) -> Mask:
-        """Return which nodes turn round or come to stick on their way from base to q, (a,) bool."""
+        """Return which slips turn round or come to stick on their way from base to q, (a,) bool."""
         (u, length), (u_0, length_0) = self.slip(q), self.slip(base)
         passes: Mask = ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
         return passes
 
-    def blocks(self, q: Positions, true: bool, secant: Mask | None = None) -> Rows:
+    def curvature(self, q: Positions, plane: Rows, true: bool, secant: Mask | None = None) -> Rows:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
 
         The second part is not positive; unless ``true``, or where ``secant`` (a,), it is left out. What is then left
         is no less than the Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
+
+        plane : I - n n^T (a or 1, 3, 3)
         """
         u, length = self.slip(q)
         slope = self.slope(length)
-        blocks = slope[:, None, None] * (like(q, np.eye(3)) - squares(self.normal))
+        blocks = slope[:, None, None] * plane
         if true:
             direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
             curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
@@ -90,9 +109,53 @@ class Friction:
         return self.limit[:, None, None] * blocks
 
 
+@dataclass(frozen=True)
+class NodeFriction(Friction):
+    """Friction of nodes on an obstacle.
+
+    nodes   : (a,) those in contact; normal (a, 3) of the faces
+    carried : (a, 3) where they are if they do not slip [m]
+    """
+
+    nodes: Indices
+    normal: Rows
+    carried: Positions
+
+    def after(self, last: "NodeFriction | None", q: Positions) -> "NodeFriction":
+        """Return friction of a step from q (owned, 3) [m] where ``last`` was that of the step before, if any."""
+        held = np.zeros_like(q)
+        if last:
+            held[last.nodes] = last.held(q, self.stick)
+        return replace(self, begin=self._tangential(held[self.nodes]))
+
+    def along(self, moved: Rows) -> Rows:
+        return self._tangential(moved[self.nodes])
+
+    def slip(self, q: Positions) -> tuple[Rows, Floats]:
+        u = self.begin + self._tangential(q[self.nodes] - self.carried)
+        return u, np.linalg.norm(u, axis=1)
+
+    def _tangential(self, moved: Rows) -> Rows:
+        tangential: Rows = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
+        return tangential
+
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
+        """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
+        gradient[self.nodes] += self.force(q)
+
+    def blocks(self, q: Positions, true: bool, secant: Mask | None = None) -> Rows:
+        """Return the Hessian's blocks of the nodes (a, 3, 3) [N/m], as ``curvature`` has them."""
+        return self.curvature(q, like(q, np.eye(3)) - squares(self.normal), true, secant)
+
+
 def squares(vectors: Rows) -> Rows:
     """Return v v^T of each of the vectors (a, 3), (a, 3, 3)."""
     return vectors[:, :, None] * vectors[:, None, :]
+
+
+def smallest(bounds: Rows) -> float:
+    """Return the longest side [m] of the smallest of bodies, by their bounds (b, 2, 3) [m]."""
+    return float((bounds[:, 1] - bounds[:, 0]).max(axis=1).min())
 
 
 class Movers(NamedTuple):

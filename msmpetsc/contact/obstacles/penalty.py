@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
-from msmpetsc.contact.obstacles.friction import Friction, Pressed, squares
+from msmpetsc.contact.obstacles.friction import NodeFriction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
 SHALLOW = 1e-3  # of the depth that a node would come to, where it is stopped
-Secants = list[Mask | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
+Secants = list[Mask | None]  # which slips (a,) have their secant, of each obstacle's friction and of the surface's
 
 
 @dataclass(frozen=True)
@@ -42,26 +42,36 @@ class Penalty:
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
     def during(
-        self, q: Positions, time: float, time_step: float, sides: Indices | None = None, last: Positions | None = None
+        self,
+        q: Positions,
+        time: float,
+        time_step: float,
+        sides: Indices | None = None,
+        last: Positions | None = None,
+        end: Positions | None = None,
     ) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m].
 
         last : (owned or more, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the
             velocity that it ends with, under the push that is to be expected then
+        end  : (owned, 3) [m] where an earlier solve of the step has ended: it then goes by the push there
         """
         state = self.state_at(time, sides)
         if self.friction == 0:
             return state
         start, path = time - time_step, self.obstacle.path
-        nodes, depth, normal = self.state_at(start, sides).pressed(q)
+        nodes, depth, normal = self.state_at(start, sides).pressed(q) if end is None else state.pressed(end)
         way, stick = like(q, path.displacement_between(start, time)), self.stick * time_step
         carried = q[nodes] + way
         if last is not None:
             carried += (q[nodes] - last[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
             stick *= 2 / 3
+        if last is not None and end is None:
             coming, _ = self.obstacle.depths(2 * q - last[: len(q)], time, sides)
             depth = np.clip(coming[nodes], 0, 2 * depth)  # what just came in tells little
-        return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
+        limit, begin = self.friction * self.stiffness * depth, np.zeros((1, 3), like=q)
+        friction = NodeFriction(limit, stick, begin, nodes, normal, carried)
+        return replace(state, friction=friction, mu=self.friction)
 
 
 @dataclass(frozen=True)
@@ -71,13 +81,27 @@ class ContactState:
     stiffness : [N/m] on each node
     friction  : of the step, if any
     sides     : (owned or more,) by which face each node came in (solids.side_of); None: the nearest
+    mu        : of friction
     """
 
     obstacle: Obstacle
     time: float
     stiffness: float
-    friction: Friction | None
+    friction: NodeFriction | None
     sides: Indices | None = None
+    mu: float = 0.0
+
+    def after(self, before: "list[ContactState]", q: Positions) -> "ContactState":
+        """Return the same with friction that goes on from that of the step before, which ended at q (owned, 3) [m]."""
+        last = next((state.friction for state in before if state.obstacle is self.obstacle), None)
+        return replace(self, friction=self.friction.after(last, q)) if self.friction else self
+
+    def friction_limits(self, q: Positions) -> Floats:
+        """Return the sums (2,) of mu N [N] that friction goes by, and with the push at q (owned, 3) [m]."""
+        if not self.friction:
+            return np.zeros(2)
+        _, depth, _ = self.pressed(q)
+        return np.array([float(self.friction.limit.sum()), self.mu * self.stiffness * float(depth.sum())])
 
     def depths(self, q: Positions) -> tuple[Floats, Indices]:
         """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
@@ -165,13 +189,24 @@ class Contact:
         if self.surface:
             self.surface.add_gradient(q, gradient)
 
+    def friction_limits(self, q: Positions) -> Floats:
+        """Return the sums (2,) of mu N [N] that this rank's friction goes by, and with the push at q."""
+        of_nodes = sum((state.friction_limits(q[: self.owned]) for state in self.states), np.zeros(2))
+        return of_nodes + self.surface.friction_limits(q) if self.surface else of_nodes
+
+    def released(self, q: Positions) -> float:
+        """Return how much less energy [J] elastic slips of friction store at q than where the step begins."""
+        of_nodes = sum(state.friction.released(q[: self.owned]) for state in self.states if state.friction)
+        return of_nodes + (self.surface.released(q) if self.surface else 0.0)
+
     def all_secant(self) -> Secants:
-        """Return what ``hessian`` takes for all friction to have its secant."""
-        return [state.friction.all_secant() if state.friction else None for state in self.states]
+        """Return what ``hessian`` takes for all friction of obstacles to have its secant."""
+        return [*(state.friction.all_secant() if state.friction else None for state in self.states), None]
 
     def passes_kinks(self, q: Positions, base: Positions) -> Secants:
         """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
-        return [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
+        of_nodes = [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
+        return [*of_nodes, self.surface.passes_kink(q, base) if self.surface else None]
 
     def hessian(self, q: Positions, true: bool, secants: Secants | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
@@ -183,7 +218,8 @@ class Contact:
             Hessian, nothing along a slip, would let nodes run to and fro
         secants : where friction has that of its secant all the same
         """
-        for state, secant in zip(self.states, secants or [None] * len(self.states), strict=True):
+        of_states = secants[:-1] if secants else [None] * len(self.states)
+        for state, secant in zip(self.states, of_states, strict=True):
             rows, _, normal = state.pressed(q[: self.owned])
             yield rows, state.stiffness * squares(normal)
             if state.friction:

@@ -17,13 +17,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Indices, Positions, Rows
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.contact.surface.creases import creases, neighbours
+from msmpetsc.contact.surface.surface_friction import SurfaceFriction, limits_of, slips_of
 from msmpetsc.geometry.surface import Surface
 
 if TYPE_CHECKING:
     import ipctk
     from scipy.sparse import csc_matrix
+
+    from msmpetsc.contact.surface.surface_friction import Tangential
 
 ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # one for each distance that pairs push from
 
@@ -39,7 +42,7 @@ class BarrierLaw:
     distance  : dhat [m]
     stiffness : kappa [J/m^2]
     friction  : Coulomb's mu
-    stick     : slip speed [m/s] below which friction fades to nothing
+    stick     : slip [m] a second below which friction is not whole
     """
 
     distance: float
@@ -153,24 +156,37 @@ class Barrier:
         kinds = zip(self.potentials, contacts, strict=True)
         return [Acting(potential, pairs, self.mesh) for potential, pairs in kinds if not pairs.empty()]
 
-    def rubbing(self, contacts: ContactSets, start: Positions, stick: float) -> "list[Acting]":
-        """Return Coulomb's friction between parts of the surface in one step, lagged: of the contacts where the step
-        starts, with their push there. It is a potential of the slip S - S_n, of the same law as an obstacle's
-        (obstacles.friction).
+    def friction(
+        self, contacts: ContactSets, points: Positions, start: Positions, stick: float
+    ) -> SurfaceFriction | None:
+        """Return Coulomb's friction of contacts, with their push at points (p, 3) [m]; None without any.
 
-        contacts : where the step starts, the points at ``start`` (p, 3) [m]
-        stick    : slip [m] below which it fades to nothing
+        start : (p, 3) where the points are if nothing slips [m]
+        stick : slip below which it is not whole [m]
         """
-        friction, rubbing = self.ipctk.FrictionPotential(stick), []
-        for potential, pairs, mesh, _ in self.pushing(contacts):
-            tangential = self.ipctk.TangentialCollisions()  # its normals and pushes stay
-            tangential.build(mesh, np.asfortranarray(start), pairs, potential, self.law.friction)
-            rubbing.append(Acting(friction, tangential, mesh, start))
-        return rubbing
+        tangential = self._tangential(contacts, points)
+        if not tangential:
+            return None
+        pairs, limit = limits_of(tangential, self.mesh)
+        slips = slips_of(tangential, pairs, len(points))
+        return SurfaceFriction(limit, stick, np.zeros((1, 3)), start, pairs, slips)
+
+    def friction_limits(self, contacts: ContactSets, points: Positions) -> tuple[Indices, Floats]:
+        """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N] at points (p, 3) [m]."""
+        return limits_of(self._tangential(contacts, points), self.mesh)
+
+    def _tangential(self, contacts: ContactSets, points: Positions) -> "Tangential":
+        of_all: Tangential = []
+        for potential, pairs, mesh in self.pushing(contacts):
+            built = self.ipctk.TangentialCollisions()
+            built.build(mesh, np.asfortranarray(points), pairs, potential, self.law.friction)
+            # by kind, in copies: to go over ``built`` itself ends in a crash now and then (ipctk 1.6)
+            of_all += [*built.vv_collisions, *built.ev_collisions, *built.ee_collisions, *built.fv_collisions]
+        return of_all
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite where there are no contacts."""
-        return min((self._least(pairs, points) for _, pairs, *_ in self.pushing(contacts)), default=np.inf)
+        return min((self._least(pairs, points) for _, pairs, _ in self.pushing(contacts)), default=np.inf)
 
     def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
@@ -217,39 +233,34 @@ class Barrier:
 
 
 class Acting(NamedTuple):
-    """A potential [J] of pairs: a barrier of the points S (p, 3) [m], or friction of their slip from ``start``."""
+    """A barrier of pairs, whose potential [J] is of the points S (p, 3) [m]."""
 
-    potential: Any
-    pairs: Any
+    potential: "ipctk.BarrierPotential"
+    pairs: "ipctk.NormalCollisions"
     mesh: "ipctk.CollisionMesh"
-    start: Positions | None = None
-
-    def at(self, points: Positions) -> tuple[Any, "ipctk.CollisionMesh", Positions]:
-        """Return what the potential takes for its value."""
-        return self.pairs, self.mesh, np.asfortranarray(points if self.start is None else points - self.start)
 
 
 def energy_of(acting: list[Acting], points: Positions) -> float:
     """Return the sum of potentials [J] at points S (p, 3) [m]."""
-    return float(sum(each.potential(*each.at(points)) for each in acting))
+    at = np.asfortranarray(points)
+    return float(sum(each.potential(each.pairs, each.mesh, at) for each in acting))
 
 
 def gradient_of(acting: list[Acting], points: Positions) -> Rows:
     """Return the gradient (p, 3) [N] of potentials."""
-    gradient = np.zeros(points.size)
+    gradient, at = np.zeros(points.size), np.asfortranarray(points)
     for each in acting:
-        gradient += each.potential.gradient(*each.at(points))
+        gradient += each.potential.gradient(each.pairs, each.mesh, at)
     return gradient.reshape(-1, 3)
 
 
 def hessian_of(acting: list[Acting], points: Positions, projected: bool) -> "list[csc_matrix]":
-    """Return the terms (3p, 3p) [N/m] of the Hessian; ``projected`` leaves out the negative part of each pair, of which
-    friction has none."""
+    """Return the terms (3p, 3p) [N/m] of the Hessian; ``projected`` leaves out the negative part of each pair."""
     import ipctk
 
-    kinds = ipctk.PSDProjectionMethod
-    clamped = [kinds.CLAMP if projected and each.start is None else kinds.NONE for each in acting]
-    return [each.potential.hessian(*each.at(points), kind) for each, kind in zip(acting, clamped, strict=True)]
+    kinds, at = ipctk.PSDProjectionMethod, np.asfortranarray(points)
+    kind = kinds.CLAMP if projected else kinds.NONE
+    return [each.potential.hessian(each.pairs, each.mesh, at, kind) for each in acting]
 
 
 def _kept(share: float) -> float:

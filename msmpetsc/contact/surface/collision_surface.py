@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.obstacles.friction import STICK
+from msmpetsc.contact.obstacles.friction import STICK, smallest
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.creases import NEAREST
@@ -53,7 +53,7 @@ def collision_surface(
     # takes both of each contact; with those of the stiffest cell it, and the energy of a state, is always the same.
     mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
     layer = (PER_EDGE * lattice.stiffest(comm) + mass / scene.time.step**2) / lattice.cell_size**2
-    stick = table.friction_speed or STICK * float(sides.max())
+    stick = table.friction_speed or STICK * smallest(np.array([body.bounds for body in bodies]))
     law = BarrierLaw(distance, float(distance**2 * layer), table.friction, stick)
     carried = SurfacePoints(comm, lattice, embedding, met)
     joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))

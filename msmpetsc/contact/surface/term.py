@@ -11,10 +11,11 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.surface.barrier import Acting, energy_of, gradient_of, hessian_of
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.points import Carried
+from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
 TINY = np.finfo(float).tiny
 SMALL = 1e-4  # of the barrier's distance: points that move less change the energy by their mean force times that
@@ -73,22 +74,63 @@ class SurfaceHessian:
 class SurfaceContact:
     """Self-contact in one step. All methods are collective; positions are (owned or more, 3) [m].
 
-    rubs    : there is friction
-    rubbing : friction of the step, on rank 0
+    start    : where the step starts
+    last     : one step before that, of a step of BDF2, whose friction is that of the velocity that it ends with
+    end      : where an earlier solve of the step has ended, with the push there; None: with that of its start
+    before   : contact in the step before
+    rubs     : there is friction
+    friction : of the step, on rank 0
     """
 
-    def __init__(self, contacts: Contacts, start: Positions, time_step: float):
+    def __init__(
+        self,
+        contacts: Contacts,
+        start: Positions,
+        time_step: float,
+        last: Positions | None = None,
+        end: Positions | None = None,
+        before: "SurfaceContact | None" = None,
+    ):
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
-        self.rubbing: list[Acting] = []
-        self._hessians: dict[bool, tuple[ContactsAt, SurfaceHessian]] = {}  # with and without their negative parts
+        self.friction: SurfaceFriction | None = None
+        self._hessians: dict[bool, tuple[ContactsAt, Mask | None, SurfaceHessian]] = {}  # with and without negatives
         if contacts.law.friction > 0:
-            moment = contacts.find(start, contacts.begin)
-            barrier = contacts.barrier
+            moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
             self.rubs = moment.count > 0
-            if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
-                stick = contacts.law.stick * time_step
-                self.rubbing = barrier.rubbing(moment.contacts, moment.points, stick)
+            if self.rubs:
+                points = contacts.points(start, contacts.begin)
+                came = None if last is None else contacts.points.moved(start - last[: len(start)])
+                friction = self._friction(moment, points, came, time_step, end is None)
+                self.friction = friction.after(before.friction, points) if friction and before else friction
+
+    def _friction(
+        self, moment: ContactsAt, points: Positions, came: Rows | None, time_step: float, extrapolates: bool
+    ) -> SurfaceFriction | None:
+        """Return friction with the push of a moment, on rank 0.
+
+        points, came : where points (p, 3) are when the step begins [m], and how far they came in the one before, of a
+            step of BDF2, which ``extrapolates`` the push
+        """
+        contacts, barrier, stick = self.contacts, self.contacts.barrier, self.contacts.law.stick * time_step
+        if barrier is None or moment.contacts is None or moment.points is None:
+            return None
+        if came is None:
+            return barrier.friction(moment.contacts, moment.points, points, stick)
+        came[contacts.points.bodies :] = contacts.obstacles.way(contacts.begin, contacts.time)
+        friction = barrier.friction(moment.contacts, moment.points, points + came / 3, 2 / 3 * stick)
+        if friction is None or not extrapolates:
+            return friction
+        before = friction.values_of(*barrier.friction_limits(moment.contacts, points - came))
+        return replace(friction, limit=np.clip(2 * friction.limit - before, 0, 2 * friction.limit))
+
+    def friction_limits(self, q: Positions) -> Floats:
+        """Return the sums (2,) of mu N [N] that friction goes by, and with the push at q, on rank 0."""
+        moment, barrier = self.contacts.find(q), self.contacts.barrier
+        if self.contacts.law.friction == 0 or not barrier or moment.contacts is None or moment.points is None:
+            return np.zeros(2)
+        by = self.friction.limit.sum() if self.friction else 0.0
+        return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
 
     def _acting(self, q: Positions) -> ContactsAt | None:
         """Return the contacts at q, with the points for friction; None where nothing acts."""
@@ -112,15 +154,16 @@ class SurfaceContact:
         if after is None and before is None:
             return 0.0
         moved = self.contacts.points.moved(q - base)
+        rubbed = 0.0
+        if self.friction and after and before and after.points is not None and before.points is not None:
+            rubbed = self.friction.change(after.points, before.points, moved)
         if moved.size and np.abs(moved).max() < SMALL * self.contacts.law.distance:
-            forces = filter(None, (self._forces(moment) for moment in (before, after) if moment))  # on rank 0
-            return sum(0.5 * float(np.vdot(gradient, moved[touched])) for touched, gradient in forces)
-        return self._energy(after) - self._energy(before)
+            moments = [moment for moment in (before, after) if moment and moment.points is not None]
+            return rubbed + sum(0.5 * float(np.vdot(self._pushes(moment), moved)) for moment in moments)
+        return rubbed + self._energy(after) - self._energy(before)
 
     def _energy(self, moment: ContactsAt | None) -> float:
-        if moment is None or moment.points is None:
-            return 0.0
-        return energy_of(self._pushing(moment), moment.points) + energy_of(self.rubbing, moment.points)
+        return energy_of(self._pushing(moment), moment.points) if moment and moment.points is not None else 0.0
 
     def _pushing(self, moment: ContactsAt) -> list[Acting]:
         """Return the barriers that act, on rank 0."""
@@ -145,9 +188,14 @@ class SurfaceContact:
         return touched, forces[touched]
 
     def _gradient(self, moment: ContactsAt) -> Rows:
-        """Return the gradient (total, 3) [N] on rank 0."""
+        """Return the gradient (total, 3) [N] on rank 0, friction included."""
         assert moment.points is not None
-        return gradient_of(self._pushing(moment), moment.points) + gradient_of(self.rubbing, moment.points)
+        rubs = self.friction.gradient(moment.points) if self.friction else 0.0
+        return self._pushes(moment) + rubs
+
+    def _pushes(self, moment: ContactsAt) -> Rows:
+        assert moment.points is not None
+        return gradient_of(self._pushing(moment), moment.points)
 
     def of_obstacles(self, q: Positions) -> tuple[Rows, float]:
         """Return the pushes of obstacles (k, 3) [N] on the bodies, and their work [J] in the step that ends at q.
@@ -165,17 +213,35 @@ class SurfaceContact:
             found = self.comm.bcast(found)
         return found
 
-    def hessian(self, q: Positions, projected: bool) -> SurfaceHessian | None:
-        """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts."""
+    def released(self, q: Positions) -> float:
+        """Return how much less energy [J] elastic slips store at q than where the step begins, on rank 0."""
+        moment = self._acting(q)
+        if self.friction is None or moment is None or moment.points is None:
+            return 0.0
+        return self.friction.released(moment.points)
+
+    def passes_kink(self, q: Positions, base: Positions) -> Mask | None:
+        """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
+        after, before, passes = self._acting(q), self._acting(base), None
+        if self.friction and after and before and after.points is not None and before.points is not None:
+            passes = self.friction.passes_kink(after.points, before.points)
+        of_root: Mask | None = self.comm.bcast(passes)
+        return of_root
+
+    def hessian(self, q: Positions, projected: bool, secant: Mask | None = None) -> SurfaceHessian | None:
+        """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts.
+
+        secant : (a,) which slips' friction has that of its secant
+        """
         moment = self._acting(q)
         if moment is None:
             return None
         known = self._hessians.get(projected)
-        if known is None or known[0] is not moment:
-            touched, points = self.comm.bcast(self._curvature(moment, projected))
-            known = moment, SurfaceHessian(self.comm, self.contacts.points.carried(touched), points)
+        if known is None or known[0] is not moment or known[1] is not secant:
+            touched, points = self.comm.bcast(self._curvature(moment, projected, secant))
+            known = moment, secant, SurfaceHessian(self.comm, self.contacts.points.carried(touched), points)
             self._hessians[projected] = known
-        return known[1]
+        return known[2]
 
     def concavity(self, q: Positions) -> Floats:
         """Return c (owned,) [N/m]: the Hessian's negative part is no more than a diagonal of c on the nodes.
@@ -191,11 +257,13 @@ class SurfaceContact:
         bound: Floats = self.contacts.points.spread * (np.abs(weights).T @ sums[at])
         return bound
 
-    def _curvature(self, moment: ContactsAt, projected: bool) -> tuple[Indices, csr_array] | None:
+    def _curvature(self, moment: ContactsAt, projected: bool, secant: Mask | None) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
         if self.contacts.barrier is None or moment.points is None:
             return None
-        parts = hessian_of([*self._pushing(moment), *self.rubbing], moment.points, projected)
+        parts = hessian_of(self._pushing(moment), moment.points, projected)
+        if self.friction:
+            parts.append(self.friction.hessian(moment.points, secant))
         whole = csr_array(sum(parts))
         rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
         touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))

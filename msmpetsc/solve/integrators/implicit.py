@@ -23,6 +23,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint, Range
+from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
@@ -65,6 +66,8 @@ class ContactFaces:
     def __post_init__(self) -> None:
         self.solves = 0
         self.is_settled = False
+        self.contact: Contact | None = None  # of the problem solved last
+        self.end: Positions | None = None  # of a solve whose friction went by too small a push
         self.sides = self._crossed(self.y)
 
     def _crossed(self, end: Positions) -> Indices:
@@ -75,8 +78,9 @@ class ContactFaces:
     def problem(self) -> StepProblem:
         """Return the problem of the step with the faces as they are known now."""
         environment, time = self.environment, self.time
-        contact = environment.contact(self.q, self.y, time, self.time_step, self.sides, self.q_before)
-        return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
+        way = self.y, self.q_before
+        self.contact = environment.contact(self.q, way, time, self.time_step, self.sides, self.end)
+        return StepProblem(self.q, self.y, environment.load(time), self.contact, environment.prescribed(self.q, time))
 
     def compare(self, x: Positions) -> None:
         """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
@@ -96,6 +100,9 @@ class ContactFaces:
                     'in by; try a smaller time.step, or safety.on_failure = "substep"',
                     "contact",
                 )
+            return
+        if self.end is None and environment.friction_lags(x, self.contact):
+            self.end, self.is_settled = x, False
             return
         if self.environment.penalties:  # what reflects goes by the way to x alone
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
@@ -169,8 +176,9 @@ class ImplicitEuler(Integrator):
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         while not faces.is_settled:
             problem = replace(faces.problem(), rates=rates)
-            result = self.stepper.step(problem)
+            result = self.stepper.step(problem, faces.end)
             faces.compare(result.position)
+        self.environment.end_step(result.position, problem.contact)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
         result = replace(result, cost=cost, problem=problem, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides

@@ -110,7 +110,8 @@ class TrueHessian:
             count_flops(self.elasticity.flops.hessian)
             if self.contact:
                 self.contact.linearise(contact, q, True, secants)
-            self.surface = contact.surface.hessian(q, projected) if contact and contact.surface else None
+            secant = secants[-1] if secants else None  # of the surface
+            self.surface = contact.surface.hessian(q, projected, secant) if contact and contact.surface else None
 
     def take_slopes(self, slopes: Array) -> None:
         """Take other V U' of a solid's cells (elasticity.solid.CellHessians) than those at q."""

@@ -1,0 +1,81 @@
+"""Friction between parts of surfaces in one step, of the same law as an obstacle's (contact.obstacles.friction).
+
+A pair of parts has its points of contact, its normal and its push from one moment (Li et al. 2020, Incremental
+Potential Contact, section 5.3); its slip is then linear in the points.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import bsr_array, coo_array, csr_array
+
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.contact.obstacles.friction import Friction
+
+if TYPE_CHECKING:
+    import ipctk
+
+    Tangential = list[ipctk.TangentialCollision]
+
+
+@dataclass(frozen=True)
+class SurfaceFriction(Friction):
+    """Friction of pairs of a surface's parts.
+
+    start : (p, 3) where points are if nothing slips [m]
+    pairs : (a, 4) points of each, -1 for none
+    slips : (3a, 3p) of moves of all points the slip of each pair
+    """
+
+    start: Positions
+    pairs: Indices
+    slips: csr_array
+
+    def along(self, moved: Rows) -> Rows:
+        slip: Rows = (self.slips @ moved.ravel()).reshape(-1, 3)
+        return slip
+
+    def slip(self, q: Positions) -> tuple[Rows, Floats]:
+        u = self.begin + self.along(q - self.start)
+        return u, np.linalg.norm(u, axis=1)
+
+    def after(self, last: "SurfaceFriction | None", points: Positions) -> "SurfaceFriction":
+        """Return friction of a step from points (p, 3) [m] where ``last`` was that of the step before, if any."""
+        return replace(self, begin=self.values_of(last.pairs, last.held(points, self.stick))) if last else self
+
+    def values_of(self, pairs: Indices, values: Rows) -> Rows:
+        """Return of values (k, 3) of other ``pairs`` (k, 4) those of these, (a, 3), 0 where there are none."""
+        known = dict(zip(map(tuple, pairs.tolist()), values, strict=True))
+        nothing = np.zeros(values.shape[1:])
+        return np.array([known.get(tuple(pair), nothing) for pair in self.pairs.tolist()])
+
+    def gradient(self, points: Positions) -> Rows:
+        """Return the gradient (p, 3) [N] at the points."""
+        gradient: Rows = (self.slips.T @ self.force(points).ravel()).reshape(-1, 3)
+        return gradient
+
+    def hessian(self, points: Positions, secant: Mask | None = None) -> csr_array:
+        """Return the Hessian (3p, 3p) [N/m] at the points, of some slips by their ``secant`` (a,)."""
+        blocks = self.curvature(points, np.eye(3)[None], True, secant)
+        middle = bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
+        return csr_array(self.slips.T @ (middle @ self.slips))
+
+
+def slips_of(tangential: "Tangential", pairs: Indices, points: int) -> csr_array:
+    """Return the slips (3a, 3p) of pairs (a, 4), each along the plane of its contact, of so many points."""
+    rows, columns, values = [], [], []
+    for number, pair in enumerate(tangential):
+        along = pair.tangent_basis @ (pair.tangent_basis.T @ pair.relative_velocity_jacobian())
+        own = pairs[number, : pair.num_vertices()]
+        rows.append(np.repeat(3 * number + np.arange(3), along.shape[1]))
+        columns.append(np.tile((3 * own[:, None] + np.arange(3)).ravel(), 3))
+        values.append(along.ravel())
+    at = np.concatenate(rows), np.concatenate(columns)
+    return csr_array(coo_array((np.concatenate(values), at), shape=(3 * len(pairs), 3 * points)))
+
+
+def limits_of(tangential: "Tangential", mesh: "ipctk.CollisionMesh") -> tuple[Indices, Floats]:
+    """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N]."""
+    pairs = np.array([pair.vertex_ids(mesh.edges, mesh.faces) for pair in tangential], int).reshape(-1, 4)
+    return pairs, np.array([pair.mu_s * pair.weight * pair.normal_force_magnitude for pair in tangential])

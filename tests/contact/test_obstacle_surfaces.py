@@ -132,6 +132,40 @@ def test_a_ball_pressed_into_a_hole_stays_on_its_rim(tmp_path: Path, response: s
     assert 5 < frames[-1].push[0, 2] < 60
 
 
+PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}  # [s], [N]
+
+
+def error_of_a_slide(folder: Path, t: float) -> float:
+    """How far [m] X + mu Z is off, as in test_contact: it does not depend on how the push comes and goes."""
+    mu, end, mass = 0.2, 0.2, DENSITY * SIDES.prod()
+    floor = FLOOR | {"box": [[-0.503, -0.507, -0.2], [1.5, 1.1, -1e-4]]}
+    force = [{"region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}, "total": PRESSING}]
+    scene = block_scene(
+        folder,
+        time={"step": t, "duration": end, "integrator": "bdf2"},
+        force=force,
+        obstacle=[floor],
+        gravity=GRAVITY,
+        start={"velocity": [2.0, 0, 0]},
+        material={"young_modulus": 2e4, "density": DENSITY},
+        self_contact={"distance": 1e-4, "friction": mu},
+        solver=ERROR | {"error": 1e-6},
+    )
+    trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide().subdivide().export(folder / "scene.ply")
+    model, frames = play(scene)
+    X, _, Z = model.lattice.mass @ (frames[-1].position - model.lattice.nodes) / mass
+    fine = np.linspace(0, end, 20001)
+    pressed = np.interp(fine, PRESSING["times"], -np.array(PRESSING["values"])[:, 2]) + mass * G
+    return abs(X + mu * Z - end * 2.0 + mu / mass * float(((end - fine) * pressed).mean() * end))
+
+
+@pytest.mark.slow
+def test_friction_of_the_surface_is_of_second_order_with_bdf2(tmp_path: Path):
+    """Down to 2e-4 m, which the edges of the floor's triangles make. It was 7.0, 3.7 and 1.9 mm."""
+    errors = [error_of_a_slide(tmp_path, t) for t in (0.01, 0.005, 0.0025)]
+    assert errors[0] < 2.5e-3 and errors[1] < 0.5 * errors[0] and errors[2] < 0.4 * errors[1]
+
+
 def test_ranks_agree(tmp_path: Path):
     """For six steps: the seventh has two minima, of 5 and of 7 contacts, and one rank or two come to either."""
     tables = {"self_contact": {"friction": 0.5}, "solver": ERROR | {"error": 1e-8}}

@@ -5,7 +5,8 @@ u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020, Incremental Potent
 known before the step is solved. It is convex.
 
 There the slip is that of one step, so that what holds creeps. Here it goes on from step to step, by e at most, as an
-elastic slip does (Wriggers 2006, Computational Contact Mechanics, section 5.2.3): what holds stays where it is.
+elastic slip does (Simo and Laursen 1992, An augmented Lagrangian treatment of contact problems involving friction):
+what holds stays where it is.
 
 Explicit substeps take friction as a change of velocity.
 """

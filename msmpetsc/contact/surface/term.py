@@ -225,7 +225,7 @@ class SurfaceContact:
         after, before, passes = self._acting(q), self._acting(base), None
         if self.friction and after and before and after.points is not None and before.points is not None:
             passes = self.friction.passes_kink(after.points, before.points)
-        of_root: Mask | None = self.comm.bcast(passes)
+        of_root: Mask | None = self.comm.bcast(passes if passes is not None and passes.any() else None)
         return of_root
 
     def hessian(self, q: Positions, projected: bool, secant: Mask | None = None) -> SurfaceHessian | None:

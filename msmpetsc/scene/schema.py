@@ -58,17 +58,6 @@ class Output(Table):
         return probes
 
 
-class BudgetTable(Table):
-    """The surface error that a plan expects: rms over surface and time, of the greatest motion."""
-
-    target: Positive = Field(description="asked for [-]")
-    cells: NotNegative = Field(description="of the cells [-]")
-    time: NotNegative = Field(description="of the time step [-]")
-    step: NotNegative = Field(description="of the steps' solution [-]")
-    count: Count = Field(description="number of cells that it was estimated for [-]")
-    time_step: Positive = Field(description="time step that it was estimated for [s]")
-
-
 class Picture(Table):
     """View of the result in pictures."""
 
@@ -103,7 +92,6 @@ class SceneFile(Table):
         default_factory=lambda: Safety.model_validate({}), description="what is done about a failed step"
     )
     output: Output = Field(default_factory=lambda: Output.model_validate({}), description="what is stored")
-    budget: BudgetTable | None = Field(None, description="the surface error that `plan` expects; for the reader")
     picture: Picture = Field(default_factory=lambda: Picture.model_validate({}), description="how the result is drawn")
 
     @model_validator(mode="before")

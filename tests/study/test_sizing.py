@@ -389,15 +389,11 @@ def test_the_command_tells_the_answer_and_writes_it(tmp_path: Path, monkeypatch,
     monkeypatch.setattr(plan_command, "size_all", lambda *_: print("what was tried") or PLAN)
     path = tmp_path / "scene.toml"
     path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
-    before = load_scene(path)
     assert main(["plan", str(path), "--surface-error", "0.1", "--write"]) == 0
     out, written = capsys.readouterr().out, load_scene(path)
     assert "7.5 computing seconds a simulated second" in out and "the step: planted" in out
-    assert written.cages.count == 4321 and written.cages.cell_size is None and before.budget is None
+    assert written.cages.count == 4321 and written.cages.cell_size is None
     assert (written.time.integrator, written.time.step, written.solver.error) == ("bdf2", 0.005, 0.01)
-    assert written.budget.model_dump() == {
-        "target": 0.1, "cells": 0.05, "time": 0.03, "step": 0.001, "count": 4321, "time_step": 0.005
-    }  # fmt: skip
     assert main(["plan", str(path), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["met"] and answer["choice"]["cells"] == 4321 and answer["error"] == pytest.approx(0.081)

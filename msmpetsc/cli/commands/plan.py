@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
         plan = size_all(args, target)
         print_size(plan, target)
-        command = print_command(args, plan.choice, target) if plan.met else None
+        command = print_command(args, plan.choice) if plan.met else None
     tried = [{"method": each.method.integrator, "cells": each.cells, "cost": each.cost} for each in plan.tried]
     record = {
         "met": plan.met, "target": target, "choice": asdict(plan.choice), "error": plan.choice.budget.total,
@@ -41,11 +41,9 @@ def run(args: argparse.Namespace) -> int:
     return 0 if plan.met else NOTHING_MEETS
 
 
-def print_command(args: argparse.Namespace, choice: Choice, target: float) -> str:
+def print_command(args: argparse.Namespace, choice: Choice) -> str:
     """Print and return the command that runs the choice, and write the choice into the scene if asked to."""
-    errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
-    budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
-    answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
+    answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}}
     changes = [word for change in overrides(args.scene, answer) for word in ("--set", change)]
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes])
     print(f"\n{command}", flush=True)

@@ -13,7 +13,7 @@ from msmpetsc.scene.obstacles import BARRIER, ObstacleTable, SelfContactTable
 from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.statics import one_state, unlike_the_integrator
 from msmpetsc.scene.time import Time
-from msmpetsc.scene.values import Count, Direction, FileName, ListOf, NotNegative, Positive, PresetName, Table, Vector
+from msmpetsc.scene.values import Count, Direction, FileName, ListOf, NotNegative, PresetName, Table, Vector
 
 
 class Solver(Table):

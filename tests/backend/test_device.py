@@ -8,7 +8,6 @@ from block_scene import block_scene, play
 from mpi4py import MPI
 from one_process import assert_one_line
 
-from msmpetsc.backend import cuda
 from msmpetsc.errors import InputError
 from msmpetsc.solve.petsc import device
 
@@ -38,7 +37,7 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
 
 def test_a_package_that_is_not_there_is_named():
     with patch.dict("sys.modules", cupy=None):
-        assert "msmpetsc[cuda]" in cuda.missing()
+        assert "msmpetsc[cuda]" in device.missing_cuda()
 
 
 @pytest.mark.cuda

@@ -2,6 +2,8 @@
 
 Both forms of ``Memory`` do the same: hand out the numbers of a vector as an array, without a copy, and make
 vectors and dense blocks over arrays of ours. Which one it is, ``memory_of`` an array tells.
+
+CuPy and numba's CUDA target are imported by those alone who ask for a GPU: a CPU's run needs neither.
 """
 
 import ctypes
@@ -11,7 +13,6 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend import cuda
 from msmpetsc.backend.arrays import Array, Floats, on_host
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
@@ -48,18 +49,34 @@ def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
         lacking = what_is_missing()
         if lacking:
             raise InputError(f"--device cuda (-{OPTION} {wanted}): {lacking}")
-    cuda.use_device(PETSc.COMM_WORLD.rank)
+    import cupy
+
+    cupy.cuda.Device(PETSc.COMM_WORLD.rank % cupy.cuda.runtime.getDeviceCount()).use()  # of several the one PETSc takes
     if AWARE not in PETSc.Options().getAll():
         # Not all MPI know GPUs, and without one PETSc stops at the first device use. It has read its options by now.
         ctypes.c_bool.in_dll(petsc_library(), AWARE).value = False
-    return cuda.send
+    send: Callable[[Array], Array] = cupy.asarray
+    return send
 
 
 def what_is_missing() -> str | None:
     """Why this process cannot compute on a GPU, in words; None if it can."""
     if not PETSc.Sys.hasExternalPackage("cuda"):
         return "this PETSc was built without CUDA; scripts/build_petsc_cuda makes one that was not"
-    return cuda.missing()
+    return missing_cuda()
+
+
+def missing_cuda() -> str | None:
+    """Why Python has no GPU, in words; None if it has. The runtime is asked, for PETSc would crash at exit."""
+    try:
+        import cupy
+        from numba import cuda  # noqa: F401
+    except ImportError as error:
+        return f"{error.name or 'CuPy'} cannot be imported; pip install 'msmpetsc[cuda]' brings it"
+    try:
+        return None if cupy.cuda.runtime.getDeviceCount() else "no GPU is seen"
+    except Exception as error:  # of CuPy, of the runtime or of what loads it: no driver, one too old, no library
+        return f"no GPU is seen: {str(error).splitlines()[0]}"
 
 
 class Memory:
@@ -117,12 +134,23 @@ class CudaMemory(Memory):
         return _ready(PETSc.Mat().createDenseCUDA((rows, (None, columns)), comm=comm))
 
     def values(self, dense: PETSc.Mat) -> Floats:
-        return cuda.view(dense_pointer(dense), dense.getLocalSize()[0] * dense.getSize()[1])
+        return view(dense_pointer(dense), dense.getLocalSize()[0] * dense.getSize()[1])
 
     def _view(self, vector: PETSc.Vec, mode: str) -> Floats:
         pointer = vector.getCUDAHandle(mode)
         vector.restoreCUDAHandle(pointer, mode)
-        return cuda.view(pointer, vector.getLocalSize())
+        return view(pointer, vector.getLocalSize())
+
+
+def view(pointer: int, size: int) -> Floats:
+    """Return memory of a GPU that is someone else's, (size,) numbers, as an array; valid as long as that memory."""
+    import cupy
+
+    numbers: Floats = cupy.empty(0)
+    if size:
+        memory = cupy.cuda.UnownedMemory(pointer, 8 * size, None, cupy.cuda.Device().id)
+        numbers = cupy.ndarray((size,), np.float64, cupy.cuda.MemoryPointer(memory, 0))
+    return numbers
 
 
 def _ready(dense: PETSc.Mat) -> PETSc.Mat:

@@ -1,20 +1,39 @@
-"""The entry point of the command line, which reports failures in one line and an exit status."""
+"""The entry point of the command line: it parses, carries out, and reports failures in one line and an exit status.
+
+What is imported at the top starts neither MPI nor PETSc, so that ``--help`` answers at once.
+"""
 
 import argparse
 import logging
 import os
+import platform
+import re
+import shlex
 import signal
 import sys
+import textwrap
 import traceback
+from argparse import RawDescriptionHelpFormatter
 from importlib import import_module
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
+import msmpetsc
+from msmpetsc.app.checks import SCENE_NAMES
 from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.command_table import COMMANDS
-from msmpetsc.cli.ranks import world
-from msmpetsc.errors import InputError, MsmpetscError, as_expected
+from msmpetsc.cli.command_table import COMMANDS, SAID, Shown
+from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean, printable
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 DRAWING = ("render", "export", "compare")  # which the extra "render" is enough for
+OUR_SHORT = ("-o", "-h")
+TAKE_PETSC_OPTIONS = ("run",)
+LAUNCHED = {  # variables that Open MPI, MPICH, PMIx, Slurm, Flux and the launchers of Cray and IBM set for each rank
+    "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID", "FLUX_TASK_RANK", "ALPS_APP_PE", "PALS_RANKID",
+    "JSM_NAMESPACE_RANK", "MPI_LOCALRANKID", "MV2_COMM_WORLD_RANK",
+}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -84,6 +103,144 @@ def entry_point() -> None:
         status = expected.exit_status
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: one more could only spoil the status
     sys.exit(status)
+
+
+# ---- arguments
+
+
+def parsed(words: list[str]) -> argparse.Namespace:
+    """Parse a whole command line: our own arguments, and PETSc's options. Raises InputError."""
+    ours, petsc = split_petsc_options(words)
+    if ours and ours[0] not in COMMANDS and not ours[0].startswith("-"):
+        word = printable(ours[0], 60)
+        if word.endswith(SCENE_NAMES):
+            raise InputError(f"{word} is no command, did you mean 'msmpetsc run {word}'?")
+        raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
+    _refuse_one_dash(ours, petsc)
+    args, unknown = command_parser().parse_known_args(ours, argparse.Namespace(petsc_options=shlex.join(petsc)))
+    if unknown:
+        near = did_you_mean(unknown[0], option_names(args.command))
+        raise InputError(f"{args.command}: unknown argument {unknown[0]}{near}")
+    return args
+
+
+def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
+    """Split words into ours and PETSc's options, which have one dash and may have a value."""
+    ours: list[str] = []
+    petsc: list[str] = []
+    for before, word in pairwise(["", *words]):
+        ends_it = word.startswith("--") or word in OUR_SHORT or word.endswith(".toml")
+        value = _is_petsc_option(before) and not ends_it
+        (petsc if value or _is_petsc_option(word) else ours).append(word)
+    return ours, petsc
+
+
+def _is_petsc_option(word: str) -> bool:
+    return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
+
+
+def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
+    """Raise InputError for our options with one dash, and for PETSc options where none are taken."""
+    name = ours[0] if ours else ""
+    if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
+        return
+    valid = option_names(name)
+    for word in petsc:
+        doubled = f"-{word.partition('=')[0]}"
+        if doubled in valid and not (name in TAKE_PETSC_OPTIONS and doubled == "--help"):  # PETSc has a -help, too
+            raise InputError(f"{word}: options of one dash are PETSc's, did you mean {doubled!r}?")
+    if petsc and name not in TAKE_PETSC_OPTIONS:
+        raise InputError(f"{petsc[0]}: {name} takes no PETSc options{did_you_mean(f'-{petsc[0]}', valid)}")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that prints on rank 0 only, and raises InputError."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(re.sub(r"^argument (\S+): (?=must )", r"\1 ", message))
+
+    def _print_message(self, message: str, file: Any = None) -> None:  # where argparse prints help and version
+        if world().rank == 0:
+            super()._print_message(message, file)
+
+
+def versions_line() -> str:
+    """Return the versions of this package, PETSc, MPI and Python; what cannot be loaded says so."""
+    libraries = []
+    for name, version in {"PETSc": petsc_version, "MPI": mpi_version}.items():
+        try:
+            libraries.append(version())
+        except Exception:  # a library that is missing, or built for another: each in its own way
+            libraries.append(f"no {name}")
+    return f"msmpetsc {msmpetsc.__version__} ({', '.join(libraries)}, Python {platform.python_version()})"
+
+
+def petsc_version() -> str:
+    """Return the version of PETSc: "PETSc 3.22.4"."""
+    from petsc4py import PETSc
+
+    return f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
+
+
+def mpi_version() -> str:
+    """Return the first words of the version string of MPI: "Open MPI v5.0.7"."""
+    from mpi4py import MPI
+
+    return re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()
+
+
+def command_parser() -> Parser:
+    """Return the parser of all commands."""
+    parser = Parser(prog="msmpetsc", description=msmpetsc.__doc__)
+    about = "show the versions of msmpetsc, PETSc and MPI"
+    parser.add_argument("--version", action=Shown, const=versions_line, help=about)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, command in COMMANDS.items():
+        examples = "\n  ".join(("examples:", *command.examples))
+        about = textwrap.fill(command.description or "")
+        add = commands.add_parser(
+            name, help=command.help, description=about, epilog=examples, formatter_class=RawDescriptionHelpFormatter
+        )
+        for names, keywords in command.arguments:
+            add.add_argument(*names, **keywords)
+        for choice in filter(None, (command.exclusive, SAID)):
+            group = add.add_mutually_exclusive_group()
+            for names, keywords in choice:
+                group.add_argument(*names, **keywords)
+    return parser
+
+
+def option_names(command: str) -> list[str]:
+    """Return the options of a command, such as "--preset"."""
+    known = COMMANDS[command]
+    given = (*known.arguments, *known.exclusive, *SAID)
+    return ["--help", *(name for names, _ in given for name in names if name.startswith("-"))]
+
+
+# ---- ranks
+
+
+class Alone:
+    """A stand-in for the communicator of a process that no launcher started."""
+
+    rank, size = 0, 1
+
+
+def world(started: bool = False) -> "MPI.Comm":
+    """Return all ranks.
+
+    started : whether MPI must be started, which takes 0.3 s; or else only where a launcher started the process, and
+        that MPI can be started
+    """
+    if not (started or LAUNCHED & os.environ.keys()):
+        return cast("MPI.Comm", Alone())
+    try:
+        from mpi4py import MPI
+    except (ImportError, RuntimeError):  # missing or broken, in a shell of a batch system, say: `run` says so
+        if started:
+            raise
+        return cast("MPI.Comm", Alone())
+    return MPI.COMM_WORLD
 
 
 if __name__ == "__main__":

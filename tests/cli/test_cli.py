@@ -11,7 +11,7 @@ import trimesh
 from conftest import run
 from one_process import Answers, answers_on, assert_one_line, refusal_in
 
-from msmpetsc.cli.arguments import split_petsc_options
+from msmpetsc.cli.main import split_petsc_options
 from msmpetsc.results.reader import finished
 
 SCENE = """

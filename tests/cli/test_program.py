@@ -13,10 +13,9 @@ from block_scene import block_scene
 from conftest import ENVIRONMENT, python
 from one_process import command_error
 
-from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.commands import doctor
-from msmpetsc.cli.main import main
+from msmpetsc.cli.main import main, parsed
 
 ONCE = {"step": 0.01, "duration": 0.01}
 

@@ -13,8 +13,8 @@ import pytest
 import trimesh
 from one_process import input_error
 
-from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import fetch as command
+from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.registry import MODELS, NamedMesh, fetch, load, locate

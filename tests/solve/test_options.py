@@ -11,8 +11,8 @@ from lattices import beam, swing, weight
 from mpi4py import MPI
 from one_process import assert_one_line, command_error, input_error
 
-from msmpetsc.cli.arguments import option_names
 from msmpetsc.cli.command_table import COMMANDS
+from msmpetsc.cli.main import option_names
 from msmpetsc.errors import InputError
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper

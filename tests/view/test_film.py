@@ -9,8 +9,8 @@ from ball_result import HEIGHTS
 from one_process import input_error
 from PIL import Image, ImageSequence
 
-from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
+from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.view.film import playback_of, usual_speed
 

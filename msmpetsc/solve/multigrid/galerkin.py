@@ -18,11 +18,11 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import form_of, modes_forces, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
-from msmpetsc.elasticity.cell_volume import FRAMES, cofactors, corner_curvature, edges, vector_of
+from msmpetsc.elasticity.cell_volume import FRAMES, Resistance, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
 from msmpetsc.elasticity.solid import CellHessians
-from msmpetsc.elasticity.springs import SYMMETRIC, spring_block
+from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
@@ -30,6 +30,7 @@ from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
 HELD = 27  # code of an end that is no unknown; others are 9 i + 3 j + k of where they are in their coarse cell
+UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]  # of the nine numbers of a block, and of those six
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])  # of corners: the upper triangle of a cell's matrix
 
 
@@ -40,18 +41,25 @@ def _weights() -> Rows:
     return np.concatenate([along.prod(axis=2), np.zeros((1, 8))])
 
 
-def _products(weights: Rows) -> tuple[Indices, Indices, Floats]:
-    """Of each of some weights (n, 8), w w^T where it is not zero: entry i's are begin[i] to begin[i
-    + 1] of pairs and their factors."""
-    factors = weights[:, PAIRS[:, 0]] * weights[:, PAIRS[:, 1]]
-    which, pair = np.nonzero(factors)
-    begin = np.searchsorted(which, np.arange(len(weights) + 1)).astype(np.int32)
-    return begin, pair.astype(np.int32), factors[which, pair]
+class Products(NamedTuple):
+    """Of each of some weights (n, 8), w w^T where it is not zero: entry i's are begin[i] to begin[i + 1] of pairs and
+    their factors."""
+
+    begin: Indices
+    pair: Indices
+    factor: Floats
+
+    @classmethod
+    def of(cls, weights: Rows) -> "Products":
+        factors = weights[:, PAIRS[:, 0]] * weights[:, PAIRS[:, 1]]
+        which, pair = np.nonzero(factors)
+        begin = np.searchsorted(which, np.arange(len(weights) + 1)).astype(np.int32)
+        return cls(begin, pair.astype(np.int32), factors[which, pair])
 
 
 WEIGHTS = _weights()
-OF_SPRINGS = _products((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))  # by 28 times one code and the other
-OF_NODES = _products(WEIGHTS)
+OF_SPRINGS = Products.of((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))  # by 28 times a code and another
+OF_NODES = Products.of(WEIGHTS)
 
 
 class ByCell(NamedTuple):
@@ -72,6 +80,24 @@ class ByCell(NamedTuple):
     def near(self, array: Array) -> "ByCell":
         """Return the same in the memory that an array is in."""
         return ByCell(*(like(array, part) for part in self))
+
+
+class PairSum(NamedTuple):
+    """Blocks that springs or nodes add to; ``places`` (c, 36) has that of each pair of a coarse cell's corners."""
+
+    values: Rows
+    places: Indices
+    by_cell: ByCell
+    products: Products
+
+
+class CellSum(NamedTuple):
+    """Blocks that fine cells add to; ``weights`` are times the step [s], as a Hessian is of second degree in them."""
+
+    values: Rows
+    places: Indices
+    by_cell: ByCell
+    weights: Rows
 
 
 class GalerkinSum:
@@ -97,9 +123,11 @@ class GalerkinSum:
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
         keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity, ijk, apart)
-        self.law = tuple(like(lattice.nodes, a) for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
-        self.of_springs, self.of_nodes = (tuple(like(lattice.nodes, a) for a in t) for t in (OF_SPRINGS, OF_NODES))
-        self.weights, self.full = (like(lattice.nodes, a) for a in (WEIGHTS, SYMMETRIC))
+        self.weights, self.full = (like(lattice.nodes, a) for a in (t2**0.5 * WEIGHTS, SYMMETRIC))
+        of_springs = OF_SPRINGS._replace(factor=t2 * OF_SPRINGS.factor)
+        self.of_springs, self.of_nodes = (
+            Products(*(like(lattice.nodes, part) for part in products)) for products in (of_springs, OF_NODES)
+        )
         first, second, places = self._pairs(grid, keys)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)
@@ -137,21 +165,23 @@ class GalerkinSum:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes
         [N/m] (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
-        law, mass = (*self.law, self.unknowns.lattice.stiffening), self.unknowns.ballast
-        solid, viscosity = self.elasticity.solid, self.elasticity.viscosity
-        if solid is None:
-            add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
-        add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
-        values = symmetric[:, self.full]
-        weights = self.t2**0.5 * self.weights  # a Hessian is of second degree in them
+        solid, viscosity, cells = self.elasticity.solid, self.elasticity.viscosity, self.elasticity.cells
+        if self.elasticity.springs:
+            of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
+            add_springs(count, q, of_springs, self.elasticity.springs.owned)
+        own = np.zeros((self.unknowns.lattice.owned, 6), like=q)
+        own[:, DIAGONAL] = self.unknowns.ballast[:, None]
+        if len(contact):
+            own += self.t2 * contact[:, UPPER]
+        add_nodes(count, own, PairSum(symmetric, self.places, self.nodes, self.of_nodes))
+        into = CellSum(symmetric[:, self.full], self.places, self.cells, self.weights)
+        scratch = np.empty((1 if on_host(q) else count, 8, 14), like=q)
         hessians: list[CellHessians] = [solid.hessian_at(q, True)] if solid else []
         for hessian in hessians + ([viscosity.hessian] if viscosity else []):
-            cells = one_by_one(hessian.blocks, hessian.state)
-            scratch = np.empty((1 if on_host(q) else count, 8, 14), like=q)
-            add_solid(count, values, self.places, self.cells, cells, weights, scratch)
-        if self.elasticity.cells:
-            law = self.elasticity.cells.law
-            add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
+            add_solid(count, scratch, into, one_by_one(hessian.blocks, hessian.state))
+        if cells:
+            add_resistance(count, q, into, cells.law)
+        values = into.values
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 
 
@@ -266,20 +296,18 @@ def _by_cell(
 
 
 @kernel
-def add_springs(
-    first: int, count: int, step: int, q: Positions, start: Indices, order: Indices, code: Array, springs: Indices,
-    rest: Floats, k: Floats, b: float, t2: float, begin: Indices, pair: Indices, factor: Floats, places: Indices,
-    values: Rows,
-) -> None:  # fmt: skip
+def add_springs(first: int, count: int, step: int, q: Positions, into: PairSum, springs: Springs) -> None:
+    values, places, (start, order, code), (begin, pair, factor) = into
+    ends, rest, k, b = springs
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
             s, kind = order[at], 28 * code[at, 0] + code[at, 1]
-            m, n = springs[s, 0], springs[s, 1]
+            m, n = ends[s, 0], ends[s, 1]
             x, y, z = q[m, 0] - q[n, 0], q[m, 1] - q[n, 1], q[m, 2] - q[n, 2]
             c, ex, ey, ez = spring_block((x, y, z), rest[s], k[s], b, True)
             xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
             for entry in range(begin[kind], begin[kind + 1]):
-                f, place = t2 * factor[entry], places[i, pair[entry]]
+                f, place = factor[entry], places[i, pair[entry]]
                 values[place, 0] += f * xx  # a view of the block would take as long again
                 values[place, 1] += f * xy
                 values[place, 2] += f * xz
@@ -289,37 +317,25 @@ def add_springs(
 
 
 @kernel
-def add_nodes(
-    first: int, count: int, step: int, start: Indices, order: Indices, code: Array, mass: Floats, contact: Rows,
-    t2: float, begin: Indices, pair: Indices, factor: Floats, places: Indices, values: Rows,
-) -> None:  # fmt: skip
+def add_nodes(first: int, count: int, step: int, own: Rows, into: PairSum) -> None:
+    """Add the upper triangles ``own`` (owned, 6) of the nodes' blocks."""
+    values, places, (start, order, code), (begin, pair, factor) = into
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
             node, kind = order[at], code[at, 0]
             for entry in range(begin[kind], begin[kind + 1]):
-                f, block = factor[entry], values[places[i, pair[entry]]]
-                block[0] += f * mass[node]
-                block[3] += f * mass[node]
-                block[5] += f * mass[node]
-                if len(contact):
-                    c = contact[node]
-                    block[0] += f * t2 * c[0]
-                    block[1] += f * t2 * c[1]
-                    block[2] += f * t2 * c[2]
-                    block[3] += f * t2 * c[4]
-                    block[4] += f * t2 * c[5]
-                    block[5] += f * t2 * c[8]
+                place = places[i, pair[entry]]
+                for c in range(6):
+                    values[place, c] += factor[entry] * own[node, c]
 
 
 @kernel
-def add_solid(
-    first: int, count: int, step: int, values: Rows, places: Indices, by_cell: ByCell, cells: CellRows, weights: Rows,
-    scratch: Array,
-) -> None:  # fmt: skip
-    """Add t^2 times the Hessians of cells, whose corners follow coarse cells; ``weights`` are times t [s].
+def add_solid(first: int, count: int, step: int, scratch: Array, into: CellSum, cells: CellRows) -> None:
+    """Add t^2 times the Hessians of cells, whose corners follow coarse cells.
 
     scratch : (s, 8, 14) of each coarse corner the strain of one component and what it does; cell i has row i % s
     """
+    values, places, by_cell, weights = into
     for i in range(first, count, step):
         e = scratch[i % len(scratch)]
         for at in range(by_cell.start[i], by_cell.start[i + 1]):
@@ -372,44 +388,43 @@ def _add_block(block: Floats, own: float, state: Floats, s: int, g: Floats, h: F
 
 
 @kernel
-def add_resistance(
-    first: int, count: int, step: int, q: Positions, start: Indices, order: Indices, code: Array, cells: Indices,
-    resistance: Floats, least: float, t2: float, weights: Rows, places: Indices, values: Rows,
-) -> None:  # fmt: skip
+def add_resistance(first: int, count: int, step: int, q: Positions, into: CellSum, law: Resistance) -> None:
+    """Add t^2 times what resists being turned inside out."""
+    values, places, by_cell, weights = into
     for i in range(first, count, step):
-        for at in range(start[i], start[i + 1]):
-            cell = order[at]
+        for at in range(by_cell.start[i], by_cell.start[i + 1]):
+            cell, code = by_cell.order[at], by_cell.code[at]
             for frame in range(8):
-                e = edges(q, cells[cell], frame)
+                e = edges(q, law.cells[cell], frame)
                 n = cofactors(e)
-                curvature = t2 * corner_curvature(e, n[0], resistance[cell], least)
+                curvature = corner_curvature(e, n[0], law.stiffness[cell], law.volume)
                 if curvature > 0.0:
-                    _add_corner(i, frame, code[at], curvature, n, weights, places, values)
+                    f = FRAMES[frame]
+                    ends = code[f[0]], code[f[1]], code[f[2]], code[f[3]]
+                    _add_corner(values, places[i], weights, ends, curvature, n)
 
 
 @numba.njit(cache=True)
-def _add_corner(
-    i: int, frame: int, code: Array, curvature: float, n: Any, weights: Rows, places: Indices, values: Rows
-) -> None:
-    """Add curvature G G^T to the blocks of cell i."""
+def _add_corner(values: Rows, places: Indices, weights: Rows, ends: Any, curvature: float, n: Any) -> None:
+    """Add curvature G G^T to the blocks of a coarse cell; ``ends`` (4) are codes of the corner and its edges' ends."""
     pair = -1
     for a in range(8):
-        g = _slope(frame, code, weights, a, n)
+        g = _slope(ends, weights, a, n)
         for b in range(a, 8):
             pair += 1
-            if places[i, pair] >= 0:
-                h, block = _slope(frame, code, weights, b, n), values[places[i, pair]]
+            if places[pair] >= 0:
+                h, block = _slope(ends, weights, b, n), values[places[pair]]
                 for r in range(3):
                     for c in range(3):
                         block[3 * r + c] += curvature * g[r] * h[c]
 
 
 @numba.njit(cache=True)
-def _slope(frame: int, code: Array, weights: Rows, a: int, n: Any) -> tuple[float, float, float]:
+def _slope(ends: Any, weights: Rows, a: int, n: Any) -> tuple[float, float, float]:
     """Slope of a corner's volume as corner a of the coarse cell moves."""
     x, y, z = 0.0, 0.0, 0.0
     for role in range(4):
-        w = weights[code[FRAMES[frame, role]], a]
+        w = weights[ends[role], a]
         g = vector_of(role, n)
         x, y, z = x + w * g[0], y + w * g[1], z + w * g[2]
     return x, y, z

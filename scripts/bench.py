@@ -28,7 +28,6 @@ from typing import NamedTuple
 import lab
 
 import numpy as np
-import trimesh
 from petsc4py import PETSc
 from scene_tables import PAPER, SCENES, slowest_tenth
 
@@ -75,10 +74,8 @@ TODAY = "newton"
 def beam(name: str, folder: Path) -> tuple[str, ...]:
     """Return the changes that make a beam of studies/beam_soft.toml, and write its mesh."""
     along, young, frames = BEAMS[name]
-    folder.mkdir(parents=True, exist_ok=True)
-    trimesh.creation.box(bounds=np.array([np.zeros(3), SIDES])).export(folder / "beam.obj")
     size, length = f"cages.cell_size={SIDES[0] / along!r}", f"time.duration={frames / 60!r}"
-    return f'mesh.source="{folder / "beam.obj"}"', size, f"material.young_modulus={young!r}", length
+    return lab.box(folder / "beam.obj", SIDES), size, f"material.young_modulus={young!r}", length
 
 
 def measured(name: str, method: Method, frames: int | None, law: str = LAWS[0]) -> Sample | None:
@@ -139,8 +136,7 @@ def rows(methods: dict[str, Method], args: Namespace) -> lab.Rows:
     """Yield the rows that are asked for as they are run, the repeats of each method alternating with the others'."""
     asked = (name for name in (*SCENES, *BEAMS) if any(word in name for word in args.only))
     names = [name for name in asked if name != LARGE or args.large]
-    laws = args.laws or (LAWS[:1] if args.gpu else LAWS)  # solids run on the CPU alone
-    for name, law in product(names, laws):
+    for name, law in product(names, args.laws or LAWS):
         kinds = {kind: partial(measured, name, method, args.frames, law) for kind, method in methods.items()}
         runs = lab.alternated(kinds, args.repeats)
         if any(runs.values()):

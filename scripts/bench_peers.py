@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import lab
 
 import numpy as np
-import trimesh
 
 from msmpetsc.results.reader import Result
 
@@ -142,10 +141,11 @@ def use_one_core() -> None:
 
 def set_up(cells: list[int], frames: int, timeout: float) -> Setup:
     """Run the reference, whose lattice all programs take."""
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    mesh = FOLDER / "beam.obj"
-    trimesh.creation.box(bounds=np.array([np.zeros(3), CELL * np.array(cells)])).export(mesh)
-    changes = [f'mesh.source="{mesh}"', f"cages.cell_size={CELL}", f"time.duration={frames * FRAME}"]
+    changes = [
+        lab.box(FOLDER / "beam.obj", CELL * np.array(cells)),
+        f"cages.cell_size={CELL}",
+        f"time.duration={frames * FRAME}",
+    ]
     reference = lab.run(SCENE, FOLDER / "reference.h5", (), [*changes, *REFERENCE], timeout=timeout)
     return Setup(changes, reference.path, frames, timeout)
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Holds the error that steps say they have against their true one, on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--set KEY=VALUE ...] [--json OUT]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--set KEY=VALUE ...]
 
 Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
 or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
@@ -189,7 +189,6 @@ def main() -> int:
     options.add_argument("--scenes", type=int, default=500)
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--only", type=int)
-    options.add_argument("--json", type=Path)
     options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     args = options.parse_args()
     if args.only is not None:
@@ -198,8 +197,6 @@ def main() -> int:
         return int(bad(row))
     with ThreadPoolExecutor(2) as pool:
         rows = list(pool.map(partial(measured, args.seed, args.set), range(args.scenes)))
-    if args.json:
-        args.json.write_text(json.dumps(rows))
     for row in filter(bad, rows):
         steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
         print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)

@@ -15,10 +15,12 @@ from typing import Any, TypeVar
 from clone import ROOT
 
 import numpy as np
+import trimesh
 
 from msmpetsc import __version__
 from msmpetsc.backend.machine import machine
 from msmpetsc.results.reader import Result
+from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Ended, Processes
 
 SCENES, OUT = ROOT / "scenes", ROOT / "out"
@@ -81,8 +83,14 @@ def run(
 
 def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:
     """Run Python with these words to its end, what it says into ``log``."""
-    launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
-    return Processes().run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
+    return Processes().run([*launcher(ranks), sys.executable, *map(str, words)], log, timeout, warm)
+
+
+def box(path: Path, sides: Sequence[float] | np.ndarray) -> str:
+    """Write a box with a corner at the origin; return the change that makes it the mesh of a scene."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trimesh.creation.box(bounds=np.array([np.zeros(3), sides])).export(path)
+    return f'mesh.source="{path}"'
 
 
 # ---- repeats

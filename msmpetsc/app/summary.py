@@ -112,7 +112,7 @@ class Cost:
 
     def __init__(self, comm: MPI.Comm, simulation: TimeLoop, setup: float):
         self.comm, self.simulation, self.setup = comm, simulation, setup
-        self.output, self.stepping = 0.0, 0.0
+        self.output = self.stepping = 0.0
         self.products: dict[int, int] = {}
         model = simulation.model
         free = int((~simulation.environment.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())

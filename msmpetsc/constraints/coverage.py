@@ -32,7 +32,8 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
     def count(where: Mask) -> int:
         return int(comm.allreduce(int(where[: lattice.owned].sum())))
 
-    words, pinned = [], lattice.pinned
+    words = []
+    pinned = lattice.pinned
     for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
         where = masks[table.key]
         _warn_of_overruled(table.key, count(where), count(where & pinned), count(where & ~anchor.where & ~pinned))
@@ -51,11 +52,9 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
 
 def _warn_of_overruled(key: str, nodes: int, pinned: int, prescribed: int) -> None:
     """Warn that some of an anchor's nodes are pinned, or led by earlier anchors; raise if all are."""
-    why = [f"{pinned} {'is' if pinned == 1 else 'are'} pinned"] if pinned else []
-    why += [f"{prescribed} {'is' if prescribed == 1 else 'are'} led by an anchor before it"] if prescribed else []
-    if not why:
+    if not pinned + prescribed:
         return
-    text = f"{key}: of the {_nodes(nodes)} in its region {' and '.join(why)}"
+    text = f"{key}: of the {_nodes(nodes)} in its region pins hold {pinned}, and anchors before it lead {prescribed}"
     if pinned + prescribed == nodes:
         raise InputError(f"{text}: it leads none")
     log.warning("%s, which it does not lead", text)

@@ -106,7 +106,8 @@ def repair(surface: Surface) -> Surface:
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
     if len(repaired.triangles) == 0:
         raise InputError("nothing of the surface was left")
-    report, kept = examine(repaired), examine(repaired).area / examine(surface).area
+    report = examine(repaired)
+    kept = report.area / examine(surface).area
     if kept < LEAST_AREA_KEPT:
         raise InputError(
             f"only {kept:.1%} of the surface's area was left: its parts overlap or have two walls "

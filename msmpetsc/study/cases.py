@@ -235,8 +235,8 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 
     Nothing is measured beyond its end.
     """
-    steps = sweep.steps or (scene.steps if scene.duration is None else None)
-    duration = steps * case.time_step if steps else scene.duration or as_given.time.duration
+    length = Length(steps=sweep.steps) if sweep.steps else scene
+    duration = length.seconds(case.time_step, as_given.time.duration)
     steps = max(1, round(duration / case.time_step))
     case = replace(case, true_error=case.true_error and min(case.true_error, steps))
     every = 1
@@ -260,7 +260,7 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     if reference.law:
         base = base.changed(f"material.law={reference.law}")
     frame = scene.frame or as_given.time.step
-    duration = scene.duration or (scene.steps * as_given.time.step if scene.steps else as_given.time.duration)
+    duration = scene.seconds(as_given.time.step, as_given.time.duration)
     case = replace(
         base, integrator=reference.integrator, time_step=frame, repeats=1, timeout=reference.timeout, label="reference"
     )
@@ -282,7 +282,7 @@ def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
         file = folder / run.file
         scene = load_scene(file, run.set, by_user=False)
         step = scene.time.step
-        duration = run.steps * step if run.steps else run.duration or scene.time.duration
+        duration = run.seconds(step, scene.time.duration)
         for method in study.method:
             if map.methods and method.label not in map.methods:
                 continue
@@ -316,5 +316,4 @@ def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
     """Yield the overrides of an axis, with the duration where the axis is the time step."""
     yield from axis.changes(value)
     if axis.key == "time.step":
-        duration = length.steps * value if length.steps else max(length.duration or value, value)
-        yield f"time.duration={duration!r}"
+        yield f"time.duration={max(length.seconds(value, value), value)!r}"

@@ -79,6 +79,10 @@ class Length(Table):
             raise rule("must not stand beside steps", "steps")
         return duration
 
+    def seconds(self, step: float, usual: float) -> float:
+        """Return the simulated time [s] of steps of this length; the usual one where neither is given."""
+        return self.steps * step if self.steps else self.duration or usual
+
 
 class StudyScene(Length):
     """A scene of the study, with its length, reference and measurements."""

@@ -107,7 +107,7 @@ def _length(entries: Sequence[Entry], font: ImageFont.FreeTypeFont) -> float:
 
 def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, font: ImageFont.FreeTypeFont) -> None:
     """Draw a legend entry from `left` on, vertically centred at `middle`, in fine pixels."""
-    gap, half = 8 * FINE, 8 * FINE
+    gap = half = 8 * FINE
     if entry.low:
         draw.text((left, middle), entry.low, INK, font, anchor="lm")
         left += font.getlength(entry.low) + gap

@@ -22,7 +22,6 @@ from msmpetsc.view.renderer import Renderer
 
 LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
 USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
-QUALITY = 8  # of 10, as imageio-ffmpeg counts
 FASTEST = 30.0  # pictures a second
 LENGTHS = 3.0, 8.0  # [s] that a film lasts, where nothing is said
 STEPS = (1, 2, 5)  # times powers of ten: how much slower or faster
@@ -135,7 +134,7 @@ def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], f
     """
     import imageio_ffmpeg
 
-    options: dict[str, Any] = dict(codec="libx264", quality=QUALITY, macro_block_size=2, ffmpeg_log_level="quiet")
+    options: dict[str, Any] = dict(codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="quiet")
     sent = 0
     try:
         with closing(imageio_ffmpeg.write_frames(str(path), size, fps=fps, **options)) as writer:

@@ -82,12 +82,10 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     surface = load(source, scene.parent)
     measures = measured(surface)
     warnings = check_encloses(surface, measures.report)
-    count, state = len(measures.parts), "closed" if measures.report.closed else "open"
-    parts = f"{count} parts, the largest of {measures.parts[0]:.0%} of the area" if count > 1 else "1 part"
-    log.info("%s: %d triangles, %s, %s", mesh, measures.triangles, state, parts)
+    log.info("%s: %s", mesh, measures.words)
     for warning in warnings:
         log.warning("%s: %s", mesh, warning)
-    if warnings or count > 1:
+    if warnings or len(measures.parts) > 1:
         log.info("what the scene does about that stands in its comments")
     if up is None:
         is_y = mesh.suffix.lower() in Y_BY_DEFINITION or uprightness(surface, 1) > uprightness(surface, 2) + SURER
@@ -149,6 +147,16 @@ class MeshMeasures:
     def thickness(self) -> float:
         """Mean thickness, twice the volume over the area; in the file's unit."""
         return 2 * abs(self.report.volume) / self.report.area
+
+    @property
+    def words(self) -> str:
+        """Triangles, boundary and parts in words."""
+        boundary, parts = "closed", "1 part"
+        if not self.report.closed:
+            boundary = f"open ({self.report.boundary_edges} boundary edges)"
+        if len(self.parts) > 1:
+            parts = f"{len(self.parts)} parts, the largest of {self.parts[0]:.0%} of the area"
+        return f"{self.triangles} triangles, {boundary}, {parts}"
 
 
 def measured(surface: Surface) -> MeshMeasures:
@@ -237,10 +245,7 @@ def draft(source: str, title: str, mesh: MeshMeasures, up: str) -> str:
 def _mesh(source: str, mesh: MeshMeasures, body: Dimensions, up: str) -> list[str]:
     """Return the table of the mesh, with comments on its defects."""
     report = mesh.report
-    parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
-    state = "closed" if report.closed else f"open ({report.boundary_edges} boundary edges)"
-    name = json.dumps(source, ensure_ascii=False)
-    lines = ["[mesh]", line(f"source = {name}", f"{mesh.triangles} triangles, {state}, {parts}")]
+    lines = ["[mesh]", line(f"source = {json.dumps(source, ensure_ascii=False)}", mesh.words)]
     lines.append(f"# {up} is taken for upwards: msmpetsc new --up says another axis")
     steps = {}  # with the reason
     if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:

@@ -224,7 +224,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 
 
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
-    """Return the prepared surfaces, on rank 0, and what all ranks need to know of them (collective)."""
+    """Return the prepared surfaces, on rank 0, and what all ranks must know (collective)."""
 
     def read() -> tuple[list[Surface], list[tuple[SurfaceReport, Rows]]]:
         surfaces, reports = zip(*_prepared(scene), strict=True)

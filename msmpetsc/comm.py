@@ -38,7 +38,7 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
-    """Call a function on rank 0 only; its error is everyone's. Returns its value; None elsewhere."""
+    """Call a function on rank 0 only; its error is everyone's. Returns None elsewhere."""
     value = None
     with together(comm):
         if comm.rank == 0:

@@ -71,7 +71,7 @@ def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None,
 
 
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
-    """Read the scene. Raises InputError for what can be refused before there is a model (collective)."""
+    """Read the scene. Raises InputError for what can be refused before a model is made (collective)."""
     refuse_early(comm)
     choose(comm, request.device)
     began = perf_counter()
@@ -123,7 +123,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
 
 
 def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) -> int:
-    """Write what stands beside the result, say how it ended, and return the exit status (collective).
+    """Write what stands beside the result, tell the end, and return the exit status (collective).
 
     Raises the StepFailed that ended the run.
     """

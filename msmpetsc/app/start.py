@@ -109,7 +109,7 @@ def frames(
 
 
 class Simulation:
-    """A scene that is run again and again, on all ranks; its lattice is built anew where it must be.
+    """A scene that is run again and again, on all ranks; its lattice is kept while it may be.
 
     simulation = msmpetsc.Simulation("scene.toml")
     for modulus in (1e5, 2e5, 4e5):

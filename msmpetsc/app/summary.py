@@ -59,7 +59,7 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
 
 
 def warn_of_long_steps(scene: Scene, model: Model) -> None:
-    """Warn of steps that are longer than the slowest motion of any body, which implicit steps damp away.
+    """Warn of steps longer than the slowest motion of any body, which implicit steps damp away.
 
     That is taken to be the bending of a bar of the body's longest and shortest side: of most bodies it is not so slow.
     """
@@ -133,7 +133,7 @@ class Cost:
         self.products[frame.index] = frame.products
 
     def log_hardest(self) -> None:
-        """Log which frame took the most products, where these are many times those of the median one."""
+        """Log which frame took the most products, if many times those of the median one."""
         working = [products for products in self.products.values() if products]
         hardest = max(self.products, key=lambda index: self.products[index], default=0)
         ratio = max(working, default=0) / np.median(working or [1])

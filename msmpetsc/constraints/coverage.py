@@ -51,7 +51,7 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
 
 
 def _warn_of_overruled(key: str, nodes: int, pinned: int, prescribed: int) -> None:
-    """Warn that some of an anchor's nodes are pinned, or led by earlier anchors; raise if all are."""
+    """Warn of an anchor's nodes that are pinned, or led by earlier anchors; raise if all are."""
     if not pinned + prescribed:
         return
     text = f"{key}: of the {_nodes(nodes)} in its region pins hold {pinned}, and anchors before it lead {prescribed}"

@@ -64,7 +64,7 @@ class Chunk:
 
 
 def write_glb(moments: Moments, path: Path) -> None:
-    """Write frames as glTF. Raises InputError where the file would be longer than its format allows."""
+    """Write frames as glTF. Raises InputError for more bytes than the format allows."""
     first, *others = moments.frames
     base = moments.points(first).astype(np.float32)
     upright = normals(base, moments.cells)
@@ -142,7 +142,7 @@ FORMATS: dict[str, Callable[[Moments, Path], None]] = {
 
 
 def export(result: str | Path, path: str | Path, frames: Frames | None = None) -> Path:
-    """Write the surface at frames of a result in the format of the path's ending, and return the path.
+    """Write the surface at frames of a result in the format that the path ends in; return it.
 
     frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
 
@@ -161,7 +161,7 @@ def export(result: str | Path, path: str | Path, frames: Frames | None = None) -
 
 
 def _frames(run: Result, path: Path, moves: bool, frames: Frames | None) -> list[int]:
-    """Return the numbers of the frames to export. Raises InputError for frames that the result lacks."""
+    """Return the numbers of the frames to export. Raises InputError for those that there are not."""
     count = len(run.frames.time)
     if not count:
         raise InputError(f"{run.path} has no finished frame")

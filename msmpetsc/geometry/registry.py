@@ -68,7 +68,7 @@ def locate(source: str, folder: str | Path) -> Path:
 
 
 def load(source: str, folder: str | Path) -> Surface:
-    """Return the surface of a registry name or a path; a name's original after the model's own steps."""
+    """Return the surface of a name or a path; of a name the original after the model's steps."""
     from msmpetsc.geometry.readers import read_surface  # and trimesh: a third of a second for the one rank that reads
 
     if source not in MODELS:

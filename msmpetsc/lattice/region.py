@@ -168,7 +168,7 @@ def _extent(region: Region, bounds: Rows) -> str:
 
 
 def cell_materials(scene: Scene, finder: Finder) -> Callable[[Indices], CellMaterial] | None:
-    """Return the function from the grid index (c, 3) of cells to what they are made of (collective).
+    """Return what makes of cells' grid index (c, 3) their materials (collective).
 
     It is None where all cells are of the same material.
     """

@@ -137,7 +137,7 @@ def refuse_small_disk(path: Path, planned: int) -> None:
 
 @contextmanager
 def plain_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the file system, and HDF5's long wording of them, into an InputError of one line."""
+    """Turn errors of the file system, and HDF5's wording of them, into one line's InputError."""
     try:
         yield
     except (OSError, RuntimeError, ValueError) as error:

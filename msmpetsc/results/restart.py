@@ -44,7 +44,7 @@ class Earlier:
 
     @classmethod
     def read(cls, path: Path) -> "Earlier":
-        """Read the earlier run on one rank. Raises InputError for a file that is no result, or damaged."""
+        """Read the earlier run on one rank. Raises InputError for no result, or a damaged one."""
         with Result(path) as result:  # which checks it
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")

@@ -186,6 +186,6 @@ class OwnMaterial(Table):
 
 
 class PartTable(OwnMaterial):
-    """Cells of another material; of two parts that hold a cell, the last that gives a key counts."""
+    """Cells of another material; of two parts with a cell, the last that gives a key counts."""
 
     region: Region = Field(description="the cells whose middles lie in it")

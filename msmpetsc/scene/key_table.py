@@ -31,7 +31,7 @@ class SceneKey(NamedTuple):
 
 
 class WithoutNull(GenerateJsonSchema):
-    """A JSON schema without null, which TOML lacks: a key that may be absent is of its kind alone."""
+    """A JSON schema without null, which TOML lacks: a key that may be absent has its kind."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
         """Return the schema of the kind alone."""

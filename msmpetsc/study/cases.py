@@ -247,7 +247,7 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 
 
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
-    """Return the reference run of a case, with tiny steps and output at the times that are compared.
+    """Return the reference run of a case, with tiny steps and output at times compared.
 
     It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in
     it, but for the law, if it names none.

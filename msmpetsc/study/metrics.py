@@ -63,7 +63,7 @@ def costs(record: dict[str, Any]) -> Row:
 
 
 def of_frames(result: Path, time_step: float) -> Row:
-    """Return metrics of a result; times and iterations are means over steps after the first frame."""
+    """Return metrics of a result; times and iterations are means after the first frame."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}

@@ -36,7 +36,7 @@ OF_FAILURES = ["scene", "label", "time_step", "error", "status", "reason", "comm
 
 
 def write_report(folder: Path) -> Path:
-    """Draw a folder's table as PNG files and report.html, whose path is returned. Raises InputError."""
+    """Draw a folder's table as PNG files and report.html; return its path. Raises InputError."""
     table = read_table(folder)
     file = folder / "study.toml"
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}

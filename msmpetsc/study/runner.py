@@ -109,7 +109,7 @@ def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
 
 
 def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
-    """Return the error of a run against its reference, by its column, or the reason why there is none."""
+    """Return the error of a run against its reference, by its column, or why there is none."""
     name, measure = ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
     try:
         return {f"{name}_error": measure(path, reference)}, ""

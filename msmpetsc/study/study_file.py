@@ -80,7 +80,7 @@ class Length(Table):
         return duration
 
     def seconds(self, step: float, usual: float) -> float:
-        """Return the simulated time [s] of steps of this length; the usual one where neither is given."""
+        """Return the simulated time [s] of steps so long; the usual one where neither is given."""
         return self.steps * step if self.steps else self.duration or usual
 
 

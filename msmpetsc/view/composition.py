@@ -1,4 +1,4 @@
-"""The composition of pictures, films and pages: one camera, colour scale and extent for all frames."""
+"""The composition of pictures, films and pages: one camera, scale and extent for all."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

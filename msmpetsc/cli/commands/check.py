@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
-    """Run a scene and store its numbers, as those stored before were made if nothing else is asked for."""
+    """Run a scene and store its numbers, made as those before if nothing else is asked for."""
     recipe = asked or Recipe(cells=None, steps=STEPS)
     if file.is_file() and not asked:
         recipe = read(file).run

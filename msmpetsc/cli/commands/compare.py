@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
-    """Compare two results, by their surfaces alone if the lattices differ, and return notes on that."""
+    """Compare two results, by surfaces alone if lattices differ, and return notes on that."""
     try:
         return compare(first, second), []
     except DifferentLattices as error:

@@ -115,7 +115,7 @@ def write(path: Path, text: str) -> None:
 
 
 def shipped_titles() -> dict[str, str]:
-    """Return the titles of the scenes that come with the package. Raises InputError if there are none."""
+    """Return the titles of the shipped scenes. Raises InputError if there are none."""
     files = sorted(SHIPPED.glob("*.toml"))
     if not files:
         raise InputError(f"{SHIPPED} has no scenes: this msmpetsc was installed without them")
@@ -123,7 +123,7 @@ def shipped_titles() -> dict[str, str]:
 
 
 def shipped_text(name: str) -> str:
-    """Return the text of a scene that comes with the package. Raises InputError for an unknown name."""
+    """Return the text of a shipped scene. Raises InputError for an unknown name."""
     titles = shipped_titles()
     if name not in titles:
         raise InputError(f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: msmpetsc new --list")

@@ -1,4 +1,4 @@
-"""PETSc started with the user's options, once: it reads most of those that are not of a solver only then.
+"""PETSc started with the user's options: those of no solver it mostly reads only then.
 
 One that runs already is lent others for the time of a run.
 """

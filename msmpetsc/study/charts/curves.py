@@ -170,7 +170,7 @@ SIZE = ("time_second", "surface_error")
 
 
 def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return a chart of surface errors over cost and over cells, with a curve for each way to step."""
+    """Return a chart of surface errors over cost and over cells, a curve for each way to step."""
     scenes = grouped(measured(succeeded(table), *SIZE), "scene")
     if not scenes:
         return []

@@ -1,4 +1,4 @@
-"""The answer of a plan: its trials, its choice, what bounds the error, and the changes of the scene."""
+"""The answer of a plan: trials, choice, what bounds the error, and changes of the scene."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Trial runs of a plan: coarse lattices show the error of the step, three lattices that of the cells."""
+"""Trial runs of a plan: coarse lattices show the step's error, three lattices the cells'."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -15,6 +15,7 @@ import pytest
 import trimesh
 from conftest import run
 
+from msmpetsc.cli.main import main
 from msmpetsc.constraints.loads import Motion
 from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.errors import InputError
@@ -104,6 +105,16 @@ def skip_without_mesh(name: str) -> None:
             pytest.skip(str(error))
         if found is None:
             pytest.skip(f"mesh '{source}' is not here: msmpetsc fetch {source}")
+
+
+@pytest.mark.parametrize("name", ["heart_tissue", "armadillo_leg"])
+def test_quick_scenes_are_as_stored(name: str, capsys):
+    skip_without_mesh(name)
+    assert main(["check", str(SCENES / f"{name}.toml")]) == 0, capsys.readouterr().out
+
+
+def test_every_scene_has_its_numbers_stored():
+    assert {path.name.partition(".")[0] for path in SCENES.glob("*.baseline.json")} == set(ALL)
 
 
 def test_every_scene_has_the_papers_cells_or_its_own_and_four_moments():

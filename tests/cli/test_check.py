@@ -60,6 +60,15 @@ def test_what_differs_is_named(scene: Path, numbers: Path, capfd):
     assert not shown["same"] and [line.partition(":")[0] for line in wrong] == ["elastic", "pinned"]
 
 
+def test_a_scene_that_fails_is_named_and_the_others_are_checked(scene: Path, numbers: Path, tmp_path: Path, capfd):
+    alone = tmp_path / "alone.toml"  # without its mesh
+    alone.write_text(scene.read_text())
+    alone.with_suffix(".baseline.json").write_text(numbers.read_text())
+    assert main(["check", str(alone), str(scene)]) == 1
+    out = capfd.readouterr().out
+    assert "alone                FAILED\n" in out and " same\n" in out and f"\n{alone}: the run failed: mesh" in out
+
+
 def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(scene: Path, numbers: Path, capfd):
     text, before = scene.read_text(), json.loads(numbers.read_text())
     scene.write_text(text.replace("young_modulus = 100000.0", "young_modulus = 100010.0"))

@@ -9,7 +9,6 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-import regression
 from conftest import AS_ROOT, ROOT
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem not in ("clone", "lab"))
@@ -167,21 +166,3 @@ def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
     done = build(bare, prefix, "--", "--with-x=1")
     assert (done.returncode, done.stdout) == (0, "export PETSC_DIR=there\n"), done
     assert build(bare, prefix, "--", "--with-x=2").returncode == 2  # another build: goes on to look for compilers
-
-
-# ---- scripts/regression.py: two quick scenes are as stored
-
-
-@pytest.mark.timeout(200)
-@pytest.mark.parametrize("scene", ["heart_tissue", "armadillo_leg"])
-def test_quick_scenes_are_as_stored(scene: str, capsys):
-    outcome = regression.check(scene, 1, False)
-    if outcome is None:
-        pytest.skip(capsys.readouterr().out)
-    assert outcome == []
-
-
-def test_every_scene_is_stored():
-    assert {path.stem for path in (ROOT / "scenes").glob("*.toml")} == {
-        p.stem for p in regression.STORED.glob("*.json")
-    }

@@ -146,7 +146,11 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, li
 def checked(scene: Path, stored: Numbers, ranks: int) -> list[str]:
     """Run a scene as its stored numbers were made; print a summary and return the differences, a line each."""
     began = perf_counter()
-    numbers = numbers_of(scene, stored.run, ranks)
+    try:
+        numbers = numbers_of(scene, stored.run, ranks)
+    except InputError as error:  # other scenes are checked all the same
+        print(f"{scene.stem:20} FAILED", flush=True)
+        return [str(error).removeprefix(f"{scene}: ")]
     wrong = judged(numbers, stored)
     verdict = "DIFFERS" if wrong else "same"
     _, off, most = max(differences(numbers, stored), key=lambda row: row[1] / row[2] if row[2] else np.inf)

@@ -115,7 +115,6 @@ def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
 
 def numbers_of(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
     """Run a scene by a recipe; return its numbers. Raises InputError where the run fails."""
-    load_scene(scene, recipe.changes, by_user=False)  # they come with the scene, and name what lies beside it
     cells = [] if recipe.cells is None else [f"cages.count={recipe.cells}"]
     words = [word for change in (*cells, "output.surface=false", *recipe.changes) for word in ("--set", change)]
     with tempfile.TemporaryDirectory(prefix="msmpetsc-numbers-") as folder:
@@ -134,6 +133,8 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, li
         if not file.is_file():
             raise InputError(f"nothing is stored of {scene}: msmpetsc check --update {scene} stores {file}")
     stored = {scene: read(file) for scene, file in files.items()}
+    for scene, numbers in stored.items():  # whose changes come with the scene, and name what lies beside it
+        load_scene(scene, numbers.run.changes, by_user=False)
     with redirect_stdout(None) if as_json else nullcontext():
         print(HEAD, flush=True)
         wrong = {str(scene): checked(scene, numbers, ranks) for scene, numbers in stored.items()}

@@ -20,7 +20,6 @@ import trimesh
 from msmpetsc import __version__
 from msmpetsc.backend.machine import machine
 from msmpetsc.results.reader import Result
-from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Ended, Processes
 
 SCENES, OUT = ROOT / "scenes", ROOT / "out"
@@ -83,7 +82,8 @@ def run(
 
 def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:
     """Run Python with these words to its end, what it says into ``log``."""
-    return Processes().run([*launcher(ranks), sys.executable, *map(str, words)], log, timeout, warm)
+    launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []  # study.cases' starts PETSc where it is imported
+    return Processes().run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
 
 
 def box(path: Path, sides: Sequence[float] | np.ndarray) -> str:

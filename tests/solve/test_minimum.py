@@ -243,8 +243,8 @@ SOLID = 'material.law="neo-hookean"', "material.poisson_ratio=0.45"
 @pytest.mark.parametrize("seed, number, changes", [(31, 10, ()), (32, 30, SOLID)])
 def test_what_cg_has_left_is_no_bound_across_a_kink(seed: int, number: int, changes: tuple[str, ...]):
     """Friction and contact make F at the next iterate another than CG has left of it: errors of 0.3 and 1.6 were
-    said to be 0.08 and 0.07, 0.27 and 0.04 of them. What is said is an estimate all the same: where a body springs back
-    from an eighth of its length, of the first step's error 0.47, 0.76 or over 0.9, by the way that its 70 iterations go."""
+    said to be 0.08 and 0.07, 0.27 and 0.04 of them. What is said is an estimate all the same: where a body springs
+    back from an eighth of its length, of the first step's error 0.47, 0.76 or over 0.9, by the way of 70 iterations."""
     said = shares_said(seed, number, 'solver.preset="newton-multigrid"', *changes)
     assert said[0] > 1 / 3 and said[1] > 0.6 and said[2] > 0.6
 

@@ -41,6 +41,12 @@ class SurfaceHessian:
         forces = (self.points @ moved.ravel()).reshape(-1, 3)
         product[: weights.shape[1]] += weights.T @ forces[at]
 
+    def carried_by(self, nodes: Indices) -> csr_array:
+        """Return the weights (k, n) of some of this rank's nodes (n,) for all points in contact."""
+        at, weights = self.carried
+        rows = csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(self.points.shape[0] // 3, len(at)))
+        return csr_array(rows @ weights[:, nodes])
+
     def split(self, most: int) -> "tuple[SurfaceHessian, SurfaceHessian | None]":
         """Return the part of the stiffest points, so many at most, and that of the others, if any."""
         stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1)

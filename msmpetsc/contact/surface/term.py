@@ -47,13 +47,20 @@ class SurfaceHessian:
         rows = csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(self.points.shape[0] // 3, len(at)))
         return csr_array(rows @ weights[:, nodes])
 
-    def split(self, most: int) -> "tuple[SurfaceHessian, SurfaceHessian | None]":
-        """Return the part of the stiffest points, so many at most, and that of the others, if any."""
-        stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1)
-        if len(stiffness) <= most:
-            return self, None
+    def split(self, compliance: Floats, most: int) -> "tuple[SurfaceHessian | None, SurfaceHessian | None]":
+        """Return the part of the stiff points, of the stiffest so many, and that of the others; None for none.
+
+        compliance : (n,) [m/N] of nodes of this rank: a point is stiff that gives way less than they let it
+        """
+        at, weights = self.carried
+        given = np.zeros(self.points.shape[0] // 3)
+        given[at] = weights.power(2) @ compliance
+        stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * self.comm.allreduce(given)
         order = np.argsort(-stiffness, kind="stable")
-        return self._part(np.sort(order[:most])), self._part(np.sort(order[most:]))
+        stiff = min(most, int((stiffness > 1).sum()))
+        parts = np.sort(order[:stiff]), np.sort(order[stiff:])
+        joined, held = (self._part(numbers) if len(numbers) else None for numbers in parts)
+        return joined, held
 
     def _part(self, numbers: Indices) -> "SurfaceHessian":
         at, weights = self.carried

@@ -6,7 +6,7 @@ Diagonal blocks tell CG neither: they hold each node to the ground.
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
 from scipy.sparse import csr_array, eye_array, kron
 
@@ -30,31 +30,35 @@ class ContactSmoother:
     stays. Coarse levels have the diagonal blocks of C.
 
     inverse : D^-1 (m, 9) of the free nodes [1/kg]
+    nodes   : (c,) of these that carry the points; ``weights`` (k, c) by which, of k points
+    middle  : (3k, 3k) between W and W^T
     """
 
     def __init__(self, unknowns: Unknowns, surface: SurfaceHessian, t2: float, inverse: Array):
-        self.comm, self.inverse = unknowns.comm, inverse
-        self.at, weights = surface.carried
-        self.weights = weights[:, unknowns.free]
+        self.comm = unknowns.comm
+        weights = surface.carried_by(unknowns.free)
+        self.nodes = np.unique(weights.indices)
+        self.weights, self.inverse = csr_array(weights[:, self.nodes]), inverse[self.nodes].reshape(-1, 3, 3)
+        self.back = csr_array(self.weights.T)
         size = surface.points.shape[0]
         compliance, scaled = np.zeros((size, size)), self.weights.copy()
         for r in range(3):
             for c in range(3):
-                scaled.data = self.weights.data * inverse[self.weights.indices, 3 * r + c]
-                compliance[np.ix_(3 * self.at + r, 3 * self.at + c)] = (self.weights @ scaled.T).toarray()
+                scaled.data = self.weights.data * self.inverse[self.weights.indices, r, c]
+                compliance[r::3, c::3] = (self.weights @ scaled.T).toarray()
         compliance = self.comm.allreduce(compliance)
-        self.root = root_of(t2 * surface.points.toarray())
-        self.factor = cho_factor(np.eye(self.root.shape[1]) + self.root.T @ compliance @ self.root)
+        root = root_of(t2 * surface.points.toarray())
+        lower = np.linalg.cholesky(np.eye(root.shape[1]) + root.T @ compliance @ root)
+        root = solve_triangular(lower, root.T, lower=True, check_finite=False)
+        self.middle = root.T @ root
 
     def correct(self, y: Rows) -> None:
         """Turn y = D^-1 x (3, m) into (D + C)^-1 x."""
-        moved = np.zeros((len(self.root) // 3, 3))
-        moved[self.at] = self.weights @ y.T
+        moved = self.weights @ y[:, self.nodes].T
         if self.comm.size > 1:
             moved = self.comm.allreduce(moved)
-        forces = self.root @ cho_solve(self.factor, self.root.T @ moved.ravel())
-        back = self.weights.T @ forces.reshape(-1, 3)[self.at]
-        y -= np.einsum("mrc,mc->rm", self.inverse.reshape(-1, 3, 3), back)
+        back = self.back @ (self.middle @ moved.ravel()).reshape(-1, 3)
+        y[:, self.nodes] -= np.einsum("mrc,mc->rm", self.inverse, back)
 
 
 def root_of(matrix: Rows) -> Rows:

@@ -102,7 +102,7 @@ class Multigrid:
 
         surface : contact of the surface with itself
         """
-        joined, others = surface.split(POINTS) if surface else (None, None)
+        joined, others = surface.split(self.fine.compliance, POINTS) if surface else (None, None)
         self.fine.update(q, contact + others.blocks if others else contact, joined)
         self.operator.assemble()
         self.sum.update(q, contact)
@@ -261,6 +261,9 @@ class ProjectedHessian:
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
+        blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
+        elasticity.add_bound(lattice.nodes, blocks)
+        self.compliance = 1 / (unknowns.ballast / t2 + blocks[: lattice.owned, [0, 4, 8]].sum(axis=1) / 3)
         self.joined: SurfaceHessian | None = None
         self.smoother: ContactSmoother | None = None
 

@@ -103,14 +103,15 @@ class Multigrid:
         surface : contact of the surface with itself
         """
         joined, others = surface.split(self.fine.compliance, POINTS) if surface else (None, None)
-        self.fine.update(q, contact + others.blocks if others else contact, joined)
+        contact = contact + others.blocks if others else contact
+        self.fine.update(q, contact, joined)
         self.operator.assemble()
         self.sum.update(q, contact)
         self._raise_diagonal(self.sum.matrix)
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
             self._raise_diagonal(level.matrix)
-        coarsest = self.contact.added([level.matrix for level in self.levels], surface)
+        coarsest = self.contact.added([level.matrix for level in self.levels], joined)
         is_new = self.pc.getType() is None
         if is_new and self.unknowns.memory is not device.CUDA:
             self.coarse = [CoarseOperator(level.matrix) for level in self.levels[:-1]]

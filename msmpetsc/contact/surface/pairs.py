@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     import ipctk
 
 REMEMBERED = 3  # positions whose contacts are kept: where a line search starts, and where it tries
-FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
+FARTHEST = (
+    0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
+)
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 1.5  # times the move that is expected
 

@@ -32,14 +32,20 @@ class SurfaceHessian:
     carried: Carried
     points: csr_array
 
+    @cached_property
+    def _carrying(self) -> tuple[Indices, csr_array, csr_array]:
+        """This rank's nodes (c,) that carry points, these points' weights (k, c) and their transpose."""
+        nodes = np.unique(self.carried.weights.indices)
+        weights = self.carried_by(nodes)
+        return nodes, weights, csr_array(weights.T)
+
     def add_product(self, v: Array, product: Array) -> None:
         """Add the Hessian times v (owned or more, 3) to owned rows of ``product`` (collective)."""
-        at, weights = self.carried
-        moved = np.zeros((self.points.shape[0] // 3, 3))
-        moved[at] = weights @ v[: weights.shape[1]]
-        self.comm.Allreduce(MPI.IN_PLACE, moved)
-        forces = (self.points @ moved.ravel()).reshape(-1, 3)
-        product[: weights.shape[1]] += weights.T @ forces[at]
+        nodes, weights, back = self._carrying
+        moved = weights @ v[nodes].astype(float, copy=False)
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, moved)
+        product[nodes] += back @ (self.points @ moved.ravel()).reshape(-1, 3)
 
     def carried_by(self, nodes: Indices) -> csr_array:
         """Return the weights (k, n) of some of this rank's nodes (n,) for all points in contact."""
@@ -72,14 +78,13 @@ class SurfaceHessian:
     @cached_property
     def blocks(self) -> Rows:
         """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
-        at, weights = self.carried
-        own = (3 * at[:, None] + np.arange(3)).ravel()
-        points = self.points[own][:, own]
-        blocks = np.empty((weights.shape[1], 9))
+        nodes, weights, _ = self._carrying
+        blocks, joined = np.zeros((self.carried.weights.shape[1], 9)), np.empty((len(nodes), 9))
         for row in range(3):
             for column in range(3):
-                acting = points[row::3][:, column::3] @ weights
-                blocks[:, 3 * row + column] = (weights * acting).sum(axis=0)
+                acting = csr_array(self.points[row::3][:, column::3]) @ weights
+                joined[:, 3 * row + column] = weights.multiply(acting).sum(axis=0)
+        blocks[nodes] = joined
         return blocks
 
 
@@ -110,7 +115,7 @@ class SurfaceContact:
             return None
         if moment.points is not None:
             return moment
-        return replace(moment, points=self.contacts.points(moment.q, moment.time))
+        return replace(moment, points=self.contacts.points_at(moment.q, moment.time))
 
     def presses(self, q: Positions) -> bool:
         """Return whether it acts at q."""
@@ -124,11 +129,17 @@ class SurfaceContact:
         after, before = self._acting(q), self._acting(base)
         if after is None and before is None:
             return 0.0
-        moved = self.contacts.points.moved(q - base)
-        if moved.size and np.abs(moved).max() < SMALL * self.contacts.law.distance:
+        if self._is_small(q, base):
+            moved = self.contacts.points.moved(q - base)
             forces = filter(None, (self._forces(moment) for moment in (before, after) if moment))  # on rank 0
             return sum(0.5 * float(np.vdot(gradient, moved[touched])) for touched, gradient in forces)
         return self._energy(after) - self._energy(before)
+
+    def _is_small(self, q: Positions, base: Positions) -> bool:
+        """Return whether no point goes far from base to q, for a difference of energies to keep its digits."""
+        points, time = self.contacts.points_at, self.contacts.time
+        gone = np.abs(points(q, time) - points(base, time)).max(initial=0.0)
+        return bool(self.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
     def _energy(self, moment: ContactsAt | None) -> float:
         if moment is None or moment.points is None:

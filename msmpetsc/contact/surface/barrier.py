@@ -107,11 +107,13 @@ class Barrier:
         cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
         return np.array(sorted(cut), np.int64)
 
-    def candidates(self, points: Positions, reach: float) -> "ipctk.Candidates":
+    def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than
-        ``reach`` [m], but for those in creases."""
-        candidates = self.ipctk.Candidates()
-        candidates.build(self.mesh, np.asfortranarray(points), 0.5 * self.law.distance + reach, self.ipctk.LBVH())
+        ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; but for those in creases."""
+        candidates, ends = self.ipctk.Candidates(), [np.asfortranarray(points)]
+        if moved is not None:
+            ends += [np.asfortranarray(points + moved - moved.mean(axis=0))]
+        candidates.build(self.mesh, *ends, 0.5 * self.law.distance + reach, self.ipctk.LBVH())
         return candidates
 
     def clear_reach(self, candidates: "ipctk.Candidates", points: Positions, reach: float) -> tuple[float, float]:

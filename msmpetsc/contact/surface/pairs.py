@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, energy_of
+from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets, energy_of
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -27,7 +27,8 @@ FARTHEST = (
     0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
 )
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
-AHEAD = 1.5  # times the move that is expected
+AHEAD = 2.0  # times the move that is expected
+TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,14 @@ class Touch:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs that may meet while no point moves by more than ``reach`` [m] from q (owned, 3), but for a translation.
+    """Pairs that may meet while no point is farther than ``reach`` [m] from where it is at q (owned, 3), or from its
+    straight way from there, but for a translation.
 
     time               : [s], at which obstacles are there as they are
     apart              : no more than reach [m]; none of them comes near enough to count while no point moves farther
     clear              : no more than that [m]; nor does any pair in a crease, which is not among them
     points, candidates : S there (p, 3) [m] and the pairs, on rank 0
+    moved              : the ways (p, 3) [m], on rank 0; None where there are none
     """
 
     q: Positions
@@ -71,6 +74,15 @@ class Pairs:
     clear: float
     points: Positions
     candidates: "ipctk.Candidates | None"
+    moved: Rows | None = None
+
+    def serve(self, points: Positions) -> bool:
+        """Return whether points S (p, 3) are within reach, on rank 0."""
+        gone = points - self.points
+        if self.moved is not None:
+            gone, way = gone - gone.mean(axis=0), self.moved - self.moved.mean(axis=0)
+            gone -= np.clip(np.vdot(gone, way) / (np.vdot(way, way) + TINY), 0.0, 1.0) * way
+        return farthest(gone) <= self.reach
 
 
 @dataclass(frozen=True)
@@ -102,15 +114,16 @@ class NearPairs:
         self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, collision) if surface else None)
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self._newest: Pairs | None = None
+        self.touching = False  # where contacts were asked for last
 
     def step(self, q: Positions, end: Positions, begin: float, time: float) -> "Contacts":
         """Return the contacts of a step from q at ``begin`` [s] to about ``end`` at ``time`` [s].
 
-        Where nothing was near, pairs are looked for as far as the step leads, unless the known ones serve.
+        Where nothing touches, pairs are looked for as far as the step leads, unless the known ones serve.
         """
         pairs = self._newest
         if not pairs or (
-            pairs.clear > 0 and max(self.moved(q, begin, pairs), self.moved(end, time, pairs)) > pairs.reach
+            not self.touching and max(self.moved(q, begin, pairs), self.moved(end, time, pairs)) > pairs.reach
         ):
             self.look(q, begin, AHEAD * self._farthest(end, q, time, begin))
         return Contacts(self, begin, time)
@@ -130,6 +143,13 @@ class NearPairs:
         self._newest = Pairs(q[: self.owned].copy(), time, reach, apart, clear, points, candidates)
         return self._newest
 
+    def look_along(self, q: Positions, time: float, points: Positions, moved: Rows) -> Pairs:
+        """Look for pairs on a way of the points (p, 3) [m] at q, by ``moved`` (p, 3) [m]."""
+        reach = LEAST * self.edge
+        candidates = self.barrier.candidates(points, reach, moved) if self.barrier else None
+        self._newest = Pairs(q[: self.owned].copy(), time, reach, 0.0, 0.0, points, candidates, moved)
+        return self._newest
+
     def moved(self, q: Positions, time: float, pairs: Pairs) -> float:
         """Return no less than how far points at q are from where the pairs were looked for [m]."""
         return self._farthest(q, pairs.q, time, pairs.time)
@@ -147,7 +167,7 @@ class NearPairs:
 
     def forget(self) -> None:
         """Forget what earlier steps showed."""
-        self._newest = None
+        self._newest, self.touching = None, False
 
 
 class Contacts:
@@ -181,6 +201,7 @@ class Contacts:
             candidates = pairs.candidates
         contacts = self.barrier.contacts(candidates, points) if self.barrier else None
         count = self.comm.bcast(sum(map(len, contacts or ())))
+        self.near.touching = count > 0
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
@@ -203,8 +224,7 @@ class Contacts:
 
     def _serve(self, pairs: Pairs, points: Positions) -> bool:
         """Return whether points S (p, 3) are within the pairs' reach, by their own moves."""
-        serve = self.barrier is not None and farthest(points - pairs.points) <= pairs.reach
-        return bool(self.comm.bcast(serve))
+        return bool(self.comm.bcast(self.barrier is not None and pairs.serve(points)))
 
     def touch(self, q: Positions, time: float) -> Touch:
         """Return what there is of contacts at q and a time [s]."""
@@ -233,9 +253,9 @@ class Contacts:
         if 2 * way < self.comm.bcast(clearance):
             return 1.0
         if bound >= pairs.apart and not self._serve(pairs, start + moved):
-            if way > FARTHEST * self.near.edge:
+            if way > PIECE * self.near.edge:
                 return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
-            pairs = self.near.look(q, begin, AHEAD * way)
+            pairs = self.near.look_along(q, begin, start, moved)
         candidates = None if bound < pairs.apart else pairs.candidates
         return float(self.comm.bcast(self.barrier.free_share(start, moved, candidates) if self.barrier else 1.0))
 

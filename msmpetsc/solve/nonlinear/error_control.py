@@ -101,7 +101,7 @@ class ErrorControl:
             if lowest > 0 and now.bound <= now.goal * lowest:
                 return replace(now, error=now.bound / lowest)
         found = self.estimated(iterate, now, now.goal)
-        stays = before.corrected and now.bound > STAYS * before.bound  # by rounding: stiff contact has much of it
+        stays = before.corrected and STAYS * before.bound < now.bound < FULL_STEP_ERROR  # rounding of stiff contact
         if is_near or stays or self.estimate.is_trusted:
             return found
         return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here

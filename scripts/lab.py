@@ -69,7 +69,7 @@ def run(
     words : options of `msmpetsc run`, and of PETSc; changes : those of --set
     warm  : spare it the start of the program, where no time is asked
     """
-    file = scene if isinstance(scene, Path) else SCENES / f"{scene}.toml"
+    file = file_of(scene)
     command: list[object] = ["-m", "msmpetsc", "run", file, "-o", path, "--overwrite", *words]
     command += ["--measure", path.with_suffix(".json"), *(word for change in changes for word in ("--set", change))]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -78,6 +78,11 @@ def run(
     if ended.reason:
         print("  failed:", ended.reason, file=sys.stderr)
     return Run(path, ended.reason, ended.status)
+
+
+def file_of(scene: str | Path) -> Path:
+    """Return the file of a scene of scenes/ by its name, or of a path."""
+    return Path(scene) if Path(scene).suffix == ".toml" else SCENES / f"{scene}.toml"
 
 
 def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:

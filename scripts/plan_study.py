@@ -141,8 +141,7 @@ def rows(args: Namespace) -> lab.Rows:
         number = next((number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1)
         for scene in args.scenes or STUDIES:
             tried, finest = STUDIES.get(scene, ANOTHER)
-            file = Path(scene) if scene.endswith(".toml") else lab.SCENES / f"{scene}.toml"
-            plan = planned(file, target, args.frames or tried[number], args.cells or finest[number])
+            plan = planned(lab.file_of(scene), target, args.frames or tried[number], args.cells or finest[number])
             yield row(scene, target, plan, args.limit)
 
 

@@ -9,14 +9,18 @@ table1   : the paper's Table 1 beside ours, the paper's figures in brackets: wit
            with the Hessian are a frame's. The error is the largest relative error of a step that the runs report.
 tissue   : neo-Hookean solids of Poisson's ratio 0.47. The volume is what the drawn surface encloses, against rest:
            the most that is lost and gained in any frame, and at the end. "Inside out" is the most cells in any frame.
-touching : surfaces that meet themselves. Crossed: pairs of an edge and a triangle that cross, over all frames, by a
-           test that shares nothing with the contact's own, of the surface that meets itself; drawn: of the one that is
-           drawn, over 20 frames. --shorter 16 takes steps, and frames, of a sixteenth.
+touching : surfaces that meet themselves; a SCENE may be a file. Crossed: pairs of an edge and a triangle that cross,
+           over all frames, by a test that shares nothing with the contact's own, of the surface that meets itself;
+           drawn: of the one that is drawn, over 20 frames. CPU is of the process, by the share of its steps, with
+           contact and of the scene without [self_contact]. --shorter 16 takes steps, and frames, of a sixteenth.
 """
 
+import re
+import shutil
 import sys
 from argparse import Namespace
 from pathlib import Path
+from resource import RUSAGE_CHILDREN, getrusage
 
 import lab
 from clone import ROOT
@@ -33,14 +37,16 @@ from msmpetsc.scene.reading import load_scene
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 from crossings import count_crossings
 
+OUT = lab.OUT / "scene_tables"
 
-def run(name: str, scene: str, args: Namespace, *changes: str) -> Path:
+
+def run(name: str, scene: str | Path, args: Namespace, *changes: str) -> Path:
     """Run a scene; its result, whose frames count if the run fails, too."""
-    changes = (*changes, *args.set)
+    changes, file = (*changes, *args.set), lab.file_of(scene)
     if args.shorter > 1:
-        changes += (f"time.step={load_scene(lab.SCENES / f'{scene}.toml').time.step / args.shorter!r}",)
+        changes += (f"time.step={load_scene(file).time.step / args.shorter!r}",)
     words = ["--quiet", *(["--frames", args.frames] if args.frames else [])]
-    return lab.run(scene, lab.OUT / "scene_tables" / f"{name}_{scene}.h5", words, changes).path
+    return lab.run(file, OUT / f"{name}_{file.stem}.h5", words, changes).path
 
 
 def mean(result: Result, *names: str) -> dict[str, float]:
@@ -125,18 +131,40 @@ def tissue(scene: str, args: Namespace) -> lab.Row:
 COUNTED = 20  # frames whose crossings of the surface that is drawn are counted
 
 
+def cost(name: str, scene: str | Path, args: Namespace) -> tuple[Path, float]:
+    """Return the result of a scene, and the CPU time of a frame [ms]."""
+    began = sum(getrusage(RUSAGE_CHILDREN)[:2])
+    path = run(name, scene, args)
+    time, cpu = lab.Run(path).cost["time"], sum(getrusage(RUSAGE_CHILDREN)[:2]) - began
+    with Result(path) as result:
+        frames = len(result.frames.time) - 1
+    return path, 1e3 * cpu * time["stepping"] / (time["setup"] + time["stepping"] + time["output"]) / frames
+
+
+def without_contact(file: Path) -> Path:
+    """Return a copy of a scene without [self_contact], its meshes beside it."""
+    copy = OUT / "without" / file.name
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    for mesh in file.parent.glob("*.ply"):
+        shutil.copy(mesh, copy.parent)
+    copy.write_text(re.sub(r"(?m)^\[self_contact\].*\n(?:(?!\[).*\n)*", "", file.read_text()))
+    return copy
+
+
 def touching(scene: str, args: Namespace) -> lab.Row:
     """Return the row of a scene that touches itself."""
-    path = run("touching", scene, args)
-    model = build_model(MPI.COMM_SELF, load_scene(lab.SCENES / f"{scene}.toml", args.set))
+    path, cpu = cost("touching", scene, args)
+    file, others = lab.file_of(scene), [change for change in args.set if not change.startswith("self_contact")]
+    _, without = cost("without", without_contact(file), Namespace(**vars(args) | {"set": others}))
+    model = build_model(MPI.COMM_SELF, load_scene(file, args.set))
     assert isinstance(model.collision, CollisionSurface) and model.collision.surface and model.surface
     with Result(path) as result:
         whole = [*map(model.collision.points, result.frames.position, result.frames.time[:])]
         counted = np.unique(np.linspace(0, len(whole) - 1, COUNTED).round().astype(int))
         drawn = (result.embedding @ result.frames.position[index] for index in counted)
-        least = np.nanmin(result.frames.self_distance[:])
+        least, products = np.nanmin(result.frames.self_distance[:]), result.frames.products[1:]
         return {
-            "scene": f"`{scene}`",
+            "scene": f"`{file.stem}`",
             "cells": len(model.lattice.cells),
             "triangles": len(model.collision.surface.triangles),
             "steps": len(whole) - 1,
@@ -144,7 +172,10 @@ def touching(scene: str, args: Namespace) -> lab.Row:
             "least distance [µm]": f"{1e6 * least:.2g} of {1e6 * model.collision.law.distance:.0f}",
             "crossed": sum(int(count_crossings(each, model.collision.surface.triangles)) for each in whole),
             "drawn": sum(int(count_crossings(each, model.surface.triangles)) for each in drawn),
-            **mean(result, "iterations", "products", "wall_time"),
+            **mean(result, "iterations", "products"),
+            "median, most products": f"{np.median(products):,.0f}, {products.max():,}",
+            "CPU ms a frame": cpu,
+            "without contact": without,
         }
 
 

@@ -57,8 +57,8 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     assert not barrier.contacts(None, closed(points, 0.99 * tight))[level].empty()
     through = closed(points, -2 * HALF) - points
     assert 0.3 < barrier.free_share(points, through, candidates) < 0.5  # they meet halfway
-    assert 0.3 < barrier.sweep(points, through, 0.0)[0] < 0.5
-    assert 0.3 < barrier.free_share_in_creases(points, through) < 0.5
+    assert 0.3 < barrier.sweep(points, through) < 0.5
+    assert 0.3 < barrier.free_share(points, through, None) < 0.5
     assert barrier.free_share(points, closed(points, 0.05) - points, candidates) == 1
 
 

@@ -51,19 +51,6 @@ class BarrierLaw:
     stick: float
 
 
-@dataclass(frozen=True)
-class SweptPairs:
-    """Pairs that come near on the first of so many pieces, all as long, of a straight way of the points."""
-
-    whole: int
-    pieces: "list[ipctk.Candidates]"
-
-    def pairs_at(self, share: float) -> "ipctk.Candidates | None":
-        """Return those at a share of the way; None beyond the pieces."""
-        piece = max(int(np.ceil(share * self.whole)) - 1, 0)
-        return self.pieces[piece] if piece < len(self.pieces) else None
-
-
 class Barrier:
     """Barrier of a surface (p, 3), by the positions S (p, 3) [m] of its points.
 
@@ -123,11 +110,13 @@ class Barrier:
         cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
         return np.array(sorted(cut), np.int64)
 
-    def candidates(self, points: Positions, reach: float) -> "ipctk.Candidates":
+    def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than
-        ``reach`` [m], but for those in creases."""
-        candidates = self.ipctk.Candidates()
-        candidates.build(self.mesh, np.asfortranarray(points), 0.5 * self.law.distance + reach, self.ipctk.LBVH())
+        ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; but for those in creases."""
+        candidates, ends = self.ipctk.Candidates(), [np.asfortranarray(points)]
+        if moved is not None:
+            ends += [np.asfortranarray(points + moved - moved.mean(axis=0))]
+        candidates.build(self.mesh, *ends, 0.5 * self.law.distance + reach, self.ipctk.LBVH())
         return candidates
 
     def clear_reach(self, candidates: "ipctk.Candidates", points: Positions, reach: float) -> tuple[float, float]:
@@ -191,41 +180,37 @@ class Barrier:
     def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
-    def free_share(self, start: Positions, moved: Rows, candidates: "ipctk.Candidates") -> float:
+    def clearance(self, contacts: ContactSets, points: Positions) -> float:
+        """Return the least distance [m] of any pair at points S (p, 3), but no more than dhat.
+
+        contacts : there
+        """
+        distance = self.law.distance
+        near = [contacts[0], *(self._pairs(pairs, points, distance) for pairs in self.creases)]
+        return min((self._least(pairs, points) for pairs in near if not pairs.empty()), default=distance)
+
+    def free_share(self, start: Positions, moved: Rows, candidates: "ipctk.Candidates | None") -> float:
         """Return the share, up to 1, of a straight way that points go from start (p, 3) by
         ``moved`` (p, 3) [m] without any meeting.
 
         candidates : pairs that may meet on it, besides those in creases
         """
         end = start + moved - moved.mean(axis=0)
-        return _kept(self._share(start, end, candidates, *self.creases))
+        share = self._share(start, end, *([candidates] if candidates else []), *self.creases)
+        return share if share >= 1 else KEPT * share
 
-    def sweep(self, start: Positions, moved: Rows, aside: float) -> tuple[float, "SweptPairs"]:
-        """Return the free share of any way, as ``free_share`` does, and the pairs near it, up to where points meet.
-
-        aside : [m], as far as points may be from the way and have no other pairs
-        """
+    def sweep(self, start: Positions, moved: Rows) -> float:
+        """Return the free share of any way, as ``free_share`` does, from the pairs that it passes."""
         moved = moved - moved.mean(axis=0)
-        farthest = float(np.sqrt((moved**2).sum(axis=1).max()))
-        whole, pieces = max(int(np.ceil(farthest / (PIECE * self.edge))), 1), []
+        whole = max(int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * self.edge))), 1)
         for piece in range(min(whole, PIECES)):
             begin, end = (start + i / whole * moved for i in (piece, piece + 1))
-            pieces.append(self._near_way(begin, end, 0.5 * self.law.distance + aside))
-            if self._share(begin, end, pieces[-1], *self.creases) < 1:  # or a tenth as far apart: pairs that pass
-                share = self._share(begin, end, self._near_way(begin, end, 0.0), *self.creases)
-                if share < 1:
-                    return KEPT * (piece + share) / whole, SweptPairs(whole, pieces)
-        return (1.0 if whole <= PIECES else PIECES / whole), SweptPairs(whole, pieces)
-
-    def _near_way(self, begin: Positions, end: Positions, reach: float) -> "ipctk.Candidates":
-        """Return the pairs whose boxes meet on a way, each wider by ``reach`` [m]."""
-        candidates = self.ipctk.Candidates()
-        candidates.build(self.mesh, np.asfortranarray(begin), np.asfortranarray(end), reach, self.ipctk.LBVH())
-        return candidates
-
-    def free_share_in_creases(self, start: Positions, moved: Rows) -> float:
-        """Return the free share of a way on which only pairs in creases can meet."""
-        return _kept(self._share(start, start + moved, *self.creases))
+            candidates = self.ipctk.Candidates()
+            candidates.build(self.mesh, np.asfortranarray(begin), np.asfortranarray(end), 0.0, self.ipctk.LBVH())
+            share = self._share(begin, end, candidates, *self.creases)
+            if share < 1:
+                return KEPT * (piece + share) / whole
+        return 1.0 if whole <= PIECES else PIECES / whole
 
     def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
@@ -261,7 +246,3 @@ def hessian_of(acting: list[Acting], points: Positions, projected: bool) -> "lis
     kinds, at = ipctk.PSDProjectionMethod, np.asfortranarray(points)
     kind = kinds.CLAMP if projected else kinds.NONE
     return [each.potential.hessian(each.pairs, each.mesh, at, kind) for each in acting]
-
-
-def _kept(share: float) -> float:
-    return share if share >= 1 else KEPT * share

@@ -1,9 +1,9 @@
 """Contacts of a surface with itself and with obstacles, wherever they are: looked for as rarely as can be.
 
-Pairs of its parts that may meet are looked for where a step begins, and again where a point has moved farther than was
+Pairs of its parts that may meet are looked for around positions, and again where a point has moved farther than was
 allowed for then; a common translation is no such move. Where none of them can come near, positions of nodes tell that
-without a single point's being computed. Pairs outlive a step (``NearPairs``); contacts at positions and pairs on ways
-are known for as long as it lasts (``Contacts``).
+without a single point's being computed; elsewhere points tell, for light nodes around a body swing much farther. Pairs
+outlive a step (``NearPairs``); contacts at positions are known for as long as it lasts (``Contacts``).
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs, energy_of
+from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets, energy_of
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -23,9 +23,12 @@ if TYPE_CHECKING:
     import ipctk
 
 REMEMBERED = 3  # positions whose contacts are kept: where a line search starts, and where it tries
-FARTHEST = 0.1  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
-ASIDE = 1e-3  # of the barrier's distance: positions so near a way are on it
+FARTHEST = (
+    0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
+)
+LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 2.0  # times the move that is expected
+TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
@@ -54,12 +57,14 @@ class Touch:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs that may meet while no point moves by more than ``reach`` [m] from q (owned, 3), but for a translation.
+    """Pairs that may meet while no point is farther than ``reach`` [m] from where it is at q (owned, 3), or from its
+    straight way from there, but for a translation.
 
     time               : [s], at which obstacles are there as they are
     apart              : no more than reach [m]; none of them comes near enough to count while no point moves farther
     clear              : no more than that [m]; nor does any pair in a crease, which is not among them
     points, candidates : S there (p, 3) [m] and the pairs, on rank 0
+    moved              : the ways (p, 3) [m], on rank 0; None where there are none
     """
 
     q: Positions
@@ -69,19 +74,15 @@ class Pairs:
     clear: float
     points: Positions
     candidates: "ipctk.Candidates | None"
+    moved: Rows | None = None
 
-
-@dataclass(frozen=True)
-class Way:
-    """A straight way from q by ``moved`` (owned, 3) [m] that was swept; the pairs that come near on it, on rank 0.
-
-    square : |moved|^2 of all ranks [m^2]
-    """
-
-    q: Positions
-    moved: Rows
-    square: float
-    sweep: SweptPairs | None
+    def serve(self, points: Positions) -> bool:
+        """Return whether points S (p, 3) are within reach, on rank 0."""
+        gone = points - self.points
+        if self.moved is not None:
+            gone, way = gone - gone.mean(axis=0), self.moved - self.moved.mean(axis=0)
+            gone -= np.clip(np.vdot(gone, way) / (np.vdot(way, way) + TINY), 0.0, 1.0) * way
+        return farthest(gone) <= self.reach
 
 
 @dataclass(frozen=True)
@@ -113,14 +114,17 @@ class NearPairs:
         self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, collision) if surface else None)
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self._newest: Pairs | None = None
+        self.touching = False  # where contacts were asked for last
 
     def step(self, q: Positions, end: Positions, begin: float, time: float) -> "Contacts":
         """Return the contacts of a step from q at ``begin`` [s] to about ``end`` at ``time`` [s].
 
-        Pairs are looked for unless the known ones serve.
+        Where nothing touches, pairs are looked for as far as the step leads, unless the known ones serve.
         """
         pairs = self._newest
-        if not (pairs and max(self.moved(q, begin, pairs), self.moved(end, time, pairs)) <= pairs.reach):
+        if not pairs or (
+            not self.touching and max(self.moved(q, begin, pairs), self.moved(end, time, pairs)) > pairs.reach
+        ):
             self.look(q, begin, AHEAD * self._farthest(end, q, time, begin))
         return Contacts(self, begin, time)
 
@@ -130,13 +134,20 @@ class NearPairs:
 
     def look(self, q: Positions, time: float, reach: float) -> Pairs:
         """Look for pairs at q."""
-        points, reach = self.points(q, time), min(max(reach, self.law.distance), FARTHEST * self.edge)
+        points, reach = self.points(q, time), min(max(reach, LEAST * self.edge), FARTHEST * self.edge)
         candidates, ways = None, (0.0, 0.0)
         if self.barrier:
             candidates = self.barrier.candidates(points, reach)
             ways = self.barrier.clear_reach(candidates, points, reach)
         apart, clear = self.comm.bcast(ways)
         self._newest = Pairs(q[: self.owned].copy(), time, reach, apart, clear, points, candidates)
+        return self._newest
+
+    def look_along(self, q: Positions, time: float, points: Positions, moved: Rows) -> Pairs:
+        """Look for pairs on a way of the points (p, 3) [m] at q, by ``moved`` (p, 3) [m]."""
+        reach = LEAST * self.edge
+        candidates = self.barrier.candidates(points, reach, moved) if self.barrier else None
+        self._newest = Pairs(q[: self.owned].copy(), time, reach, 0.0, 0.0, points, candidates, moved)
         return self._newest
 
     def moved(self, q: Positions, time: float, pairs: Pairs) -> float:
@@ -148,13 +159,15 @@ class NearPairs:
         moved = end[: self.owned] - start[: self.owned]
         if self.points.obstacles.total:
             moved = np.vstack([moved, self.points.obstacles.way(begin, time)])
-        ends = np.concatenate([np.fmax.reduce(moved, initial=-np.inf), -np.fmin.reduce(moved, initial=np.inf)])
+        along = np.ascontiguousarray(moved.T)  # along the last axis numpy takes a twentieth of the time
+        ends = [np.fmax.reduce(along, axis=1, initial=-np.inf), -np.fmin.reduce(along, axis=1, initial=np.inf)]
+        ends = np.concatenate(ends)
         self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)  # the greatest along the axes and against them
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
         """Forget what earlier steps showed."""
-        self._newest = None
+        self._newest, self.touching = None, False
 
 
 class Contacts:
@@ -169,63 +182,49 @@ class Contacts:
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
         self._moments: list[ContactsAt] = []
-        self._ways: list[Way] = []
+        self._points: list[tuple[Positions, float, Positions]] = []  # q, time and points of some positions
 
     def find(self, q: Positions, time: float | None = None) -> ContactsAt:
         """Return the contacts at positions q, and a time [s] if not that of the step's end."""
         q, time = q[: self.owned], self.time if time is None else time
+        for moment in self._moments:
+            if self._is_at(moment.q, moment.time, q, time):
+                return moment
         pairs = self.near.around(q, time)
         bound = self.near.moved(q, time, pairs)
         if bound < pairs.clear:
             return ContactsAt(q, time)
-        for moment in self._moments:
-            if self.same(moment.time, time) and self.comm.allreduce(bool(np.array_equal(q, moment.q)), MPI.LAND):
-                return moment
-        points = self.points(q, time)
-        near = self._pairs_near(q, time, points, pairs, bound)
-        contacts = self.barrier.contacts(near, points) if self.barrier else None
+        points, candidates = self.points_at(q, time), None
+        if bound >= pairs.apart:
+            if bound > pairs.reach and not self._serve(pairs, points):
+                pairs = self.near.look(q, time, LEAST * self.near.edge)
+            candidates = pairs.candidates
+        contacts = self.barrier.contacts(candidates, points) if self.barrier else None
         count = self.comm.bcast(sum(map(len, contacts or ())))
+        self.near.touching = count > 0
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
-    def _pairs_near(
-        self, q: Positions, time: float, points: Positions, pairs: Pairs, bound: float
-    ) -> "ipctk.Candidates | None":
-        """Return the pairs that may be near at q, besides those in creases, on rank 0.
+    def points_at(self, q: Positions, time: float) -> Positions:
+        """Return the points (p, 3) [m] of positions q at a time [s] on rank 0; (0, 3) on the others."""
+        q = q[: self.owned]
+        for known, at, points in self._points:
+            if self._is_at(known, at, q, time):
+                return points
+        self._points = [(q.copy(), time, self.points(q, time)), *self._points[: REMEMBERED - 1]]
+        return self._points[0][2]
 
-        bound : no point is farther from where ``pairs`` were looked for [m]
-        """
-        if bound < pairs.apart:
-            return None
-        if bound <= pairs.reach or self._serve(pairs, points):
-            return pairs.candidates
-        for way in self._ways if self.same(time, self.time) else ():
-            share = self._share_of(way, q)
-            near = way.sweep.pairs_at(share) if way.sweep and share is not None else None
-            if share is not None and self.comm.bcast(near is not None):
-                return near
-        return self.near.look(q, time, FARTHEST * self.near.edge).candidates
+    def _is_at(self, known: Positions, at: float, q: Positions, time: float) -> bool:
+        """Return whether positions and obstacles are those of another moment on all ranks."""
+        return self.same(at, time) and self.comm.allreduce(bool(np.array_equal(q, known)), MPI.LAND)
 
     def same(self, begin: float, end: float) -> bool:
         """Return whether obstacles are at one time [s] where they are at another."""
         return not self.obstacles.moves(begin, end)
 
-    def _share_of(self, way: Way, q: Positions) -> float | None:
-        """Return the share of a way that positions q are at; None where they are not on it."""
-        gone = q - way.q
-        share = self.comm.allreduce(float(np.vdot(gone, way.moved))) / way.square if way.square else 0.0
-        aside = self.points.spread * float(np.abs(gone - share * way.moved).max(initial=0.0))
-        near = self.comm.allreduce(aside, MPI.MAX) <= ASIDE * self.law.distance / np.sqrt(3)
-        return share if near and -ASIDE < share < 1 + ASIDE else None
-
     def _serve(self, pairs: Pairs, points: Positions) -> bool:
         """Return whether points S (p, 3) are within the pairs' reach, by their own moves."""
-        serve = True
-        if self.barrier:
-            moved = points - pairs.points
-            moved -= 0.5 * (moved.max(axis=0) + moved.min(axis=0))
-            serve = bool((moved**2).sum(axis=1).max() <= pairs.reach**2)
-        return bool(self.comm.bcast(serve))
+        return bool(self.comm.bcast(self.barrier is not None and pairs.serve(points)))
 
     def touch(self, q: Positions, time: float) -> Touch:
         """Return what there is of contacts at q and a time [s]."""
@@ -243,33 +242,29 @@ class Contacts:
         with_obstacles : these go from where they are when the step begins
         """
         begin = self.begin if with_obstacles else self.time
-        q, end = q[: self.owned], end[: self.owned]
         pairs = self.near.around(q, begin)
-        farthest = max(self.near.moved(q, begin, pairs), self.near.moved(end, self.time, pairs))
-        if farthest < pairs.clear:
+        bound = max(self.near.moved(q, begin, pairs), self.near.moved(end, self.time, pairs))
+        if bound < pairs.clear:
             return 1.0
-        start, moved, share = self.points(q, begin), self.points.moved(end - q), 1.0
-        if len(moved) and self.obstacles.total:
-            moved[self.points.bodies :] = self.obstacles.way(begin, self.time)
-        if self.barrier and farthest < pairs.apart:
-            share = self.barrier.free_share_in_creases(start, moved)
-        elif farthest > pairs.reach:
-            share = self._swept(q, end, start, moved)
-            if not self.same(begin, self.time):
-                self._ways.pop(0)  # of no position on it are obstacles where they are at the step's end
-        elif self.barrier and pairs.candidates is not None:
-            share = self.barrier.free_share(start, moved, pairs.candidates)
-        return float(self.comm.bcast(share))
+        contacts, start = self.find(q, begin).contacts, self.points_at(q, begin)
+        moved, pairs = self.points_at(end, self.time) - start, self.near.around(q, begin)
+        way = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
+        clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts is not None else 0.0
+        if 2 * way < self.comm.bcast(clearance):
+            return 1.0
+        if bound >= pairs.apart and not self._serve(pairs, start + moved):
+            if way > PIECE * self.near.edge:
+                return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
+            pairs = self.near.look_along(q, begin, start, moved)
+        candidates = None if bound < pairs.apart else pairs.candidates
+        return float(self.comm.bcast(self.barrier.free_share(start, moved, candidates) if self.barrier else 1.0))
 
-    def _swept(self, q: Positions, end: Positions, start: Positions, moved: Rows) -> float:
-        """Return the free share of a way that no known pairs serve for; those on it are kept."""
-        share, sweep = 1.0, None
-        if self.barrier:
-            share, sweep = self.barrier.sweep(start, moved, ASIDE * self.law.distance)
-        way = end - q
-        square = self.comm.allreduce(float(np.vdot(way, way)))
-        self._ways = [Way(q.copy(), way, square, sweep), *self._ways[: REMEMBERED - 1]]
-        return share
+
+def farthest(moved: Rows) -> float:
+    """Return no less than how far any of some points goes that move so (p, 3) [m], but for a common translation."""
+    along = np.ascontiguousarray(moved.T)
+    middle = 0.5 * (along.max(axis=1) + along.min(axis=1))
+    return float(np.sqrt(((along - middle[:, None]) ** 2).sum(axis=0).max()))
 
 
 def _barrier(surface: Surface, collision: CollisionSurface) -> Barrier:

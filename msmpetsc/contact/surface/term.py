@@ -33,22 +33,41 @@ class SurfaceHessian:
     carried: Carried
     points: csr_array
 
+    @cached_property
+    def _carrying(self) -> tuple[Indices, csr_array, csr_array]:
+        """This rank's nodes (c,) that carry points, these points' weights (k, c) and their transpose."""
+        nodes = np.unique(self.carried.weights.indices)
+        weights = self.carried_by(nodes)
+        return nodes, weights, csr_array(weights.T)
+
     def add_product(self, v: Array, product: Array) -> None:
         """Add the Hessian times v (owned or more, 3) to owned rows of ``product`` (collective)."""
-        at, weights = self.carried
-        moved = np.zeros((self.points.shape[0] // 3, 3))
-        moved[at] = weights @ v[: weights.shape[1]]
-        self.comm.Allreduce(MPI.IN_PLACE, moved)
-        forces = (self.points @ moved.ravel()).reshape(-1, 3)
-        product[: weights.shape[1]] += weights.T @ forces[at]
+        nodes, weights, back = self._carrying
+        moved = weights @ v[nodes].astype(float, copy=False)
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, moved)
+        product[nodes] += back @ (self.points @ moved.ravel()).reshape(-1, 3)
 
-    def split(self, most: int) -> "tuple[SurfaceHessian, SurfaceHessian | None]":
-        """Return the part of the stiffest points, so many at most, and that of the others, if any."""
-        stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1)
-        if len(stiffness) <= most:
-            return self, None
+    def carried_by(self, nodes: Indices) -> csr_array:
+        """Return the weights (k, n) of some of this rank's nodes (n,) for all points in contact."""
+        at, weights = self.carried
+        rows = csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(self.points.shape[0] // 3, len(at)))
+        return csr_array(rows @ weights[:, nodes])
+
+    def split(self, compliance: Floats, most: int) -> "tuple[SurfaceHessian | None, SurfaceHessian | None]":
+        """Return the part of the stiff points, of the stiffest so many, and that of the others; None for none.
+
+        compliance : (n,) [m/N] of nodes of this rank: a point is stiff that gives way less than they let it
+        """
+        at, weights = self.carried
+        given = np.zeros(self.points.shape[0] // 3)
+        given[at] = weights.power(2) @ compliance
+        stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * self.comm.allreduce(given)
         order = np.argsort(-stiffness, kind="stable")
-        return self._part(np.sort(order[:most])), self._part(np.sort(order[most:]))
+        stiff = min(most, int((stiffness > 1).sum()))
+        parts = np.sort(order[:stiff]), np.sort(order[stiff:])
+        joined, held = (self._part(numbers) if len(numbers) else None for numbers in parts)
+        return joined, held
 
     def _part(self, numbers: Indices) -> "SurfaceHessian":
         at, weights = self.carried
@@ -60,14 +79,13 @@ class SurfaceHessian:
     @cached_property
     def blocks(self) -> Rows:
         """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
-        at, weights = self.carried
-        own = (3 * at[:, None] + np.arange(3)).ravel()
-        points = self.points[own][:, own]
-        blocks = np.empty((weights.shape[1], 9))
+        nodes, weights, _ = self._carrying
+        blocks, joined = np.zeros((self.carried.weights.shape[1], 9)), np.empty((len(nodes), 9))
         for row in range(3):
             for column in range(3):
-                acting = points[row::3][:, column::3] @ weights
-                blocks[:, 3 * row + column] = (weights * acting).sum(axis=0)
+                acting = csr_array(self.points[row::3][:, column::3]) @ weights
+                joined[:, 3 * row + column] = weights.multiply(acting).sum(axis=0)
+        blocks[nodes] = joined
         return blocks
 
 
@@ -139,7 +157,7 @@ class SurfaceContact:
             return None
         if moment.points is not None:
             return moment
-        return replace(moment, points=self.contacts.points(moment.q, moment.time))
+        return replace(moment, points=self.contacts.points_at(moment.q, moment.time))
 
     def presses(self, q: Positions) -> bool:
         """Return whether it acts at q."""
@@ -153,14 +171,20 @@ class SurfaceContact:
         after, before = self._acting(q), self._acting(base)
         if after is None and before is None:
             return 0.0
-        moved = self.contacts.points.moved(q - base)
-        rubbed = 0.0
+        is_small, rubbed = self._is_small(q, base), 0.0
+        moved = self.contacts.points.moved(q - base) if is_small or self.rubs else np.zeros((0, 3))
         if self.friction and after and before and after.points is not None and before.points is not None:
             rubbed = self.friction.change(after.points, before.points, moved)
-        if moved.size and np.abs(moved).max() < SMALL * self.contacts.law.distance:
+        if is_small:
             moments = [moment for moment in (before, after) if moment and moment.points is not None]
             return rubbed + sum(0.5 * float(np.vdot(self._pushes(moment), moved)) for moment in moments)
         return rubbed + self._energy(after) - self._energy(before)
+
+    def _is_small(self, q: Positions, base: Positions) -> bool:
+        """Return whether no point goes far from base to q, for a difference of energies to keep its digits."""
+        points, time = self.contacts.points_at, self.contacts.time
+        gone = np.abs(points(q, time) - points(base, time)).max(initial=0.0)
+        return bool(self.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
     def _energy(self, moment: ContactsAt | None) -> float:
         return energy_of(self._pushing(moment), moment.points) if moment and moment.points is not None else 0.0

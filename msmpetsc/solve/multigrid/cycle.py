@@ -14,8 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpstrf
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, to_host
 from msmpetsc.backend.kernel import kernel
@@ -26,6 +24,7 @@ from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.contact import CoarseContact, ContactSmoother
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import CoarseOperator, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
@@ -34,6 +33,7 @@ from msmpetsc.solve.petsc.events import FINE, count_flops
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
+POINTS = 200  # of the surface in contact, that join nodes of the finest level: the stiffest
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
 SAFETY = 1.1  # times it where no bound is known, as ten iterations of CG know it
 RAISED = 1e-8, 1e-5  # of themselves: coarse diagonals, where all bodies are held and where not
@@ -71,6 +71,8 @@ class Multigrid:
             raise
         self.coarse: list[CoarseOperator] = []  # until ``update``
         self.bounds = [0.0] * len(self.levels)
+        self.contact = CoarseContact(unknowns, [level.interpolation for level in self.levels], time_step**2)
+        self.owned.callback(self.contact.destroy)
         self.pc = PETSc.PC().create(unknowns.comm)
         self.owned.callback(self.pc.destroy)
 
@@ -95,18 +97,21 @@ class Multigrid:
             rows = 3 * np.arange(len(ijk))[:, None] + np.arange(3)
         return galerkin, levels
 
-    def update(self, q: Positions, contact: Rows, joined: SurfaceHessian | None = None) -> None:
+    def update(self, q: Positions, contact: Rows, surface: SurfaceHessian | None = None) -> None:
         """Build the hierarchy at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m].
 
-        joined : contact of the surface with itself that is to join nodes of the finest level
+        surface : contact of the surface with itself
         """
+        joined, others = surface.split(self.fine.compliance, POINTS) if surface else (None, None)
+        contact = contact + others.blocks if others else contact
         self.fine.update(q, contact, joined)
         self.operator.assemble()
-        self.sum.update(q, contact + joined.blocks if joined else contact)
+        self.sum.update(q, contact)
         self._raise_diagonal(self.sum.matrix)
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
             self._raise_diagonal(level.matrix)
+        coarsest = self.contact.added([level.matrix for level in self.levels], joined)
         is_new = self.pc.getType() is None
         if is_new and self.unknowns.memory is not device.CUDA:
             self.coarse = [CoarseOperator(level.matrix) for level in self.levels[:-1]]
@@ -116,6 +121,7 @@ class Multigrid:
             coarse.update()
         if is_new:
             self._create_cycle()
+        self.pc.getMGCoarseSolve().setOperators(coarsest, coarsest)
         self.bounds[0] = self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
             noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
@@ -124,11 +130,6 @@ class Multigrid:
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), LEAST * bound, bound)
         if is_new:
             self._read_options()
-
-    def join(self, joined: SurfaceHessian | None) -> None:
-        """Have another contact of the surface join nodes of the finest level; coarse ones keep that of ``update``."""
-        self.fine.join(joined)
-        self.operator.assemble()
 
     def _finest_bound(self) -> float:
         """Greatest eigenvalue of D^-1 H on the finest level, at most, or as some iterations of CG know it."""
@@ -261,6 +262,9 @@ class ProjectedHessian:
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
+        blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
+        elasticity.add_bound(lattice.nodes, blocks)
+        self.compliance = 1 / (unknowns.ballast / t2 + blocks[: lattice.owned, [0, 4, 8]].sum(axis=1) / 3)
         self.joined: SurfaceHessian | None = None
         self.smoother: ContactSmoother | None = None
 
@@ -273,10 +277,6 @@ class ProjectedHessian:
         unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
         self.elasticity.add_bound(q, blocks)
         invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
-        self.join(joined)
-
-    def join(self, joined: SurfaceHessian | None) -> None:
-        """Take another contact of the surface with itself."""
         self.joined = joined
         self.smoother = ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
 
@@ -312,55 +312,6 @@ class DiagonalBlocks:
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")
-
-
-class ContactSmoother:
-    """Smoother of the finest level where contact of the surface with itself joins nodes, C = t^2 W^T H_c W.
-
-    A pair that presses is stiff along one direction of some forty unknowns. Diagonal blocks cannot tell
-    that direction from the others, so that CG has it to find. This inverts D + C, D the block diagonal
-    without that contact, by Woodbury's formula on the points in contact,
-
-        (D + C)^-1 = D^-1 - D^-1 W^T B (I + B^T G B)^-1 B^T W D^-1,    t^2 H_c = B B^T,    G = W D^-1 W^T.
-
-    With B from Cholesky's factorisation, pivoted, a direction 1e9 times as stiff as D keeps seven digits.
-    Where H - C is no more than b D, H is no more than b (D + C) for b >= 1, so that Chebyshev's bound
-    stays. Coarse levels have the diagonal blocks of C.
-
-    inverse : D^-1 (m, 9) of the free nodes [1/kg]
-    """
-
-    def __init__(self, unknowns: Unknowns, surface: SurfaceHessian, t2: float, inverse: Array):
-        self.comm, self.inverse = unknowns.comm, inverse
-        self.at, weights = surface.carried
-        self.weights = weights[:, unknowns.free]
-        size = surface.points.shape[0]
-        compliance, scaled = np.zeros((size, size)), self.weights.copy()
-        for r in range(3):
-            for c in range(3):
-                scaled.data = self.weights.data * inverse[self.weights.indices, 3 * r + c]
-                compliance[np.ix_(3 * self.at + r, 3 * self.at + c)] = (self.weights @ scaled.T).toarray()
-        compliance = self.comm.allreduce(compliance)
-        self.root = root_of(t2 * surface.points.toarray())
-        self.factor = cho_factor(np.eye(self.root.shape[1]) + self.root.T @ compliance @ self.root)
-
-    def correct(self, y: Rows) -> None:
-        """Turn y = D^-1 x (3, m) into (D + C)^-1 x."""
-        moved = np.zeros((len(self.root) // 3, 3))
-        moved[self.at] = self.weights @ y.T
-        if self.comm.size > 1:
-            moved = self.comm.allreduce(moved)
-        forces = self.root @ cho_solve(self.factor, self.root.T @ moved.ravel())
-        back = self.weights.T @ forces.reshape(-1, 3)[self.at]
-        y -= np.einsum("mrc,mc->rm", self.inverse.reshape(-1, 3, 3), back)
-
-
-def root_of(matrix: Rows) -> Rows:
-    """Return B (n, r) with B B^T a positive semidefinite matrix (n, n) of rank r, by pivoted Cholesky."""
-    lower, pivots, rank, _ = dpstrf(matrix, lower=1)
-    root = np.zeros((len(matrix), rank))
-    root[pivots - 1] = np.tril(lower)[:, :rank]
-    return root
 
 
 @kernel

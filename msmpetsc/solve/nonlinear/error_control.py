@@ -29,6 +29,7 @@ LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabola there
 NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
+STAYS = 0.5  # of the bound before: F no longer falls though each correction was known
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
 NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 KINDS = {
@@ -100,7 +101,8 @@ class ErrorControl:
             if lowest > 0 and now.bound <= now.goal * lowest:
                 return replace(now, error=now.bound / lowest)
         found = self.estimated(iterate, now, now.goal)
-        if is_near or self.estimate.is_trusted:
+        stays = before.corrected and STAYS * before.bound < now.bound < FULL_STEP_ERROR  # rounding of stiff contact
+        if is_near or stays or self.estimate.is_trusted:
             return found
         return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here
 

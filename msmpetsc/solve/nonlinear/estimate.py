@@ -102,7 +102,7 @@ class ErrorEstimate:
 
     def linearise(self, q: Positions) -> None:
         """Take the Hessian at positions q (l, 3) [m]."""
-        self.preconditioner.in_use.prepare(q, self.functional.problem.contact)
+        self.preconditioner.prepare(q, self.functional.problem.contact)
         self.hessian.linearise(q, self.functional.problem.contact)
         self.operator.assemble()
 

@@ -36,7 +36,8 @@ class FirstGuess:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
         surface = self.functional.surface
         met = surface is not None and surface.presses(q)  # parts of it push each other
-        if met:  # a free flight cut short, deep in a barrier, is far from where contact holds: q_n is mostly nearer
+        if met:  # a free flight leads into what presses, and never was the best: q_n is mostly nearer
+            del guesses[1]
             guesses = [self._without_crossing(guess) for guess in guesses]
         values = [self.functional.value(self._held(guess), met) for guess in guesses]
         best = guesses[int(np.argmin(values))]

@@ -98,7 +98,7 @@ class Jacobian:
             self.hessian.linearise(q, contact, projected, secants)
         elif self.blocks:
             self.blocks.linearise(contact, q, False)
-        changed = self.preconditioner.in_use.prepare(q, contact)
+        changed = self.preconditioner.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()
 

@@ -34,8 +34,6 @@ LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
 USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
 WORTH = 10.0  # iterations that a new hierarchy takes the time of
 PATIENCE = 15.0  # iterations beyond its pace that a solve with an old one is given: one took 2,300 else
-MANY = 150  # iterations of a solve that contact is to blame for: from there on it joins nodes
-POINTS = 200  # in contact, that join nodes in the cycle: the stiffest
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
 
 
@@ -102,8 +100,6 @@ class LatticePreconditioner:
     pace     : iterations a digit of the first solve with it; None before that
     wasted   : iterations since then that were more than that
     is_stale : a new one is due
-    joins    : contact of the surface with itself joins nodes in the cycle; it is held to the ground by blocks otherwise
-    joining  : all of it that joins them
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -117,25 +113,15 @@ class LatticePreconditioner:
         self.pace: float | None = None
         self.wasted = 0.0
         self.is_stale, self.is_new, self.is_free = True, False, False
-        self.joins = False
-        self.joining: SurfaceHessian | None = None
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """Build a hierarchy at positions q (l, 3) [m] if a new one is due; whether it was."""
-        is_asked = self.is_stale or self.joins
-        surface = contact.surface.hessian(q, True) if is_asked and contact and contact.surface else None
-        joining = surface if self.joins else None
-        is_other = joining is not self.joining
-        self.joining, self.is_free, due = joining, self._is_free(q, contact), self.is_stale
-        self.is_new = due
-        if due or is_other:
-            joined, held = joining.split(POINTS) if joining else (None, surface)
-            if due:
-                blocks = self._blocks(q, contact)
-                self._build(q.copy(), blocks + held.blocks if held else blocks, joined)
-            else:
-                self.multigrid.join(joined)
-        return due or is_other
+        self.is_free, is_due = self._is_free(q, contact), self.is_stale
+        self.is_new = is_due
+        if is_due:
+            surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+            self._build(q.copy(), self._blocks(q, contact), surface)
+        return is_due
 
     def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Move bodies that nothing holds as wholes to where forces balance, from q, or unknowns x, where F is f."""
@@ -157,13 +143,12 @@ class LatticePreconditioner:
         digits = _digits(rtol)
         if self.pace is None:
             self.pace = its / digits
-        self.joins |= its > MANY
         self.wasted += max(its - self.pace * digits, 0.0)
         self.is_stale |= self.wasted > WORTH
 
-    def _build(self, q: Positions, contact: Rows, joined: SurfaceHessian | None) -> None:
+    def _build(self, q: Positions, contact: Rows, surface: SurfaceHessian | None) -> None:
         with HIERARCHY:
-            self.multigrid.update(q, contact, joined)
+            self.multigrid.update(q, contact, surface)
         self.pace = None
         if self.is_first:
             self.pace = USUAL_PACE
@@ -199,7 +184,6 @@ class LatticePreconditioner:
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""
         self.is_stale = self.is_first = True
-        self.joins = False
 
     def destroy(self) -> None:
         self.multigrid.destroy()
@@ -239,7 +223,7 @@ class StepPreconditioner:
         if self.is_chosen:
             self.multigrid = self.make_multigrid()
         elif self.chooses and expected > LONG:
-            self._choose(f"t^2 k / m = {self.ratio:.3g}: Jacobi's would take some {expected:.0f} iterations")
+            self._choose(f"t^2 k / m = {self.ratio:.3g}: Jacobi's would take some {expected:.0f} iterations a solve")
         else:
             self.of_matrix = self.make_of_matrix()
 
@@ -248,6 +232,12 @@ class StepPreconditioner:
         chosen = self.multigrid if self.is_chosen else self.of_matrix
         assert chosen is not None
         return chosen
+
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
+        """Take positions q (l, 3) [m]; whether that changed what is preconditioned with."""
+        if self.chooses and not self.is_chosen and contact and contact.surface and contact.surface.presses(q):
+            self._choose("the surface presses on itself")
+        return self.in_use.prepare(q, contact)
 
     @property
     def is_uniform(self) -> bool:
@@ -280,7 +270,7 @@ class StepPreconditioner:
     def _choose(self, reason: str) -> None:
         self.is_chosen = True
         if self.multigrid is None:  # else it was chosen before, and forgotten
-            log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
+            log.info("preconditioner: multigrid on the lattice (%s; -pc_type jacobi keeps to it)", reason)
             self.multigrid = self.make_multigrid()
 
     @property
@@ -298,7 +288,7 @@ class StepPreconditioner:
         if self.multigrid and self.is_chosen:
             self.multigrid.learn(its, rtol)
         elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / rtol):
-            self._choose(f"Jacobi's took {its} iterations")
+            self._choose(f"Jacobi's took {its} iterations a solve")
 
     def setFromOptions(self, _: PETSc.PC) -> None:
         if not self.is_chosen:

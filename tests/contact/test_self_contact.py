@@ -2,6 +2,7 @@
 themselves, what is refused."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import igl
 import numpy as np
@@ -15,6 +16,7 @@ from stopped_runs import assert_goes_on_exactly
 
 from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.pairs import NearPairs
+from msmpetsc.contact.surface.surface_friction import limits_of, slips_of
 from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
@@ -280,3 +282,22 @@ def test_a_block_holds_on_a_tilted_one(tmp_path):
     assert speed.mean() == pytest.approx(creep / 20, rel=0.3)  # steps 51 to 70 forget once
     assert abs(speed[:9].mean()) < 0.01 * creep
     assert max(frame.iterations for frame in frames) <= 8  # a step starts where the last one ended, not in mid-air
+
+
+def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
+    """Or its slip, which goes on from step to step, would be lost, or be that of the other way."""
+
+    def pair(ids: list[int], weights: list[float]) -> SimpleNamespace:
+        jacobian = np.concatenate([weight * np.eye(3) for weight in weights], axis=1)
+        return SimpleNamespace(
+            vertex_ids=lambda edges, faces: ids, num_vertices=lambda: 4, edge0_id=0, mu_s=0.5, weight=1.0,
+            tangent_basis=np.eye(3)[:, :2], relative_velocity_jacobian=lambda: jacobian, normal_force_magnitude=2.0,
+        )  # fmt: skip
+
+    mesh = SimpleNamespace(edges=None, faces=None, num_vertices=6)
+    found = [pair([1, 5, 2, 4], [0.3, 0.7, -0.4, -0.6])], [pair([2, 4, 1, 5], [0.4, 0.6, -0.3, -0.7])]
+    (pairs, limit), (other, _) = (limits_of(each, mesh) for each in found)
+    assert pairs.tolist() == other.tolist() == [[1, 5, 2, 4]] and limit == [1.0]
+    moved = np.random.default_rng(1).normal(size=18)
+    one, two = (slips_of(each, mesh) @ moved for each in found)
+    assert one.any() and np.array_equal(one, two)

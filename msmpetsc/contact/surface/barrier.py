@@ -157,8 +157,7 @@ class Barrier:
         if not tangential:
             return None
         pairs, limit = limits_of(tangential, self.mesh)
-        slips = slips_of(tangential, pairs, len(points))
-        return SurfaceFriction(limit, stick, np.zeros((1, 3)), start, pairs, slips)
+        return SurfaceFriction(limit, stick, np.zeros((1, 3)), start, pairs, slips_of(tangential, self.mesh))
 
     def friction_limits(self, contacts: ContactSets, points: Positions) -> tuple[Indices, Floats]:
         """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N] at points (p, 3) [m]."""

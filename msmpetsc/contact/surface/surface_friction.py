@@ -24,7 +24,7 @@ class SurfaceFriction(Friction):
     """Friction of pairs of a surface's parts.
 
     start : (p, 3) where points are if nothing slips [m]
-    pairs : (a, 4) points of each, -1 for none
+    pairs : (a, 4) points of each, -1 for none (``ordered``)
     slips : (3a, 3p) of moves of all points the slip of each pair
     """
 
@@ -62,20 +62,39 @@ class SurfaceFriction(Friction):
         return csr_array(self.slips.T @ (middle @ self.slips))
 
 
-def slips_of(tangential: "Tangential", pairs: Indices, points: int) -> csr_array:
-    """Return the slips (3a, 3p) of pairs (a, 4), each along the plane of its contact, of so many points."""
-    rows, columns, values = [], [], []
-    for number, pair in enumerate(tangential):
+def slips_of(tangential: "Tangential", mesh: "ipctk.CollisionMesh") -> csr_array:
+    """Return the slips (3a, 3p) of pairs, each along the plane of its contact."""
+    rows, columns, values, named = [], [], [], _named(tangential, mesh)
+    for number, (pair, turned) in enumerate(zip(tangential, _turned(tangential, named), strict=True)):
         along = pair.tangent_basis @ (pair.tangent_basis.T @ pair.relative_velocity_jacobian())
-        own = pairs[number, : pair.num_vertices()]
+        own = named[number, : pair.num_vertices()]
         rows.append(np.repeat(3 * number + np.arange(3), along.shape[1]))
         columns.append(np.tile((3 * own[:, None] + np.arange(3)).ravel(), 3))
-        values.append(along.ravel())
+        values.append(-along.ravel() if turned else along.ravel())
     at = np.concatenate(rows), np.concatenate(columns)
-    return csr_array(coo_array((np.concatenate(values), at), shape=(3 * len(pairs), 3 * points)))
+    return csr_array(coo_array((np.concatenate(values), at), shape=(3 * len(named), 3 * mesh.num_vertices)))
 
 
 def limits_of(tangential: "Tangential", mesh: "ipctk.CollisionMesh") -> tuple[Indices, Floats]:
-    """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N]."""
-    pairs = np.array([pair.vertex_ids(mesh.edges, mesh.faces) for pair in tangential], int).reshape(-1, 4)
+    """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N].
+
+    Of two points or edges that one stands first whose first number is less, for ipctk has them as they were found.
+    """
+    named = _named(tangential, mesh)
+    order = np.where((named[:, 3] < 0)[:, None], [1, 0, 2, 3], [2, 3, 0, 1])
+    turned = np.take_along_axis(named, order, 1)
+    pairs = np.where(_turned(tangential, named)[:, None], turned, named)
     return pairs, np.array([pair.mu_s * pair.weight * pair.normal_force_magnitude for pair in tangential])
+
+
+def _named(tangential: "Tangential", mesh: "ipctk.CollisionMesh") -> Indices:
+    """Return the points (a, 4) of pairs, -1 for none, as ipctk has them."""
+    return np.array([pair.vertex_ids(mesh.edges, mesh.faces) for pair in tangential], int).reshape(-1, 4)
+
+
+def _turned(tangential: "Tangential", named: Indices) -> Mask:
+    """Return which pairs (a,) of two points or edges have the greater number first: what slips is then the other."""
+    of_edges = np.array([hasattr(pair, "edge0_id") for pair in tangential], bool)
+    second = np.where(of_edges, named[:, 2], named[:, 1])
+    turned: Mask = (of_edges | (named[:, 2] < 0)) & (named[:, 0] > second)
+    return turned

@@ -57,7 +57,7 @@ def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
     if isinstance(value, cupy.ndarray):
         return described(value.data.ptr, value.shape, value.strides, value.dtype.str)
     number = value.item() if isinstance(value, np.generic) else value
-    return SCALARS[type(number)], (number,)  # type: ignore[index, return-value]  # no array
+    return SCALARS[type(number)], (number,)  # type: ignore[return-value]  # no array
 
 
 @lru_cache(maxsize=KEPT)
@@ -80,7 +80,7 @@ def type_of(kind: Kind) -> object:
     if kind in TYPES:
         return TYPES[kind]
     dtype, dimensions, layout = kind.split()
-    return numba.types.Array(numba.from_dtype(np.dtype(dtype)), int(dimensions), layout)  # type: ignore[call-overload]
+    return numba.types.Array(numba.from_dtype(np.dtype(dtype)), int(dimensions), layout)
 
 
 def format_of(kind: Kind) -> str:

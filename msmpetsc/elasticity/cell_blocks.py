@@ -3,6 +3,7 @@
 Numbers of a block's cells stand beside each other: number i of the cell in a lane is row[lane + LANES * i].
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -97,6 +98,16 @@ def _around(nodes: Indices, is_cell: Indices, owned: int) -> Indices:
     """Return ``Blocks.around``; is_cell (b, LANES) is false of what fills up the last blocks."""
     corners = np.where(is_cell[:, None], nodes.transpose(0, 2, 1), owned).ravel().astype(np.int64)
     return rows_of(corners, owned)
+
+
+def add_corners(write: Callable[[Rows], None], around: Indices, corners: int, rows: Rows) -> None:
+    """Let a loop write so many rows, one for each corner of cells, and add to each owned row of ``rows`` (l, k) its own.
+
+    around : of ``rows_of``
+    """
+    own = np.zeros((corners + 1, rows.shape[1]), like=rows)  # the last is of no corner
+    write(own)
+    rows[: around.shape[1]] += own[around].sum(axis=0)
 
 
 def rows_of(nodes: Indices, owned: int) -> Indices:

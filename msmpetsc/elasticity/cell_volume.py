@@ -20,7 +20,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.cell_blocks import rows_of
+from msmpetsc.elasticity.cell_blocks import add_corners, rows_of
 from msmpetsc.elasticity.cell_strain import Six, strain
 from msmpetsc.elasticity.springs import Product, Vector, between, dot
 from msmpetsc.lattice.lattice import Lattice
@@ -328,9 +328,7 @@ class Cells:
         if self.around is None:
             loop(len(at), q, *law, at, *given, rows)
         else:
-            corners = np.zeros((8 * len(self.law.cells) + 1, rows.shape[1]), like=rows)
-            loop(len(at), q, *law, at, *given, corners)
-            rows[: self.around.shape[1]] += corners[self.around].sum(axis=0)
+            add_corners(partial(loop, len(at), q, *law, at, *given), self.around, 8 * len(self.law.cells), rows)
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] to the owned rows of ``gradient`` (l, 3)."""

@@ -12,9 +12,10 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, greatest, on_host, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity import cell_lanes, cell_threads
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, blocks_of, one_by_one
+from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, add_corners, blocks_of, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import cell_energies, constants_at, gradient_at, linearise, state_at
+from msmpetsc.elasticity.cell_volume import add_square
 from msmpetsc.elasticity.neo_hookean import along_cofactors, corner_stiffness, kept_cofactors, lost
 from msmpetsc.lattice.lattice import Lattice
 
@@ -46,35 +47,27 @@ def _add_concavity(first: int, count: int, step: int, concavity: Rows, cells: Ce
 @kernel
 def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: CellRows) -> None:
     for i in range(first, count, step):
-        k, n, curvature = (
-            constants_at(cells, i),
-            kept_cofactors(cells.state, state_at(i)),
-            cells.state[state_at(i) + 80],
-        )
+        k, s = constants_at(cells, i), state_at(i)
+        n, curvature = kept_cofactors(cells.state, s), cells.state[s + 80]
         for a in range(8):
             g, block = corner_strain(a, form_of(cells.constants, k)), diagonal[_row_of(cells, i, a)]
-            own, e = corner_stiffness(g, cells.constants, k), along_cofactors(n, g)
-            for r in range(3):
-                block[4 * r] += own
-            block[0] += curvature * e[0] * e[0]
-            block[1] += curvature * e[0] * e[1]
-            block[2] += curvature * e[0] * e[2]
-            block[3] += curvature * e[0] * e[1]
-            block[4] += curvature * e[1] * e[1]
-            block[5] += curvature * e[1] * e[2]
-            block[6] += curvature * e[0] * e[2]
-            block[7] += curvature * e[1] * e[2]
-            block[8] += curvature * e[2] * e[2]
+            own = corner_stiffness(g, cells.constants, k)
+            block[0] += own
+            block[4] += own
+            block[8] += own
+            add_square(block, curvature, along_cofactors(n, g))
 
 
 def _add_at_corners(kernel: Callable[..., None], rows: Rows, cells: CellRows, around: Indices, *given: Array) -> None:
     """Let cells add to the rows (l, k) of their nodes; on a GPU to rows of their own, which each node then sums."""
+
+    def write(to: Rows) -> None:
+        kernel(len(cells.nodes), to, cells, *given)
+
     if cells.by_node:
-        kernel(len(cells.nodes), rows, cells, *given)
+        write(rows)
     else:
-        corners = np.zeros((8 * len(cells.nodes) + 1, rows.shape[1]), like=rows)
-        kernel(len(cells.nodes), corners, cells, *given)
-        rows[: around.shape[1]] += corners[around].sum(axis=0)
+        add_corners(write, around, 8 * len(cells.nodes), rows)
 
 
 def _loops(array: Array) -> ModuleType:

@@ -181,9 +181,8 @@ class Environment:
         end : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
         """
         owned, surface, before, (about, last) = self.lattice.owned, None, self._before(q), way
-        states, held = [], before.states if before else []
+        states, held, ended = [], before.states if before else [], None if end is None else end[:owned]
         for p, side in self._pressing(time, sides):
-            ended = None if end is None else end[:owned]
             states.append(p.during(q[:owned], time, time_step, side[:owned], last, ended).after(held, q[:owned]))
         if self.self_contact:
             self._contacts = self.self_contact.step(q, about, max(time - time_step, 0.0), time)

@@ -175,12 +175,13 @@ class Contact:
 
     def stopped(self, q: Positions, base: Positions) -> Positions | None:
         """Return q with the nodes that come into obstacles on the way from base stopped there; None if none does."""
-        stopped, count = q.copy(), 0
-        for state in self.states:
-            rows, way = state.stopped(q[: self.owned], base[: self.owned])
+        found = [state.stopped(q[: self.owned], base[: self.owned]) for state in self.states]
+        if not any(len(rows) for rows, _ in found):
+            return None
+        stopped = q.copy()
+        for rows, way in found:
             stopped[rows] += way
-            count += len(rows)
-        return stopped if count else None
+        return stopped
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     import ipctk
 
 REMEMBERED = 3  # positions whose contacts are kept: where a line search starts, and where it tries
-FARTHEST = (
-    0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
-)
+FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are 4 times the pairs
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 2.0  # times the move that is expected
 TINY = np.finfo(float).tiny

@@ -67,7 +67,7 @@ class ContactFaces:
         self.solves = 0
         self.is_settled = False
         self.contact: Contact | None = None  # of the problem solved last
-        self.end: Positions | None = None  # of a solve whose friction went by too small a push
+        self.end: Positions | None = None  # of a solve whose friction went by a push far from the one there
         self.sides = self._crossed(self.y)
 
     def _crossed(self, end: Positions) -> Indices:

@@ -19,15 +19,13 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 class ContactSmoother:
     """Smoother of the finest level where contact of the surface with itself joins nodes, C = t^2 W^T H_c W.
 
-    A pair that presses is stiff along one direction of some forty unknowns. Diagonal blocks cannot tell
-    that direction from the others, so that CG has it to find. This inverts D + C, D the block diagonal
-    without that contact, by Woodbury's formula on the points in contact,
+    It inverts D + C, D the block diagonal without that contact, by Woodbury's formula on the points in contact,
 
         (D + C)^-1 = D^-1 - D^-1 W^T B (I + B^T G B)^-1 B^T W D^-1,    t^2 H_c = B B^T,    G = W D^-1 W^T.
 
     With B from Cholesky's factorisation, pivoted, a direction 1e9 times as stiff as D keeps seven digits.
     Where H - C is no more than b D, H is no more than b (D + C) for b >= 1, so that Chebyshev's bound
-    stays. Coarse levels have the diagonal blocks of C.
+    stays.
 
     inverse : D^-1 (m, 9) of the free nodes [1/kg]
     nodes   : (c,) of these that carry the points; ``weights`` (k, c) by which, of k points
@@ -72,7 +70,7 @@ def root_of(matrix: Rows) -> Rows:
 class CoarseContact:
     """Contact C = t^2 (W P)^T H_c (W P) on coarse levels. All methods are collective.
 
-    The coarsest matrix has all of it, those between its diagonal blocks, which keep their nonzeros.
+    The coarsest matrix has all of it, the levels between its diagonal blocks, so that they keep their nonzeros.
 
     interpolations : P to each next finer level, of vectors
     """

@@ -99,7 +99,7 @@ class LatticePreconditioner:
     is_first : there is none yet
     pace     : iterations a digit of the first solve with it; None before that
     wasted   : iterations since then that were more than that
-    is_stale : a new one is due
+    is_stale : a new one is due; ``is_new``: the present one was built where the linear solve to come was linearised
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):

@@ -345,38 +345,39 @@ class Stepper:
     def _change_way(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Change the way from x to x - y, which a line search is to try, where it leads into obstacles or the surface
         meets itself on it; whether it was."""
+        self.is_detour = False
+        if self.functional.problem.contact is None:
+            return False
         end = x.copy()
         end.axpy(-1.0, y)
         with LOCAL:
-            stops = self.preset.true_hessian and self._stop_at_obstacles(x, end)
-            if stops:
+            before, after = self.functional.positions(x), self.functional.positions(end)
+            stopped = self._stop_at_obstacles(before, after, end) if self.preset.true_hessian else None
+            if stopped is not None:
                 x.copy(y)
                 y.axpy(-1.0, end)
-            share = self.functional.free_share(self.functional.positions(x), self.functional.positions(end))
+            share = self.functional.free_share(before, after if stopped is None else stopped)
         end.destroy()
         if share < 1.0:
             y.scale(share)
-        self.is_detour = stops or share < 1.0
+        self.is_detour = stopped is not None or share < 1.0
         return self.is_detour
 
-    def _stop_at_obstacles(self, x: PETSc.Vec, end: PETSc.Vec) -> bool:
-        """Let nodes that come into an obstacle on the way from x to ``end`` end at its surface, if g is less there.
+    def _stop_at_obstacles(self, before: Positions, after: Positions, end: PETSc.Vec) -> Positions | None:
+        """Return where nodes that come into an obstacle on a way (l, 3) end at its surface, and write it into ``end``;
+        None where g is no less there.
 
         H at x knows nothing of obstacles that are not touched yet: nodes run deep into them, and a line search that
         shortens the whole way for it would let them come in one by one.
         """
         functional, contact = self.functional, self.functional.problem.contact
-        before, after = functional.positions(x), functional.positions(end)
-        stopped = contact.stopped(after, before) if contact and contact.states else None
+        stopped = contact.stopped(after, before) if contact else None
         if not self.comm.allreduce(stopped is not None, MPI.LOR):
-            return False
-        full, _ = functional.change(after, before)
+            return None
         self.unknowns.from_nodes(after if stopped is None else stopped, end)
-        change, _ = functional.change(functional.positions(end), before)
-        if change < min(full, 0.0):
-            return True
-        self.unknowns.from_nodes(after, end)
-        return False
+        free = functional.positions(end)  # nodes that are led stay where they are led to
+        (full, _), (change, _) = functional.change(after, before), functional.change(free, before)
+        return free if change < min(full, 0.0) else None
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Take the Jacobian at x, and the start of the linear solve (SNES calls it before each)."""

@@ -101,7 +101,7 @@ def _around(nodes: Indices, is_cell: Indices, owned: int) -> Indices:
 
 
 def add_corners(write: Callable[[Rows], None], around: Indices, corners: int, rows: Rows) -> None:
-    """Let a loop write so many rows, one for each corner of cells, and add to each owned row of ``rows`` (l, k) its own.
+    """Let a loop write so many rows, one a corner of cells, and add those of each owned node to its row (l, k).
 
     around : of ``rows_of``
     """

@@ -1,5 +1,6 @@
 """What the studies of this folder share: runs of scenes in processes of their own, repeats, tables in Markdown."""
 
+import atexit
 import datetime
 import json
 import shlex
@@ -24,6 +25,8 @@ from msmpetsc.study.process import Ended, Processes
 
 SCENES, OUT = ROOT / "scenes", ROOT / "out"
 DAY = 86_400.0  # [s]
+PROCESSES = Processes()  # of all that a script runs
+atexit.register(PROCESSES.close)
 T = TypeVar("T")
 Row = Mapping[str, object]  # of a table: cells by column
 Rows = Iterator[Row]
@@ -88,7 +91,7 @@ def file_of(scene: str | Path) -> Path:
 def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:
     """Run Python with these words to its end, what it says into ``log``."""
     launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []  # study.cases' starts PETSc where it is imported
-    return Processes().run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
+    return PROCESSES.run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
 
 
 def box(path: Path, sides: Sequence[float] | np.ndarray) -> str:

@@ -28,6 +28,7 @@ from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import Solver
+from msmpetsc.solve.instrumentation import event_times
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import find_preset, shown_options
@@ -39,13 +40,15 @@ from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 class RunPlan:
     """What a run does, once its request is understood.
 
-    began      : count of perf_counter when that began [s]
+    began  : count of perf_counter when that began [s]
+    logged : seconds in events of the process at that time; none where they are not measured
     """
 
     request: RunRequest
     scene: Scene
     resumed: Resumed | None
     began: float
+    logged: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -74,14 +77,15 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     """Read the scene. Raises InputError for what can be refused before a model is made (collective)."""
     refuse_early(comm)
     choose(comm, request.device)
-    began = perf_counter()
+    began, logged = perf_counter(), {}
     if request.measure:
         PETSc.Log.begin()
+        logged = event_times()
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(scene, request.true_error)
     on_root(comm, lambda: refuse_unwritable(request.measured))
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
-    return RunPlan(request, scene, resumed, began)
+    return RunPlan(request, scene, resumed, began, logged)
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
@@ -129,7 +133,7 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
     """
     request = plan.request
     if request.measured:
-        ended.cost.write(request.measured, request.command, ended.failure)
+        ended.cost.write(request.measured, request.command, plan.logged, ended.failure)
     left = write_companions(comm, request, whole=not ended.signal and ended.failure is None)
     on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, ended.cost.setup, left))
     ended.cost.log_hardest()

@@ -143,12 +143,15 @@ class Cost:
                 hardest, max(working), ratio,
             )  # fmt: skip
 
-    def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
-        """Leave it all in a file (collective). Raises InputError where that cannot be written."""
+    def write(self, path: Path, command: str, before: dict[str, float], failure: StepFailed | None = None) -> None:
+        """Leave it all in a file (collective). Raises InputError where that cannot be written.
+
+        before : seconds in events of the process when the run began
+        """
         comm, simulation = self.comm, self.simulation
         device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
-        time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
+        time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm, before)
         time["setup"] -= min(time["factor"], time["setup"])
         record = {
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,

@@ -78,6 +78,11 @@ def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
     return np.array([distance, reference.functional.change(q, exact)[0]])
 
 
-def times(comm: MPI.Comm) -> dict[str, float]:
-    """Seconds in events of the run, those of its references left out, the greatest of all ranks (collective)."""
-    return {name: comm.allreduce(sum(map(seconds, events)), MPI.MAX) for name, events in EVENTS.items()}
+def event_times() -> dict[str, float]:
+    """Return the seconds of this rank in events of all runs of the process so far, those of references left out."""
+    return {name: sum(map(seconds, events)) for name, events in EVENTS.items()}
+
+
+def times(comm: MPI.Comm, before: dict[str, float]) -> dict[str, float]:
+    """Return the seconds in events since there were so many ``before``, the greatest of all ranks (collective)."""
+    return {name: comm.allreduce(now - before[name], MPI.MAX) for name, now in event_times().items()}

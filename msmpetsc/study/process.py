@@ -48,6 +48,7 @@ class Processes:
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes] | Forked] = set()
+        self._idle: list[Forked] = []  # that wait for another command
         self.stopped = False
         self._lock = Lock()
 
@@ -66,17 +67,18 @@ class Processes:
         except subprocess.TimeoutExpired:
             reason = too_long(timeout)
         finally:
-            end(process)  # what it may have left running, too
-            with self._lock:
-                self._running.discard(process)
+            self._put_away(process, status)
         return Ended(status, reason)
 
     def close(self) -> None:
         """End all running processes."""
         with self._lock:
-            self.stopped, running = True, list(self._running)
+            self.stopped, running, idle = True, list(self._running), self._idle
+            self._idle = []
         for process in running:
             end(process)
+        for process in idle:
+            process.close()
 
     def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen[bytes] | Forked | None:
         variables = environment(alone=command[0] != "mpiexec")
@@ -85,13 +87,24 @@ class Processes:
                 return None
             process: subprocess.Popen[bytes] | Forked
             if warm:
-                process = Forked(command[3:], log, variables)
+                process = self._idle.pop() if self._idle else Forked(variables)
+                process.begin(command[3:], log)
             else:
                 process = subprocess.Popen(
                     command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, env=variables
                 )
             self._running.add(process)
             return process
+
+    def _put_away(self, process: subprocess.Popen[bytes] | Forked, status: int | None) -> None:
+        """Keep a process whose command went well for another one; end any other, with what it may have left running."""
+        serves = isinstance(process, Forked) and status == 0 and process.poll() is None and not self.stopped
+        if not serves:
+            end(process)
+        with self._lock:
+            self._running.discard(process)
+            if isinstance(process, Forked) and serves:
+                self._idle.append(process)
 
 
 def environment(alone: bool = False) -> dict[str, str]:

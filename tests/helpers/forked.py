@@ -25,12 +25,14 @@ def run_forked(arguments: Sequence[str], environment: Mapping[str, str], timeout
     """``msmpetsc`` with these arguments, as subprocess.run gives it. Raises subprocess.TimeoutExpired."""
     with tempfile.TemporaryDirectory() as folder:
         out, error = Path(folder, "out"), Path(folder, "error")
-        child = Forked(arguments, out, environment, error)
+        child = Forked(environment)
+        child.begin(arguments, out, error, last=True)
         try:
             status = child.wait(timeout)
         except subprocess.TimeoutExpired:
             os.killpg(child.pid, signal.SIGKILL)  # its session: what it started, too
             raise
+        child.close()
         return subprocess.CompletedProcess(list(arguments), status, out.read_text(), error.read_text())
 
 

@@ -25,13 +25,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 def is_killed(ranks: int, arguments: list[str], wait: float, log: Path) -> bool:
     """Kill a run, or one of its ranks, after so many seconds; of two ranks after its first frame of this start."""
     if ranks == 1:
-        child = Forked(arguments, log, ENVIRONMENT | ALONE)
+        child = Forked(ENVIRONMENT | ALONE)
+        child.begin(arguments, log, last=True)
         try:
             assert child.wait(wait) == 0, log.read_text()
         except subprocess.TimeoutExpired:
             child.kill()
             child.process.join()
-        return child.poll() != 0
+        return child.poll() is not None
     command = ["mpiexec", "--oversubscribe", "-n", str(ranks), sys.executable, "-m", "msmpetsc", *arguments]
     with subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as process:
         next((line for line in process.stderr if line.startswith("frame ")), None)

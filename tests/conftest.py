@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from forked import run_forked, run_ranks
 
-from msmpetsc.study.process import ALONE
+from msmpetsc.app.ranks import ALONE
 
 ROOT = Path(__file__).parent.parent
 WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec

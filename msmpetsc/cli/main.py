@@ -16,24 +16,18 @@ import traceback
 from argparse import RawDescriptionHelpFormatter
 from importlib import import_module
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import Any, NoReturn
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES
 from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
+from msmpetsc.app.ranks import world
 from msmpetsc.cli.command_table import COMMANDS, SAID, Shown
 from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean, printable
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
 
 DRAWING = ("render", "export", "compare")  # which the extra "render" is enough for
 OUR_SHORT = ("-o", "-h")
 TAKE_PETSC_OPTIONS = ("run",)
-LAUNCHED = {  # variables that Open MPI, MPICH, PMIx, Slurm, Flux and the launchers of Cray and IBM set for each rank
-    "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID", "FLUX_TASK_RANK", "ALPS_APP_PE", "PALS_RANKID",
-    "JSM_NAMESPACE_RANK", "MPI_LOCALRANKID", "MV2_COMM_WORLD_RANK",
-}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -215,32 +209,6 @@ def option_names(command: str) -> list[str]:
     known = COMMANDS[command]
     given = (*known.arguments, *known.exclusive, *SAID)
     return ["--help", *(name for names, _ in given for name in names if name.startswith("-"))]
-
-
-# ---- ranks
-
-
-class Alone:
-    """A stand-in for the communicator of a process that no launcher started."""
-
-    rank, size = 0, 1
-
-
-def world(started: bool = False) -> "MPI.Comm":
-    """Return all ranks.
-
-    started : whether MPI must be started, which takes 0.3 s; or else only where a launcher started the process, and
-        that MPI can be started
-    """
-    if not (started or LAUNCHED & os.environ.keys()):
-        return cast("MPI.Comm", Alone())
-    try:
-        from mpi4py import MPI
-    except (ImportError, RuntimeError):  # missing or broken, in a shell of a batch system, say: `run` says so
-        if started:
-            raise
-        return cast("MPI.Comm", Alone())
-    return MPI.COMM_WORLD
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from threading import Lock
 
 import psutil
 
+from msmpetsc.app.ranks import ALONE
 from msmpetsc.study.forkserver import COLD, Forked
 
 GRACE = 3.0  # [s] between the request to end and the end
@@ -19,11 +20,6 @@ VARIABLES_OF_MPI = (  # of a launcher around us: not for our children
     "OMPI_MCA_orte_hnp_uri",
     "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
 )  # fmt: skip
-# A process alone needs neither Open MPI's daemon nor its search for a network, a third of a second at its start; nor
-# folders that all share: one that ends may take them from under one that begins, which then fails (1 of 300).
-ALONE = {
-    "OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_orte_create_session_dirs": "0",
-}  # fmt: skip
 # more ranks than cores are the user's to ask for: as Open MPI 4 calls it, and as 5 does
 OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
 

@@ -14,10 +14,10 @@ import pytest
 from conftest import ENVIRONMENT, run
 from stopped_runs import assert_same, hanging, ranks_of
 
+from msmpetsc.app.ranks import ALONE
 from msmpetsc.results.reader import finished
 from msmpetsc.solve.simulate import REMEMBERED
 from msmpetsc.study.forkserver import Forked
-from msmpetsc.study.process import ALONE
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

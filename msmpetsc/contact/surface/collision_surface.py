@@ -24,6 +24,7 @@ from msmpetsc.scene.reading import Scene
 
 NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
 MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
+LONG = 2.0  # cells: an edge of more is split
 FEWEST = 20  # triangles of a body
 HASTE = 4  # of the decimation: with its usual 7 bunny and lung were twice and four times as far off
 PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (lattice.material)
@@ -41,7 +42,9 @@ def collision_surface(
     if table is None:
         return None
     whole = [body.surface for body in bodies if body.surface]
-    surfaces, *lengths = on_root(comm, lambda: _prepared(whole, table, scene.self_contact is not None)) or ([],)
+    meets_itself = scene.self_contact is not None
+    prepared = on_root(comm, lambda: _prepared(whole, table, meets_itself, lattice.cell_size))
+    surfaces, *lengths = prepared or ([],)
     off, edge = comm.bcast(lengths)
     met = obstacle_surfaces(scene, obstacles, edge)
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
@@ -57,14 +60,17 @@ def collision_surface(
     law = BarrierLaw(distance, float(distance**2 * layer), table.friction, stick)
     carried = SurfacePoints(comm, lattice, embedding, met)
     joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))
-    surface = CollisionSurface(joint, carried, law, scene.self_contact is not None)
+    surface = CollisionSurface(joint, carried, law, meets_itself)
     on_root(comm, lambda: _refuse_touching(surface))
     return surface
 
 
-def _prepared(bodies: list[Surface], table: SelfContactTable, meets_itself: bool) -> tuple[list[Surface], float, float]:
-    """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without those
-    that cut others, the median distance [m] of their own points from them, and their edges' mean length [m].
+def _prepared(
+    bodies: list[Surface], table: SelfContactTable, meets_itself: bool, cell_size: float
+) -> tuple[list[Surface], float, float]:
+    """Return the bodies' surfaces, of about as many triangles together as asked for, or as fine as the cells if None,
+    without those that cut others, the median distance [m] of their own points from them, and their edges' mean
+    length [m].
 
     Raises InputError where too many do.
     """
@@ -73,6 +79,8 @@ def _prepared(bodies: list[Surface], table: SelfContactTable, meets_itself: bool
         share = table.surface / sum(len(body.triangles) for body in bodies)
         coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
+    else:
+        bodies = [_as_fine_as(body, max(cell_size, 2 * (table.distance or 0.0))) for body in bodies]
     if meets_itself:
         bodies = _without_cut(bodies)
     ends = np.concatenate([b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies])
@@ -134,6 +142,30 @@ def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> floa
             sum(len(coarse.triangles) for coarse in coarser), off.max(), np.median(off),
         )  # fmt: skip
     return float(np.median(off))
+
+
+def _as_fine_as(surface: Surface, length: float) -> Surface:
+    """Return the surface with triangles about so long [m] at the most.
+
+    Contact is known where the surface has points: two cubes of long triangles would touch at their corners, and what
+    bulges between would pass.
+    """
+    corners = surface.points[surface.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    if longest <= LONG * length:
+        return surface
+    import manifold3d  # of the extra "contact"
+
+    solid = manifold3d.Manifold(manifold3d.Mesh64(surface.points, np.ascontiguousarray(surface.triangles, np.uint64)))
+    if solid.status() != manifold3d.Error.NoError:
+        log.warning(
+            "self_contact: triangles of %.2g m in cells of %.2g m, of a surface that is not closed: what bulges "
+            'between their points may cross; mesh.prepare = ["repair"] mends the mesh',
+            longest, length,
+        )  # fmt: skip
+        return surface
+    fine = solid.refine_to_length(length).to_mesh64()
+    return Surface(fine.vert_properties[:, :3].copy(), fine.tri_verts.astype(np.int64))
 
 
 def _coarser(surface: Surface, triangles: int) -> Surface:

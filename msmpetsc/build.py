@@ -15,8 +15,7 @@ from msmpetsc.constraints.holders import Holders, clamped
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK, smallest
-from msmpetsc.contact.obstacles.from_scene import build_obstacles
-from msmpetsc.contact.obstacles.moving_solid import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle, build_obstacles
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
 from msmpetsc.contact.surface.collision_surface import collision_surface
@@ -26,13 +25,12 @@ from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import encode_morton
-from msmpetsc.geometry.nearest import nearest_in_bodies
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice, topology_of
-from msmpetsc.lattice.region import Finder, cell_materials
+from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
 from msmpetsc.scene.bodies import OfBody, held_by
 from msmpetsc.scene.motion import ForceTable, Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable

@@ -17,9 +17,8 @@ from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
-from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
-from msmpetsc.geometry.touched_cells import touched_cells
+from msmpetsc.geometry.valid_cells import Slab, cells_of_gaps, enclosed_gaps, touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from

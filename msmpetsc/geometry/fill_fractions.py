@@ -25,7 +25,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Rows
 from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
 from msmpetsc.geometry.surface import Surface, is_inside
-from msmpetsc.geometry.touched_cells import clip_between, extent, grown
+from msmpetsc.geometry.valid_cells import clip_between, extent, grown
 
 SAMPLES = 6  # a side of a cell of an open surface: a plane through a cell is seen to 0.6% of the cell, rms
 OUTSIDE = 0.5  # a winding number below this

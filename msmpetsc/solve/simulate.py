@@ -21,18 +21,17 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.lattice.probe import ProbePoints
+from msmpetsc.lattice.region import ProbePoints
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, TrueErrors
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, Rest, TrueErrors
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.monitors import Monitors, Rest
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS

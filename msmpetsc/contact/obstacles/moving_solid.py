@@ -10,7 +10,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, grea
 from msmpetsc.comm import log, on_root, together
 from msmpetsc.constraints.loads import Motion, Timed
 from msmpetsc.contact.obstacles.distance import FunctionSolid
-from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Send, Solid, no_sides
+from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Planes, Send, Solid, no_sides
 from msmpetsc.elasticity.locate import node_of_greatest
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import OBSTACLES
@@ -134,7 +134,7 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path) -> Soli
         return Faces.of_box(*np.array(table.box))
     if table.center is not None:
         return BallSolid(np.array(table.center), table.radius or 0.0)
-    return Faces(np.array([table.point]), np.array([table.normal]))
+    return Faces(Planes(np.array([table.point]), np.array([table.normal])))
 
 
 def describe_overlap(

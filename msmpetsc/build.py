@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.coverage import Regions, taken
 from msmpetsc.constraints.holders import Holders, clamped
@@ -170,7 +170,9 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
-    _check_that_something_moves(comm, lattice, fixed, anchors)
+    if comm.allreduce(int((~fixed[: lattice.owned]).sum())) == 0:
+        what = "pin or anchor" if anchors else "pin"
+        raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -302,12 +304,6 @@ def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders
         anchors.append(Anchor(where, Motion.through(anchor.table.path, center), anchor.table.stop))
         taken = taken | where
     return anchors
-
-
-def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, anchors: list[Anchor]) -> None:
-    if comm.allreduce(int((~fixed[: lattice.owned]).sum())) == 0:
-        what = "pin or anchor" if anchors else "pin"
-        raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
 
 
 def _loads(

@@ -66,14 +66,14 @@ class Chunk:
 def write_glb(moments: Moments, path: Path) -> None:
     """Write frames as glTF. Raises InputError for more bytes than the format allows."""
     first, *others = moments.frames
-    base = moments.points(first).astype(np.float32)
+    base = moments.run.surface_at(first).astype(np.float32)
     upright = normals(base, moments.cells)
     chunk = Chunk()
     indices = chunk.add(moments.cells.astype("<u4").ravel(), TRIANGLES)
     shape = chunk.add_shape(base, upright)
     targets = []
     for frame in others:
-        points = moments.points(frame).astype(np.float32)
+        points = moments.run.surface_at(frame).astype(np.float32)
         targets.append(chunk.add_shape(points - base, normals(points, moments.cells) - upright))
         if chunk.size > MOST_BYTES:
             raise InputError(f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)")
@@ -127,7 +127,7 @@ def write_one_frame(moments: Moments, path: Path) -> None:
     import meshio
 
     (frame,) = moments.frames
-    meshio.write(path, meshio.Mesh(moments.points(frame), [("triangle", moments.cells)]))
+    meshio.write(path, meshio.Mesh(moments.run.surface_at(frame), [("triangle", moments.cells)]))
 
 
 FORMATS: dict[str, Callable[[Moments, Path], None]] = {

@@ -24,10 +24,6 @@ class Moments:
             raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
         self.times, self.cells = run.frames.time[:][self.frames], run.indices("surface/triangles")
 
-    def points(self, frame: int) -> Array:
-        """Return the points of a frame, (v, 3) [m]."""
-        return self.run.surface_at(frame)
-
 
 def normals(points: Array, triangles: Indices) -> Array:
     """Return area-weighted unit normals (v, 3) float32 at points (v, 3) of triangles (f, 3)."""

@@ -19,7 +19,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
-from msmpetsc.geometry.surface import Surface, is_inside
+from msmpetsc.geometry.surface import is_inside
 from msmpetsc.lattice.lattice import CORNERS, Lattice
 from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.scene.bodies import OfBody
@@ -31,23 +31,19 @@ SAME = 1e-9  # of a cell: a point of a face lies in both cells
 
 def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: Indices) -> Positions:
     """Return the nearest points (n, 3) [m] of bodies (n,) to points (n, 3) (collective)."""
+    import igl  # for scenes with regions or obstacles
+
     to_root = Route(bodies[0].comm, np.zeros(len(points), np.int64))
     nearest, of_point = to_root.send(points), to_root.send(body)
     for number in np.unique(of_point):
         own = of_point == number
         surface = bodies[number].surface
         assert surface is not None  # here
-        nearest[own] = _drawn_in(surface, nearest[own])
+        given = nearest[own]
+        closest = igl.point_mesh_squared_distance(given, surface.points, surface.triangles)[2]
+        nearest[own] = np.where(is_inside(surface, given)[:, None], given, closest)
     answer: Positions = to_root.answer(nearest)
     return answer
-
-
-def _drawn_in(surface: Surface, points: Positions) -> Positions:
-    """Return points (n, 3), those outside a surface projected onto it."""
-    import igl  # for scenes with regions or obstacles
-
-    closest = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[2]
-    return np.where(is_inside(surface, points)[:, None], points, closest)
 
 
 @dataclass(frozen=True)

@@ -239,11 +239,8 @@ def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequenc
     while done < len(rows):
         number, within = divmod(start + done, chunk)
         count = min(chunk - within, len(rows) - done)
-        _write_all(file, rows[done : done + count].data.cast("B"), offsets[number] + within * row_bytes)
+        data, offset = rows[done : done + count].data.cast("B"), offsets[number] + within * row_bytes
+        while data:
+            written = os.pwrite(file, data, offset)
+            data, offset = data[written:], offset + written
         done += count
-
-
-def _write_all(file: int, data: memoryview, offset: int) -> None:
-    while data:
-        written = os.pwrite(file, data, offset)
-        data, offset = data[written:], offset + written

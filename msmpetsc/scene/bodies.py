@@ -43,19 +43,10 @@ class OfBody(NamedTuple):
         return ".".join(map(str, self.path))
 
 
-def tables_of(scene: Any, kind: str) -> Iterator[OfBody]:
-    """Yield the tables of a kind: the scene's own, which are of all bodies, then those of each body."""
-    for number, table in enumerate(getattr(scene, kind)):
-        yield OfBody((kind, number), None, table)
-    for body, tables in enumerate(scene.body):
-        for number, table in enumerate(getattr(tables, kind)):
-            yield OfBody(("body", body, kind, number), body, table)
-
-
 def held_by(scene: Any) -> Iterator[OfBody]:
     """Yield the tables of pins, then of anchors: of two that hold a node the first has it."""
     for kind in ("pin", "anchor"):
-        yield from tables_of(scene, kind)
+        yield from scene.tables(kind)
 
 
 def unlike_the_material(scene: Any) -> Iterator[Broken]:
@@ -63,7 +54,7 @@ def unlike_the_material(scene: Any) -> Iterator[Broken]:
 
     Stiffness and Young's modulus are two ways to name all springs.
     """
-    others: dict[str, OwnMaterial] = {part.key: part.table for part in tables_of(scene, "part")}
+    others: dict[str, OwnMaterial] = {part.key: part.table for part in scene.tables("part")}
     others |= {f"body.{number}.material": body.material for number, body in enumerate(scene.body) if body.material}
     for key, other in others.items():
         for name in Material.one_of:

@@ -6,13 +6,12 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from msmpetsc.scene.bodies import OF_REGIONS, BodyTable, OfBody, regions_of_no_body, tables_of, unlike_the_material
+from msmpetsc.scene.bodies import OF_REGIONS, BodyTable, OfBody, regions_of_no_body, unlike_the_material
 from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable, SelfContactTable
 from msmpetsc.scene.problems import Broken, KeyPath, rule
-from msmpetsc.scene.statics import one_state, unlike_the_integrator
-from msmpetsc.scene.time import Time
+from msmpetsc.scene.time import Time, one_state, unlike_the_integrator
 from msmpetsc.scene.values import Count, Direction, FileName, ListOf, NotNegative, PresetName, Table, Vector
 
 
@@ -135,8 +134,12 @@ class SceneFile(Table):
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, kind: str) -> Iterator[OfBody]:
-        """Yield tables of a kind that take a region: those of all bodies, then those of each."""
-        return tables_of(self, kind)
+        """Yield the tables of a kind: the scene's own, which are of all bodies, then those of each body."""
+        for number, table in enumerate(getattr(self, kind)):
+            yield OfBody((kind, number), None, table)
+        for body, tables in enumerate(self.body):
+            for number, table in enumerate(getattr(tables, kind)):
+                yield OfBody(("body", body, kind, number), body, table)
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:
         """Yield key path and name of each file that it names; a mesh's name may be one of the registry's too."""

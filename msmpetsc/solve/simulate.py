@@ -32,7 +32,7 @@ from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
@@ -131,12 +131,6 @@ class TimeLoop:
         """Make the integrator that a scene's tables ask for, its PETSc options of this prefix (collective)."""
         return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, prefix)
 
-    @property
-    def _stepper(self) -> Stepper:
-        """Solver of the steps of a scene whose steps are solved."""
-        assert isinstance(self.integrator, ImplicitEuler)
-        return self.integrator.stepper
-
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
 
@@ -178,7 +172,9 @@ class TimeLoop:
         self.time_error = result.time_error
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
         if self.true_error and index % self.true_error == 0 and result.problem and not is_recovered:
-            self.effort.measure(self.true_errors.errors(self._stepper, result.problem, result.position))
+            assert isinstance(self.integrator, ImplicitEuler)  # which solves them
+            errors = self.true_errors.errors(self.integrator.stepper, result.problem, result.position)
+            self.effort.measure(errors)
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):

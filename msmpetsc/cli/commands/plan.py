@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.statics import STATIC
+from msmpetsc.scene.time import STATIC
 from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench

@@ -160,13 +160,14 @@ def smallest(bounds: Rows) -> float:
 
 
 class Movers(NamedTuple):
-    """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, those
-    that move as rows or (n,) bool, and 1 / mass (n,) [1/kg]."""
+    """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, the rows of those
+    that move, 1 / mass (n,) [1/kg], and grad E (n or more, 3) [N]."""
 
     q: Positions
     v: Rows
-    rows: Indices | Mask
+    rows: Indices
     per_mass: Floats
+    gradient: Rows
 
 
 def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: float) -> None:

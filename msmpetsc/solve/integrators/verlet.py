@@ -17,12 +17,12 @@ which is none for a quadratic E. A step that gains too much is taken again, in t
 
 import sys
 from itertools import pairwise
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
+from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest, like
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -200,16 +200,15 @@ class Verlet(Integrator):
         self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
         load, before = self.environment.load(time), None if beyond is None else self.v.copy()
-        kick(len(self.free), load, duration, self._free_nodes())
+        kick(len(self.free), load, duration, self._movers())
         if beyond is not None and before is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
             self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
         self._damp(0.5 * duration)
         self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)
-        nodes = Movers(self.q, self.v, self.free, self.per_mass)
-        self.environment.apply_friction(nodes, time, duration, (begin, end), self.sides)
+        self.environment.apply_friction(self._movers(), time, duration, (begin, end), self.sides)
 
-    def _free_nodes(self) -> "FreeNodes":
-        return FreeNodes(self.free, self.per_mass, self.gradient, self.v)
+    def _movers(self) -> Movers:
+        return Movers(self.q, self.v, self.free, self.per_mass, self.gradient)
 
     def _damp(self, duration: float) -> None:
         """Slow the free nodes down as damping by the mass does in this time [s]."""
@@ -219,7 +218,7 @@ class Verlet(Integrator):
     def _drift(self, begin: float, end: float) -> None:
         """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
         self._hold(end)
-        drift(len(self.free), self.q, end - begin, self._free_nodes())
+        drift(len(self.free), self.q, end - begin, self._movers())
         prescribed = self.environment.prescribed(self.position.values, end)
         if prescribed is not None:
             anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
@@ -347,17 +346,8 @@ def crushing_energy(lattice: Lattice) -> float:
     return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
 
-class FreeNodes(NamedTuple):
-    """Rows of the free nodes in arrays of nodes: M^(-1) [1/kg], grad E (l, 3) [N] and velocities (owned, 3) [m/s]."""
-
-    rows: Indices
-    per_mass: Floats
-    gradient: Rows
-    v: Rows
-
-
 @kernel
-def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: FreeNodes) -> None:
+def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: Movers) -> None:
     """v += duration M^(-1) (f_ext - grad E)."""
     for row in range(first, count, step):
         i = nodes.rows[row]
@@ -366,7 +356,7 @@ def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: 
 
 
 @kernel
-def drift(first: int, count: int, step: int, q: Positions, duration: float, nodes: FreeNodes) -> None:
+def drift(first: int, count: int, step: int, q: Positions, duration: float, nodes: Movers) -> None:
     """q += duration v."""
     for row in range(first, count, step):
         i = nodes.rows[row]

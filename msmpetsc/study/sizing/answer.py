@@ -9,7 +9,7 @@ import tomlkit
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import read_toml
-from msmpetsc.scene.statics import STATIC
+from msmpetsc.scene.time import STATIC
 from msmpetsc.study.cases import inline, scene_tables
 from msmpetsc.study.sizing.choice import Candidate, Choice, CostModel
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.statics import STATIC
+from msmpetsc.scene.time import STATIC
 from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error

@@ -31,10 +31,10 @@ from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_e
 from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
-from msmpetsc.scene.bodies import OfBody, held_by
 from msmpetsc.scene.motion import ForceTable, Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import OfBody, held_by
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle

@@ -141,7 +141,7 @@ def _is_petsc_option(word: str) -> bool:
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for our options with one dash, and for PETSc options where none are taken."""
+    """Raise InputError for our options with one dash, and PETSc options where none are taken."""
     name = ours[0] if ours else ""
     if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
         return
@@ -167,8 +167,9 @@ class Parser(argparse.ArgumentParser):
 
 def versions_line() -> str:
     """Return the versions of this package, PETSc, MPI and Python; what cannot be loaded says so."""
-    petsc, mpi = "no PETSc", "no MPI"
-    with suppress(Exception):  # a library that is missing, or built for another: each in its own way
+    petsc = "no PETSc"
+    mpi = "no MPI"
+    with suppress(Exception):  # it is missing, or built for another: each in its own way
         from petsc4py import PETSc
 
         petsc = f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"

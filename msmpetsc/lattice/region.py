@@ -22,9 +22,9 @@ from msmpetsc.geometry.inside import frame_of, inside_bodies
 from msmpetsc.geometry.surface import is_inside
 from msmpetsc.lattice.lattice import CORNERS, Lattice
 from msmpetsc.lattice.material import CellMaterial
-from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import OfBody
 
 SAME = 1e-9  # of a cell: a point of a face lies in both cells
 

@@ -15,8 +15,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.results.reader import Result
-from msmpetsc.scene.bodies import OfBody
-from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.schema import OfBody, SceneFile
 
 if TYPE_CHECKING:
     from msmpetsc.build import Model

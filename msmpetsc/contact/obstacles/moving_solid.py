@@ -9,7 +9,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
 from msmpetsc.comm import log, on_root, together
 from msmpetsc.constraints.loads import Motion, Timed
-from msmpetsc.contact.obstacles.distance import FunctionSolid
+from msmpetsc.contact.obstacles.distance import FunctionSolid, MeshSolid
 from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Planes, Send, Solid, no_sides
 from msmpetsc.elasticity.locate import node_of_greatest
 from msmpetsc.errors import InputError
@@ -122,8 +122,6 @@ def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
 
 def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path) -> Solid:
     if table.mesh is not None:
-        from msmpetsc.contact.obstacles.mesh_solid import MeshSolid  # and igl and trimesh: other scenes need neither
-
         mesh = table.mesh
         surface = comm.bcast(on_root(comm, lambda: obstacle_surface(mesh, key, folder)))
         return MeshSolid(surface)

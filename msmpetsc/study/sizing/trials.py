@@ -14,8 +14,18 @@ from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, inverted_bound, size_bounds
-from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
+from msmpetsc.study.sizing.choice import (
+    Budget,
+    Candidate,
+    Choice,
+    CostModel,
+    SizePlan,
+    SizeTrial,
+    Solving,
+    Stepping,
+    inverted_bound,
+    size_bounds,
+)
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned

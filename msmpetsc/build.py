@@ -10,8 +10,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.constraints.coverage import Regions, taken
-from msmpetsc.constraints.holders import Holders, clamped
+from msmpetsc.constraints.holders import Holders, Regions, clamped, taken
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK, smallest
@@ -162,7 +161,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     shape = shape or Geometry(comm, scene)
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
-    lattice = _lattice(scene, shape, finder)
+    lattice = build_lattice(cages, _material(scene, finder), shape.topology)
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
     points = shape.nearest(lattice) if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
@@ -170,9 +169,6 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
-    if comm.allreduce(int((~fixed[: lattice.owned]).sum())) == 0:
-        what = "pin or anchor" if anchors else "pin"
-        raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -285,16 +281,18 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 
-def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
+def _material(scene: Scene, finder: Finder) -> LatticeMaterial:
     own = scene.material
-    material = LatticeMaterial(
-        own.density, own.young_modulus, own.stiffness, own.law_stiffening, own.poisson, cell_materials(scene, finder)
-    )
-    return build_lattice(shape.cages, material, shape.topology)
+    b = own.stiffening * (own.law == "stiffening")  # of the springs' law, 0 for Hooke's
+    of_cells = cell_materials(scene, finder)
+    return LatticeMaterial(own.density, own.young_modulus, own.stiffness, b, own.poisson, of_cells)
 
 
 def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders) -> list[Anchor]:
-    """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first."""
+    """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first (collective).
+
+    Raises InputError where pins and anchors leave no node to move.
+    """
     anchors = []
     taken = lattice.pinned
     for anchor in tables:
@@ -303,6 +301,9 @@ def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders
         center = middle if anchor.table.center is None else np.array(anchor.table.center)
         anchors.append(Anchor(where, Motion.through(anchor.table.path, center), anchor.table.stop))
         taken = taken | where
+    if lattice.table.comm.allreduce(int((~taken[: lattice.owned]).sum())) == 0:
+        what = "pin or anchor" if anchors else "pin"
+        raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
     return anchors
 
 

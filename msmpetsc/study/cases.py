@@ -14,7 +14,7 @@ from typing import Any
 from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import Scene, load_scene
-from msmpetsc.study.forkserver import COLD
+from msmpetsc.study.process import COLD
 from msmpetsc.study.study_file import Axis, Length, Map, MapCase, Study, StudyScene, Sweep
 
 OVERRIDES = {  # values of a case that stand in tables of its scene
@@ -225,7 +225,6 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 
 
 def _label(sweep: Sweep, method: str, options: str, ranks: int) -> str:
-    """Return the label of the curve of a case."""
     name = sweep.label or f"{method} {options}".strip()
     return name if ranks == 1 or sweep.ranks == (ranks,) else f"{name}, {ranks} ranks"
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
 
-from msmpetsc.study.forkserver import SERVER, Forked
+from msmpetsc.study.process import SERVER, Forked
 
 STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new; mv $OMPI_COMM_WORLD_RANK.new $OMPI_COMM_WORLD_RANK.env
 read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""

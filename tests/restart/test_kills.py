@@ -16,8 +16,7 @@ from stopped_runs import assert_same, hanging, ranks_of
 
 from msmpetsc.results.reader import finished
 from msmpetsc.solve.simulate import REMEMBERED
-from msmpetsc.study.forkserver import Forked
-from msmpetsc.study.process import ALONE
+from msmpetsc.study.process import ALONE, Forked
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

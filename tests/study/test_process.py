@@ -13,8 +13,7 @@ from conftest import ENVIRONMENT, run
 from study_files import alive
 
 from msmpetsc.study import process
-from msmpetsc.study.forkserver import COLD
-from msmpetsc.study.process import Ended, Processes, environment
+from msmpetsc.study.process import COLD, Ended, Processes, environment
 
 TIME = {"step": 0.01, "duration": 0.1}
 

@@ -28,8 +28,7 @@ from msmpetsc.errors import InputError, printable
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import launcher
-from msmpetsc.study.forkserver import COLD
-from msmpetsc.study.process import Processes
+from msmpetsc.study.process import COLD, Processes
 
 STEPS = 20  # of a scene's numbers, if nothing else is asked for
 ERROR = 1e-9  # of each step, relative

@@ -11,7 +11,7 @@ from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import one_line
-from msmpetsc.export.moments import Moments, normals
+from msmpetsc.export.formats import Moments, normals
 
 CLAY = (0.8, 0.55, 0.4)
 UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}  # the axes that USD knows as upward

@@ -227,10 +227,8 @@ class TimeLoop:
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
-        awaited = self.recovery.awaited
-        if self.true_error and not at_end:
-            awaited = (*awaited, REFERENCE_PREFIX)
-        refuse_unused(self.comm, at_end, awaited)
+        awaited = {FALLBACK: self.recovery.on_failure == "fallback", REFERENCE_PREFIX: self.true_error and not at_end}
+        refuse_unused(self.comm, at_end, tuple(prefix for prefix, may_come in awaited.items() if may_come))
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""

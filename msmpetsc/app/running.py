@@ -65,9 +65,9 @@ def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None,
     started : count of perf_counter at the start of the command [s]
     """
     plan = prepare(comm, request, earlier)
-    if plan.resumed and plan.resumed.is_done:
+    if (resumed := plan.resumed) and resumed.is_done:
         write_companions(comm, request, whole=True)
-        log.info("%s has all its %d frames: nothing left to do", request.path, plan.resumed.earlier.finished)
+        log.info("%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished)
         return 0
     return finish(comm, plan, take_steps(comm, plan), started)
 

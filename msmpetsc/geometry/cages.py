@@ -115,7 +115,6 @@ Inside = tuple[Rows, Rows]  # shares (n, 2, 2, 2) of cells' corners, and their s
 
 
 def _whole(count: int) -> Inside:
-    """Return the shares and squares of whole cells."""
     return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
 
 
@@ -155,8 +154,8 @@ def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int
     found: list[SlabCells] = []
     comm, before = bodies[0].comm, 0
     for body, grid in zip(bodies, grids.grids, strict=True):
-        volume, area = abs(body.report.volume) / grid.cell_size**3, body.report.area / grid.cell_size**2
-        least = before + max(volume / 2, area / 8)
+        of_volume = abs(body.report.volume) / grid.cell_size**3 / 2
+        least = before + max(of_volume, body.report.area / grid.cell_size**2 / 8)
         _refuse_above(max_cells, least, grid)
         refuse_beyond_memory(comm, least)
         found.append(_slab_cells(body, grid, boundary))

@@ -331,7 +331,8 @@ def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) ->
     alone = np.zeros(27, np.bool_)
     alone[ITSELF] = True
     view = PointView(np.empty((3, 4)), np.empty(144), np.empty((108, 4)))
-    blends, joined = np.empty(8), np.empty(64)
+    blends = np.empty(8)
+    joined = np.empty(64)
     for p in range(len(u)):
         set_view(u[p], view)
         joined_cage(0, alone, view, weights[p])  # x(p)

@@ -147,7 +147,7 @@ def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows
 
 @numba.njit(cache=True)
 def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tuple[int, int]:
-    """Return the first cell index that a polygon reaches along an axis, and the one after its last."""
+    """Return the first cell index that a polygon reaches along an axis, and that after its last."""
     if n == 0:
         return 0, 0
     smallest, largest = extent(polygon, n, axis)

@@ -1,9 +1,9 @@
-"""Valid cells (paper section 4.1): boundary cells, which a triangle touches, and interior ones, which no flood reaches.
+"""Valid cells (paper section 4.1): those that a triangle touches, and those that no flood reaches.
 
 Everything is in cell units: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+1). A cell owns
 its low faces, so a face of the body that lies in a grid plane marks one layer of cells, not two.
 
-The flood comes from outside, a column at a time: the boundary cells of a column (i, j) leave gaps of cells
+The flood comes from outside, a column at a time: the boundary cells of a column (i, j) leave gaps
 between them, and a gap as a whole is inside or outside. So memory follows the boundary, never the
 bounding box. Each rank floods a slab of planes i; components that meet at a slab's face are joined
 through one small graph of labels.
@@ -74,7 +74,7 @@ def extent(polygon: Rows, n: int, axis: int) -> tuple[float, float]:
 
 @numba.njit(cache=True)
 def _slack(triangle: Rows, axis: int) -> float:
-    """Return more than the rounding of a coordinate interpolated between corners of the triangle."""
+    """Return more than the rounding of a coordinate interpolated between a triangle's corners."""
     smallest, largest = extent(triangle, 3, axis)
     return SLACK * (1.0 + max(abs(smallest), abs(largest)))
 
@@ -128,7 +128,7 @@ def touched_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
 
 @dataclass(frozen=True)
 class Slab:
-    """The planes first <= i < last that a rank fills, of ``planes`` in all; empty on spare ranks."""
+    """The planes first <= i < last that a rank fills, of ``planes`` in all; none on spare ranks."""
 
     first: int
     last: int

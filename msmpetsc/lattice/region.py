@@ -222,7 +222,7 @@ class ProbePoints:
     """Points of a body that move with the corners of their cells, by trilinear functions."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, points: Sequence[Sequence[float]]):
-        """Find points by their places at rest (w, 3) [m]. Raises InputError on all ranks for one in no cell."""
+        """Find points by where they rest (w, 3) [m]. Raises InputError on all ranks for one in no cell."""
         self.comm = comm
         cells = to_host(lattice.local_cells)[: lattice.cells_owned]
         low, numbers = to_host(lattice.nodes)[cells[:, 0]], lattice.global_numbers[cells[:, 0]]

@@ -1,12 +1,12 @@
 """The layout of a result file, and the transfer of distributed rows between it and the ranks.
 
-All metadata is there before the first frame, so that a kill leaves the file readable. Every dataset of ``/frames`` and
-``/checkpoint`` has its planned length from the start, its chunks allocated, nothing buffered. While frames are written,
-no metadata changes.
+All metadata is there before the first frame and then does not change, so that a kill leaves the
+file readable. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the
+start, its chunks allocated, nothing buffered.
 
-Rank 0, which has the file open, takes or gives rows in pieces. Or each rank writes its own straight to their bytes: a
-frame's are known from the start, for its chunks lie where HDF5 put them when the file was laid out, uncompressed, and
-stay there. That needs nothing of h5py, and as nothing is collective no rank waits for another that has failed.
+Rank 0, which has the file open, takes or gives rows in pieces. Or each rank writes its own straight
+to their bytes: a frame's chunks stay where HDF5 put them when the file was laid out, uncompressed.
+That needs nothing of h5py, and as nothing is collective no rank waits for one that has failed.
 """
 
 import math
@@ -239,8 +239,10 @@ def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequenc
     while done < len(rows):
         number, within = divmod(start + done, chunk)
         count = min(chunk - within, len(rows) - done)
-        data, offset = rows[done : done + count].data.cast("B"), offsets[number] + within * row_bytes
+        data = rows[done : done + count].data.cast("B")
+        offset = offsets[number] + within * row_bytes
         while data:
             written = os.pwrite(file, data, offset)
-            data, offset = data[written:], offset + written
+            data = data[written:]
+            offset += written
         done += count

@@ -178,7 +178,7 @@ class Result:
         return self._datasets[name]
 
     def indices(self, name: str) -> Indices:
-        """Return a dataset of node or point numbers. Raises InputError where one is out of range."""
+        """Return a dataset of node or point numbers. Raises InputError for one out of range."""
         rows, count = self[name][:].astype(np.int64), len(self[NAMED[name]])
         plural = NAMED[name].partition("/")[2]
         if rows.size and not 0 <= rows.min() <= rows.max() < count:

@@ -1,7 +1,4 @@
-"""The schema of a scene file: frozen, validated tables. What a key means and its unit stand in its description.
-
-Of several bodies in one scene each has a table, and tables of nodes are of all bodies or of one.
-"""
+"""The schema of a scene file: frozen, validated tables. What a key means and its unit stand in its description."""
 
 from collections.abc import Iterator
 from itertools import chain
@@ -212,7 +209,7 @@ class SceneFile(Table):
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, kind: str) -> Iterator[OfBody]:
-        """Yield the tables of a kind: the scene's own, which are of all bodies, then those of each body."""
+        """Yield the tables of a kind: the scene's own, which are of all bodies, then each body's."""
         for number, table in enumerate(getattr(self, kind)):
             yield OfBody((kind, number), None, table)
         for body, tables in enumerate(self.body):

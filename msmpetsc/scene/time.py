@@ -18,7 +18,7 @@ OF_TIME = ("path", "times", "start", "stop")  # keys of what comes, goes or move
 
 
 def _wanted_in_motion(schema: dict[str, Any]) -> None:
-    """Say in the JSON schema that only statics may do without a step and a duration (``one_state``)."""
+    """Say in the JSON schema that only statics need no step and duration (``one_state``)."""
     is_static = {"properties": {"integrator": {"const": STATIC}}, "required": ["integrator"]}
     schema.update({"if": is_static, "else": {"required": schema.pop("required")}})
 

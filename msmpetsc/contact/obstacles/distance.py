@@ -1,4 +1,4 @@
-"""Solids known by the distance to their surface: insides of closed meshes, and functions of the user's own."""
+"""Solids known by the distance to their surface: of closed meshes, and of functions of the user's own."""
 
 from abc import abstractmethod
 from weakref import finalize

@@ -1,4 +1,4 @@
-"""Moving obstacles, how they are made from the tables of a scene, and how deep nodes lie in them."""
+"""Moving obstacles, how a scene's tables make them, and how deep nodes lie in them."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,7 +58,7 @@ class Obstacle(Timed):
         return depths if self.outside is None else depths - self.outside[: len(q)], face
 
     def normals_at(self, q: Positions, time: float, face: Indices) -> Rows:
-        """Return unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within, at a time [s]."""
+        """Return unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within at a time [s]."""
         return self.solid.normals(self.seen_from(q, time), face)
 
     def sides(

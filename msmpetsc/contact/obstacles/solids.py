@@ -69,7 +69,7 @@ class Depths(NamedTuple):
 
 
 class Ways(NamedTuple):
-    """Ends (n, 3) [m] of nodes' ways and their sides (n,) before; their sides after (n,), to be written to."""
+    """Ends (n, 3) [m] of nodes' ways, sides (n,) before, and after (n,), to be written to."""
 
     ends: Positions
     before: Indices

@@ -199,7 +199,8 @@ class Verlet(Integrator):
         """Change v by the forces at ``time``; obstacles move as in the substep to its end."""
         self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
-        load, before = self.environment.load(time), None if beyond is None else self.v.copy()
+        load = self.environment.load(time)
+        before = None if beyond is None else self.v.copy()
         kick(len(self.free), load, duration, self._movers())
         if beyond is not None and before is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
             self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))

@@ -1,19 +1,18 @@
 """Stopping rule of a step: the error that x is known to have, and how closely the next linear solve must be made.
 
-The error of x is |x - x*|_M / |x - y|_M, estimated. |F(x)|_(M^-1) / |x -
-y|_M bounds it wherever E is convex between x and x*. Where the bound will do already, or no
-estimate can be had, the bound is the error.
+The error of x is |x - x*|_M / |x - y|_M, estimated. |F(x)|_(M^-1) / |x - y|_M bounds it wherever E
+is convex between x and x*. Where that will do, or no estimate can be had, the bound is the error.
 
 With multigrid |F|_(P^-1), P the preconditioner, tells when an estimate is worth its cost: a linear solve leaves it. It
 is believed where F at the next iterate is about that, so that g is a parabola there (LINEAR).
 
-The estimate is the Newton correction e, computed no better than that needs. It solves H e = F(x), H the true Hessian,
-but for terms of second order. |F|_(M^-1) bounds |e|_M, but was seen up to 6000 times too large on stiff bodies; some
-CG iterations on H, preconditioned as the step is, tell more. In the norm of H their part is |e_k|_H^2 = e_k^T F, and
-miss no more than |r_k|_(P^-1) / sqrt(lambda), lambda the least eigenvalue of P^(-1) H, of which CG's own Ritz values
-tell: the solve ends when the second is a part of the first and |e_k|_M hardly grows, or when that is over the error
-that would do. It does not end before k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes that are so much stiffer hide the
-others for that long.
+The estimate is the Newton correction e, which solves H e = F(x), H the true Hessian, but for terms
+of second order. |F|_(M^-1) bounds |e|_M, but was seen up to 6000 times too large on stiff bodies;
+some CG iterations on H, preconditioned as the step is, tell more. In the norm of H their part is
+|e_k|_H^2 = e_k^T F, and miss no more than |r_k|_(P^-1) / sqrt(lambda), lambda the least eigenvalue
+of P^(-1) H, of which CG's own Ritz values tell: the solve ends when the second is a part of the
+first and |e_k|_M hardly grows, or when that is over the error that would do. It does not end before
+k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes so much stiffer hide the others for that long.
 
 What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends, too, once |e_k|_M
 and that, or |r_k|_(P^-1) / sqrt(lambda), are together an error that will do; their sum is then the estimate.

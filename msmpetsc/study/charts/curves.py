@@ -182,8 +182,9 @@ def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     for scene, rows in scenes.items():
         draw_sizes(chart, scene, rows.sort_values("cells", kind="stable"))
         chart.findings[f"What an error of the surface takes: {scene}"] = lines = []
+        curves = grouped(rows, "label").items()
         for level in (0.1, 0.03, 0.01):
-            ends = ", ".join(f"{label} {reached(of, level)}" for label, of in grouped(rows, "label").items())
+            ends = ", ".join(f"{label} {reached(of, level)}" for label, of in curves)
             lines.append(f"{100 * level:g}%: {ends}.")
     return [chart]
 

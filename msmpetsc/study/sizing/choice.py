@@ -1,4 +1,4 @@
-"""The cheapest split of a surface error among cells, time step and the solution of the steps, and the plan it makes."""
+"""The cheapest split of a surface error among cells, step and solution, and the plan that it makes."""
 
 import math
 from collections.abc import Mapping, Sequence

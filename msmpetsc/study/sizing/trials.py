@@ -303,7 +303,6 @@ class Sizer:
     # What is said
 
     def _bounds(self, plan: SizePlan, model: CostModel) -> list[str]:
-        """Return what bounds the error, in words."""
         inverted = inverted_bound(self.trials, self.as_given.material.law)
         bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted]
         if not plan.met:

@@ -8,15 +8,13 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.constraints.coverage import Regions, taken
-from msmpetsc.constraints.holders import Holders, clamped
+from msmpetsc.constraints.holders import Holders, Regions, clamped, taken
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK, smallest
-from msmpetsc.contact.obstacles.from_scene import build_obstacles
-from msmpetsc.contact.obstacles.moving_solid import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle, build_obstacles
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
 from msmpetsc.contact.surface.collision_surface import collision_surface
@@ -26,17 +24,16 @@ from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import encode_morton
-from msmpetsc.geometry.nearest import nearest_in_bodies
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice, topology_of
-from msmpetsc.lattice.region import Finder, cell_materials
-from msmpetsc.scene.bodies import OfBody, held_by
+from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
 from msmpetsc.scene.motion import ForceTable, Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import OfBody, held_by
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
@@ -164,7 +161,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     shape = shape or Geometry(comm, scene)
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
-    lattice = _lattice(scene, shape, finder)
+    lattice = build_lattice(cages, _material(scene, finder), shape.topology)
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
     points = shape.nearest(lattice) if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
@@ -172,7 +169,6 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
-    _check_that_something_moves(comm, lattice, fixed, anchors)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -285,16 +281,18 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 
-def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
+def _material(scene: Scene, finder: Finder) -> LatticeMaterial:
     own = scene.material
-    material = LatticeMaterial(
-        own.density, own.young_modulus, own.stiffness, own.law_stiffening, own.poisson, cell_materials(scene, finder)
-    )
-    return build_lattice(shape.cages, material, shape.topology)
+    b = own.stiffening * (own.law == "stiffening")  # of the springs' law, 0 for Hooke's
+    of_cells = cell_materials(scene, finder)
+    return LatticeMaterial(own.density, own.young_modulus, own.stiffness, b, own.poisson, of_cells)
 
 
 def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders) -> list[Anchor]:
-    """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first."""
+    """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first (collective).
+
+    Raises InputError where pins and anchors leave no node to move.
+    """
     anchors = []
     taken = lattice.pinned
     for anchor in tables:
@@ -303,13 +301,10 @@ def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders
         center = middle if anchor.table.center is None else np.array(anchor.table.center)
         anchors.append(Anchor(where, Motion.through(anchor.table.path, center), anchor.table.stop))
         taken = taken | where
-    return anchors
-
-
-def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, anchors: list[Anchor]) -> None:
-    if comm.allreduce(int((~fixed[: lattice.owned]).sum())) == 0:
+    if lattice.table.comm.allreduce(int((~taken[: lattice.owned]).sum())) == 0:
         what = "pin or anchor" if anchors else "pin"
         raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
+    return anchors
 
 
 def _loads(

@@ -159,7 +159,7 @@ class Environment:
         return sides
 
     def same_push(self, q: Positions, time: float, sides_a: Indices, sides_b: Indices) -> bool:
-        """Return whether penalties press on this rank's nodes at q alike with either sides (o, l)."""
+        """Return whether penalties press on this rank's nodes at q alike with both sides (o, l)."""
         rows = q[: self.lattice.owned]
         states = zip(self._states(time, sides_a), self._states(time, sides_b), strict=True)
         return all(

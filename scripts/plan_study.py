@@ -18,7 +18,7 @@ from typing import NamedTuple
 import lab
 
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.statics import STATIC
+from msmpetsc.scene.time import STATIC
 from msmpetsc.study.cases import inline
 from msmpetsc.study.metrics import surface_error
 

@@ -22,9 +22,8 @@ from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
-from msmpetsc.scene.bodies import BodyTable
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.schema import BodyTable, SceneFile
 from msmpetsc.study.study_file import load_study
 
 OUTSIDE = {".venv", "out", "build", ".petsc-cuda", ".pytest_cache", ".hypothesis"}

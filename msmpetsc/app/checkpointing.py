@@ -52,7 +52,10 @@ class Checkpoints:
         """
         simulation = self.simulation
         self._frames += is_stored
-        due = (self.signals.comm.rank == 0 and self._is_due()) or simulation.step in (0, simulation.steps)
+        due = perf_counter() - self._ended >= self._seconds
+        if self.every is not None:
+            due = self._frames >= self.every
+        due = (due and self.signals.comm.rank == 0) or simulation.step in (0, simulation.steps)
         due, number = self.signals.agree(due)
         if due:
             began = perf_counter()
@@ -65,11 +68,6 @@ class Checkpoints:
         if simulation.step < simulation.steps:  # after the last step there is nothing to stop
             self.signal = number
         return number != 0
-
-    def _is_due(self) -> bool:
-        if self.every is not None:
-            return self._frames >= self.every
-        return perf_counter() - self._ended >= self._seconds
 
 
 class Signals:

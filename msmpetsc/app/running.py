@@ -68,8 +68,10 @@ def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None,
     started : count of perf_counter at the start of the command [s]
     """
     plan = prepare(comm, request, earlier)
-    if plan.resumed and plan.resumed.is_done:
-        return tell_done(comm, request, plan.resumed)
+    if (resumed := plan.resumed) and resumed.is_done:
+        write_companions(comm, request, whole=True)
+        log.info("%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished)
+        return 0
     return finish(comm, plan, take_steps(comm, plan), started)
 
 
@@ -142,13 +144,6 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
     if ended.signal:
         return tell_stop(ended.signal, request.path, ended.simulation)
     ended.simulation.refuse_unused_options(at_end=True)
-    return 0
-
-
-def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int:
-    """Finish the files of a run that has all its frames; return the exit status (collective)."""
-    write_companions(comm, request, whole=True)
-    log.info("%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished)
     return 0
 
 

@@ -82,13 +82,8 @@ def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) ->
     """Log how long it took [s], and which files there are; the first of them holds the frames."""
     sizes = {path: tqdm.format_sizeof(path.stat().st_size, "B") for path in files if path.is_file()}
     result, *others = (f"{path} ({size})" for path, size in sizes.items())
-    log.info("took %s, %s of it before the first step", spoken(seconds), spoken(setup))
+    log.info("took %s, %s of it before the first step", duration(seconds), duration(setup))
     log.info("left %d frame%s in %s", frames, "s" * (frames != 1), ", ".join([result, *others]))
-
-
-def spoken(seconds: float) -> str:
-    """Return a time as a person would say it; short ones with a digit more."""
-    return f"{seconds:.1f} s" if seconds < 10 else duration(seconds)
 
 
 def tell_stop(number: int, path: Path, simulation: TimeLoop) -> int:

@@ -7,20 +7,14 @@ from typing import Any
 import psutil
 
 
-def processor() -> str:
-    """Return the model of the processor, as the system names it."""
-    path = Path("/proc/cpuinfo")  # where Linux has it: Python's platform does not look there
-    lines = path.read_text().splitlines() if path.exists() else []
-    models = (line.partition(": ")[2] for line in lines if line.startswith("model name"))
-    return next(models, "") or platform.processor() or platform.machine()
-
-
 def machine() -> dict[str, Any]:
     """Return processor, cores, memory [byte] and system."""
+    path = Path("/proc/cpuinfo")  # where Linux has the model's name: Python's platform does not look there
+    lines = path.read_text().splitlines() if path.exists() else []
+    models = (line.partition(": ")[2] for line in lines if line.startswith("model name"))
+    cpu = next(models, "") or platform.processor() or platform.machine()
     memory = psutil.virtual_memory().total
-    return {
-        "cpu": processor(), "cores": psutil.cpu_count(), "memory": memory, "system": platform.platform(terse=True),
-    }  # fmt: skip
+    return {"cpu": cpu, "cores": psutil.cpu_count(), "memory": memory, "system": platform.platform(terse=True)}
 
 
 def peak_memory() -> int:

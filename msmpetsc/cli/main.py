@@ -14,6 +14,7 @@ import sys
 import textwrap
 import traceback
 from argparse import RawDescriptionHelpFormatter
+from contextlib import suppress
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, NoReturn
@@ -134,7 +135,7 @@ def _is_petsc_option(word: str) -> bool:
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for our options with one dash, and for PETSc options where none are taken."""
+    """Raise InputError for our options with one dash, and PETSc options where none are taken."""
     name = ours[0] if ours else ""
     if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
         return
@@ -160,27 +161,17 @@ class Parser(argparse.ArgumentParser):
 
 def versions_line() -> str:
     """Return the versions of this package, PETSc, MPI and Python; what cannot be loaded says so."""
-    libraries = []
-    for name, version in {"PETSc": petsc_version, "MPI": mpi_version}.items():
-        try:
-            libraries.append(version())
-        except Exception:  # a library that is missing, or built for another: each in its own way
-            libraries.append(f"no {name}")
-    return f"msmpetsc {msmpetsc.__version__} ({', '.join(libraries)}, Python {platform.python_version()})"
+    petsc = "no PETSc"
+    mpi = "no MPI"
+    with suppress(Exception):  # it is missing, or built for another: each in its own way
+        from petsc4py import PETSc
 
+        petsc = f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
+    with suppress(Exception):
+        from mpi4py import MPI
 
-def petsc_version() -> str:
-    """Return the version of PETSc: "PETSc 3.22.4"."""
-    from petsc4py import PETSc
-
-    return f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
-
-
-def mpi_version() -> str:
-    """Return the first words of the version string of MPI: "Open MPI v5.0.7"."""
-    from mpi4py import MPI
-
-    return re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()
+        mpi = re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()  # "Open MPI v5.0.7"
+    return f"msmpetsc {msmpetsc.__version__} ({petsc}, {mpi}, Python {platform.python_version()})"
 
 
 def command_parser() -> Parser:

@@ -1,5 +1,7 @@
 """Pins and anchors: the nodes that each holds, what their edges cut, and their reactions.
 
+Anchors and forces that could not have any effect are refused; what is overruled in part is warned of.
+
 Springs, and cells of a solid, that the edge of a clamp cuts: a pin holds nodes, but its region ends between them. Of a
 spring from a free node to a held one a part theta is free, and only that gives: it is 1 / theta as stiff. Where the
 held node sticks out of the body, as at a clamped face, the spring has been made of what is inside, a part sigma of its
@@ -13,14 +15,19 @@ anchor keeps it where it is. So the forces on a body add up: reactions + loads +
 to nothing.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import chain
 
 import numpy as np
+from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
-from msmpetsc.constraints.coverage import Regions
+from msmpetsc.comm import log
+from msmpetsc.constraints.loads import Anchor
+from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.reading import Scene
@@ -29,6 +36,7 @@ LEAST = 0.1  # free part of a spring: what is stiffer costs iterations, and shor
 HALVINGS = 20  # of the way to the edge
 
 Within = Callable[[Positions], Mask]  # points (n, 3) [m] -> (n,) bool
+Regions = Mapping[str, Mask]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
 
 
 @dataclass(frozen=True)
@@ -132,3 +140,49 @@ def _free_part(within: Within, start: Positions, end: Positions) -> Floats:
         inside = within(start + middle[:, None] * (end - start))
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
     return np.where(leads_in, np.maximum(high, LEAST), 1.0)
+
+
+def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions) -> tuple[str, ...]:
+    """Return what anchors and forces take, in words; warn of what is overruled (collective).
+
+    lattice : with its pins
+    anchors : each with the nodes that it leads, those of its region aside that a pin or an earlier anchor has
+    Raises InputError on all ranks for an anchor or a force that does nothing.
+    """
+
+    def count(where: Mask) -> int:
+        return int(comm.allreduce(int(where[: lattice.owned].sum())))
+
+    words = []
+    pinned = lattice.pinned
+    for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
+        where = masks[table.key]
+        _warn_of_overruled(table.key, count(where), count(where & pinned), count(where & ~anchor.where & ~pinned))
+        words.append(f"{table.key} leads {count(anchor.where)} nodes")
+    for table in scene.tables("force"):
+        where, force = masks[table.key], table.table
+        until = math.inf if force.stop is None else force.stop
+        lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]  # hold all the while
+        nodes = count(where)
+        held = count(where & reduce(np.logical_or, lasting, pinned))
+        if held == nodes and force.pulls:
+            raise InputError(
+                f"{table.key} moves nothing: of the {_nodes(nodes)} in its region none is free while it "
+                "acts, pins and anchors hold all"
+            )
+        words.append(f"{table.key} pulls {nodes} nodes" + f" ({held} of them held)" * bool(held))
+    return tuple(words)
+
+
+def _warn_of_overruled(key: str, nodes: int, pinned: int, prescribed: int) -> None:
+    """Warn of an anchor's nodes that are pinned, or led by earlier anchors; raise if all are."""
+    if not pinned + prescribed:
+        return
+    text = f"{key}: of the {_nodes(nodes)} in its region pins hold {pinned}, and anchors before it lead {prescribed}"
+    if pinned + prescribed == nodes:
+        raise InputError(f"{text}: it leads none")
+    log.warning("%s, which it does not lead", text)
+
+
+def _nodes(count: int) -> str:
+    return f"{count} node{'s' * (count != 1)}"

@@ -7,15 +7,14 @@ binary chunk (the glTF 2.0 specification, 4.4); it has y up, so the node is turn
 
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats
+from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import InputError
-from msmpetsc.export.moments import Moments, normals
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result
@@ -25,6 +24,32 @@ POINTS, TRIANGLES = 34962, 34963  # uses of a buffer view: vertex data, indices
 MOST_BYTES = 2**32 - 2**20  # less what is no vertex
 Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # a quarter turn about x
 CLAY = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0}, "doubleSided": True}
+
+
+class Moments:
+    """The exported frames of a result's surface, independent of the format, one in memory at a time.
+
+    frames : numbers of those chosen
+    times  : (t,) [s]
+    cells  : (f, 3) corner points
+    """
+
+    def __init__(self, run: Result, frames: Sequence[int]):
+        """Choose frames. Raises InputError for a result without a surface, or a damaged one."""
+        self.run, self.frames = run, list(frames)
+        if "surface/points" not in run:
+            raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
+        self.times, self.cells = run.frames.time[:][self.frames], run.indices("surface/triangles")
+
+
+def normals(points: Array, triangles: Indices) -> Array:
+    """Return area-weighted unit normals (v, 3) float32 at points (v, 3) of triangles (f, 3)."""
+    corners = points[triangles].astype(float)
+    of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = [np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T]
+    vectors = np.stack(sums, axis=1)
+    vectors[~vectors.any(axis=1)] = (0, 0, 1)  # a point of no triangle, or of folded ones: any direction is as good
+    return np.divide(vectors, np.linalg.norm(vectors, axis=1, keepdims=True), dtype=np.float32)
 
 
 class Chunk:
@@ -66,14 +91,14 @@ class Chunk:
 def write_glb(moments: Moments, path: Path) -> None:
     """Write frames as glTF. Raises InputError for more bytes than the format allows."""
     first, *others = moments.frames
-    base = moments.points(first).astype(np.float32)
+    base = moments.run.surface_at(first).astype(np.float32)
     upright = normals(base, moments.cells)
     chunk = Chunk()
     indices = chunk.add(moments.cells.astype("<u4").ravel(), TRIANGLES)
     shape = chunk.add_shape(base, upright)
     targets = []
     for frame in others:
-        points = moments.points(frame).astype(np.float32)
+        points = moments.run.surface_at(frame).astype(np.float32)
         targets.append(chunk.add_shape(points - base, normals(points, moments.cells) - upright))
         if chunk.size > MOST_BYTES:
             raise InputError(f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)")
@@ -127,7 +152,7 @@ def write_one_frame(moments: Moments, path: Path) -> None:
     import meshio
 
     (frame,) = moments.frames
-    meshio.write(path, meshio.Mesh(moments.points(frame), [("triangle", moments.cells)]))
+    meshio.write(path, meshio.Mesh(moments.run.surface_at(frame), [("triangle", moments.cells)]))
 
 
 FORMATS: dict[str, Callable[[Moments, Path], None]] = {
@@ -161,7 +186,7 @@ def export(result: str | Path, path: str | Path, frames: Frames | None = None) -
 
 
 def _frames(run: Result, path: Path, moves: bool, frames: Frames | None) -> list[int]:
-    """Return the numbers of the frames to export. Raises InputError for those that there are not."""
+    """Return the numbers of the frames to export. Raises InputError for those there are not."""
     count = len(run.frames.time)
     if not count:
         raise InputError(f"{run.path} has no finished frame")

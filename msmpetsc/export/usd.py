@@ -11,7 +11,7 @@ from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import one_line
-from msmpetsc.export.moments import Moments, normals
+from msmpetsc.export.formats import Moments, normals
 
 CLAY = (0.8, 0.55, 0.4)
 UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}  # the axes that USD knows as upward
@@ -36,7 +36,7 @@ def write_usd(moments: Moments, path: Path) -> None:
         of_point = moments.run.body_of("surface")
         bodies = [UsdBody(stage, root.GetPath(), moments, of_point, number) for number in np.unique(of_point)]
         for count, (frame, code) in enumerate(zip(moments.frames, codes, strict=True), 1):
-            points = moments.points(frame)
+            points = moments.run.surface_at(frame)
             for body in bodies:
                 body.add(points, float(code))
             if path.suffix != ".usda" and count % SAVED == 0:

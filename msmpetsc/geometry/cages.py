@@ -17,9 +17,8 @@ from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
-from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
-from msmpetsc.geometry.touched_cells import touched_cells
+from msmpetsc.geometry.valid_cells import Slab, cells_of_gaps, enclosed_gaps, touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
@@ -76,7 +75,7 @@ class SlabCells:
     """Valid cells in a rank's slab of the grid, whose axes are cycled so that the longest is first.
 
     boundary : (b, 3) cells that the surface touches
-    gaps     : (g, 4) interior cells (geometry.interior)
+    gaps     : (g, 4) interior cells (geometry.valid_cells)
     columns  : what the triangles cut out of cells; None where that was not asked for or the surface does not tell
     """
 
@@ -116,7 +115,6 @@ Inside = tuple[Rows, Rows]  # shares (n, 2, 2, 2) of cells' corners, and their s
 
 
 def _whole(count: int) -> Inside:
-    """Return the shares and squares of whole cells."""
     return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
 
 
@@ -156,7 +154,8 @@ def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int
     found: list[SlabCells] = []
     comm, before = bodies[0].comm, 0
     for body, grid in zip(bodies, grids.grids, strict=True):
-        least = before + _least_cells(body, grid)
+        of_volume = abs(body.report.volume) / grid.cell_size**3 / 2
+        least = before + max(of_volume, body.report.area / grid.cell_size**2 / 8)
         _refuse_above(max_cells, least, grid)
         refuse_beyond_memory(comm, least)
         found.append(_slab_cells(body, grid, boundary))
@@ -190,11 +189,6 @@ def _columns(body: BodySurface, corners: Rows, shape: Indices, slab: Slab) -> Co
 def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
     """Return the first cell of a slab, and the one after its last, along each axis."""
     return np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
-
-
-def _least_cells(body: BodySurface, grid: Grid) -> float:
-    """Return a lower bound of the number of cells."""
-    return max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
 
 
 def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:

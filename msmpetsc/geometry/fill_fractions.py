@@ -25,7 +25,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Rows
 from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
 from msmpetsc.geometry.surface import Surface, is_inside
-from msmpetsc.geometry.touched_cells import clip_between, extent, grown
+from msmpetsc.geometry.valid_cells import clip_between, extent, grown
 
 SAMPLES = 6  # a side of a cell of an open surface: a plane through a cell is seen to 0.6% of the cell, rms
 OUTSIDE = 0.5  # a winding number below this
@@ -147,7 +147,7 @@ def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows
 
 @numba.njit(cache=True)
 def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tuple[int, int]:
-    """Return the first cell index that a polygon reaches along an axis, and the one after its last."""
+    """Return the first cell index that a polygon reaches along an axis, and that after its last."""
     if n == 0:
         return 0, 0
     smallest, largest = extent(polygon, n, axis)

@@ -76,7 +76,6 @@ def _kind(path: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """Return the file's bytes."""
     try:
         data = path.read_bytes()
     except (OSError, MemoryError) as error:
@@ -132,7 +131,7 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 
 def _read_mixed_ply(data: bytes) -> Arrays:
-    """Read a binary PLY whose faces differ in their number of corners, which trimesh does not read."""
+    """Read a binary PLY whose faces differ in number of corners, which trimesh does not read."""
     import meshio  # a slow import for what few scenes name
 
     mesh = meshio.ply.read(BytesIO(data))
@@ -168,7 +167,7 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
 
 
 def _read_meshio(path: Path, data: bytes) -> Arrays:
-    """Read the outer surface of the tetrahedra, or else triangles and quads, without unused points."""
+    """Read the outer surface of tetrahedra, or else triangles and quads, without unused points."""
     import meshio
 
     mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)

@@ -111,10 +111,6 @@ class Lattice:
         stiffness = self.stiffness if self.solid is None else self.cell_stiffness
         return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
 
-    def with_viscosity(self, factor: float) -> "Lattice":
-        """Return this solid's lattice for steps whose viscosity is so many times its stiffness."""
-        return replace(self, stiffness=(1 + factor) * self.stiffness, viscous=factor)
-
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool held fast."""
         return replace(self, pinned=self.pinned | where)

@@ -1,11 +1,11 @@
-"""Nodes and cells in the regions of a scene, and the materials of its parts.
+"""Nodes and cells in the regions of a scene, the materials of its parts, and its probes.
 
 A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is. Where
 skin widens from a clamp's edge, nodes just past that are nearest to skin that is free. So of nodes that lie in the
 region themselves those count, too, that have it half a cell away: else a clamp were too small by half a cell.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,19 +13,37 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
-from msmpetsc.comm import log, on_root
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_host
+from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
-from msmpetsc.geometry.nearest import nearest_in_bodies
-from msmpetsc.lattice.cut_cells import CORNERS
-from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.geometry.surface import is_inside
+from msmpetsc.lattice.lattice import CORNERS, Lattice
 from msmpetsc.lattice.material import CellMaterial
-from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import OfBody
+
+SAME = 1e-9  # of a cell: a point of a face lies in both cells
+
+
+def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: Indices) -> Positions:
+    """Return the nearest points (n, 3) [m] of bodies (n,) to points (n, 3) (collective)."""
+    import igl  # for scenes with regions or obstacles
+
+    to_root = Route(bodies[0].comm, np.zeros(len(points), np.int64))
+    nearest, of_point = to_root.send(points), to_root.send(body)
+    for number in np.unique(of_point):
+        own = of_point == number
+        surface = bodies[number].surface
+        assert surface is not None  # here
+        given = nearest[own]
+        closest = igl.point_mesh_squared_distance(given, surface.points, surface.triangles)[2]
+        nearest[own] = np.where(is_inside(surface, given)[:, None], given, closest)
+    answer: Positions = to_root.answer(nearest)
+    return answer
 
 
 @dataclass(frozen=True)
@@ -198,3 +216,33 @@ def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
     """Return a number of a body's own material; the scene's where it gives none."""
     value: float | None = getattr(own, name, None)
     return float(getattr(material, name)) if value is None else value
+
+
+class ProbePoints:
+    """Points of a body that move with the corners of their cells, by trilinear functions."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, points: Sequence[Sequence[float]]):
+        """Find points by where they rest (w, 3) [m]. Raises InputError on all ranks for one in no cell."""
+        self.comm = comm
+        cells = to_host(lattice.local_cells)[: lattice.cells_owned]
+        low, numbers = to_host(lattice.nodes)[cells[:, 0]], lattice.global_numbers[cells[:, 0]]
+        self.corners = np.zeros((len(points), 8), np.int64)
+        self.weights = np.zeros((len(points), 8))
+        for row, point in enumerate(points):
+            place = (np.array(point) - low) / lattice.cell_size
+            around = np.flatnonzero(((place >= -SAME) & (place <= 1 + SAME)).all(axis=1))
+            own = int(numbers[around].min(initial=lattice.table.total))
+            first = comm.allreduce(own, MPI.MIN)  # of several cells on a face, or of bodies in one place
+            if first == lattice.table.total:
+                place_text = ", ".join(f"{x:g}" for x in point)
+                raise InputError(f"output.probe.{row}.point: ({place_text}) m lies in no cell of the body at rest")
+            if own == first:
+                cell = around[np.argmin(numbers[around])]
+                self.corners[row] = cells[cell]
+                self.weights[row] = np.where(CORNERS == 1, place[cell], 1 - place[cell]).prod(axis=1)
+
+    def __call__(self, q: Positions) -> Rows:
+        """Return where the points are (w, 3) [m] with nodes at q (l, 3) [m] (collective)."""
+        own = (self.weights[:, :, None] * to_host(q)[self.corners]).sum(axis=1)
+        places: Rows = self.comm.allreduce(own)
+        return places

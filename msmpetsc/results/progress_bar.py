@@ -59,9 +59,9 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in words: 31 s, 12 min, 3.4 h."""
+    """Return a duration in words: 3.1 s, 31 s, 12 min, 3.4 h."""
     if seconds < 120:
-        return f"{seconds:.0f} s"
+        return f"{seconds:.{int(seconds < 10)}f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 

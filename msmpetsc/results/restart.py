@@ -15,8 +15,8 @@ from msmpetsc.comm import on_root, together
 from msmpetsc.errors import InputError
 from msmpetsc.fields import CHECKPOINT
 from msmpetsc.results.comparison import rows_agree
+from msmpetsc.results.layout import scatter_rows
 from msmpetsc.results.reader import Result, as_python, newest_slot, plain_damage
-from msmpetsc.results.transfer import scatter_rows
 
 NEAR, FARTHEST = 0.01, 1e6  # of the body's longest side
 SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks

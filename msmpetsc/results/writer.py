@@ -1,7 +1,7 @@
 """Writing of the result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
 
 Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank
-writes its own where it can reach the file (results.transfer). The file is the same.
+writes its own where it can reach the file (results.layout). The file is the same.
 
 All metadata is on disk before the first frame and does not change while frames are written (results.layout). A frame is
 its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
@@ -38,9 +38,16 @@ from msmpetsc.results.disk import (
     refuse_no_file,
     refuse_small_disk,
 )
-from msmpetsc.results.layout import Layout, of_ranks, open_to_write
+from msmpetsc.results.layout import (
+    Layout,
+    chunk_offsets,
+    gather_rows,
+    of_ranks,
+    open_on_all_ranks,
+    open_to_write,
+    write_bytes,
+)
 from msmpetsc.results.reader import FORMAT, FORMAT_VERSION, Result, checked_dataset, finished, open_result
-from msmpetsc.results.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
 
 NOTHING = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))  # what ranks but the first have of surfaces
 

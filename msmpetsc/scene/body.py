@@ -120,11 +120,6 @@ class Material(Table):
         return self
 
     @property
-    def law_stiffening(self) -> float:
-        """Return b of the springs' law, 0 for Hooke's."""
-        return self.stiffening if self.law == "stiffening" else 0.0
-
-    @property
     def poisson(self) -> float | None:
         """Return Poisson's ratio of a solid; None of springs."""
         return self.poisson_ratio if self.law == SOLID else None

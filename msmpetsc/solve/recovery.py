@@ -45,11 +45,6 @@ class Recovery:
         """Whether the next step is recovered from its start, since the one before failed."""
         return self.level > 0 and self.on_failure == "substep"  # else it was another scene that asked for it
 
-    @property
-    def awaited(self) -> tuple[str, ...]:
-        """Prefixes of PETSc options that may still be used."""
-        return (PREFIX,) if self.on_failure == "fallback" else ()
-
     def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State]:
         """Take the step that ends at ``time``, after its ``failure`` if any. Raises StepFailed."""
         if failure and self.on_failure == "stop":
@@ -109,7 +104,7 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Make another integrator: implicit Euler's, or the scene's if that is static or Verlet's."""
+        """Make another integrator: implicit Euler's, or the scene's if static or Verlet's."""
         is_fallback = self.on_failure == "fallback"
         kept = ("static",) if is_fallback else ("static", "verlet")
         name = self.time.integrator if self.time.integrator in kept else "implicit-euler"

@@ -21,19 +21,18 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.lattice.probe import ProbePoints
+from msmpetsc.lattice.region import ProbePoints
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, TrueErrors
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, Rest, TrueErrors
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.monitors import Monitors, Rest
-from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
@@ -132,12 +131,6 @@ class TimeLoop:
         """Make the integrator that a scene's tables ask for, its PETSc options of this prefix (collective)."""
         return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, prefix)
 
-    @property
-    def _stepper(self) -> Stepper:
-        """Solver of the steps of a scene whose steps are solved."""
-        assert isinstance(self.integrator, ImplicitEuler)
-        return self.integrator.stepper
-
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
 
@@ -179,7 +172,9 @@ class TimeLoop:
         self.time_error = result.time_error
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
         if self.true_error and index % self.true_error == 0 and result.problem and not is_recovered:
-            self.effort.measure(self.true_errors.errors(self._stepper, result.problem, result.position))
+            assert isinstance(self.integrator, ImplicitEuler)  # which solves them
+            errors = self.true_errors.errors(self.integrator.stepper, result.problem, result.position)
+            self.effort.measure(errors)
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
@@ -232,10 +227,8 @@ class TimeLoop:
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
-        awaited = self.recovery.awaited
-        if self.true_error and not at_end:
-            awaited = (*awaited, REFERENCE_PREFIX)
-        refuse_unused(self.comm, at_end, awaited)
+        awaited = {FALLBACK: self.recovery.on_failure == "fallback", REFERENCE_PREFIX: self.true_error and not at_end}
+        refuse_unused(self.comm, at_end, tuple(prefix for prefix, may_come in awaited.items() if may_come))
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""

@@ -225,7 +225,6 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 
 
 def _label(sweep: Sweep, method: str, options: str, ranks: int) -> str:
-    """Return the label of the curve of a case."""
     name = sweep.label or f"{method} {options}".strip()
     return name if ranks == 1 or sweep.ranks == (ranks,) else f"{name}, {ranks} ranks"
 

@@ -119,5 +119,7 @@ def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Co
         raise InputError(f"{subject.name}: the surface at these frames has no extent")
     if colouring is not None and style.colour:
         colouring = scaled(colouring, distinct)
-    camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
+    gravity = subject.scene.gravity
+    pull = gravity.acceleration if gravity else None
+    camera = camera_facing(everywhere, pull, style.eye or subject.scene.picture.eye)
     return Composition(subject, style, everywhere, camera, colouring)

@@ -15,8 +15,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.results.reader import Result
-from msmpetsc.scene.bodies import OfBody
-from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.schema import OfBody, SceneFile
 
 if TYPE_CHECKING:
     from msmpetsc.build import Model
@@ -116,16 +115,6 @@ class Drawable:
         """Title of the scene, or the file's name."""
         return self.scene.title or Path(self.name).stem
 
-    @property
-    def gravity(self) -> tuple[float, ...] | None:
-        """Acceleration of gravity (3,) [m/s^2], or None."""
-        return self.scene.gravity.acceleration if self.scene.gravity else None
-
-    @property
-    def eye(self) -> tuple[float, ...] | None:
-        """Direction (3,) from the body to the eye in the scene's picture."""
-        return self.scene.picture.eye
-
     def fixed(self, index: int) -> Floats:
         """Return the pinned or led share (v,) in [0, 1] of each surface point at a frame."""
         fixed = self.pinned.copy()
@@ -135,7 +124,7 @@ class Drawable:
         return self.on_surface(fixed.astype(float), 1.0)
 
     def on_surface(self, numbers: Floats, most: float = np.inf) -> Floats:
-        """Return numbers (n,) of the nodes interpolated to the surface points, (v,) in [0, most]."""
+        """Return numbers (n,) of nodes interpolated to the surface points, (v,) in [0, most]."""
         if not numbers.any():
             return np.zeros(len(self.rest.points))
         return np.asarray(np.clip(self.embedding @ numbers, 0, most))

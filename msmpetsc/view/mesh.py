@@ -29,7 +29,7 @@ def drawn(subject: Drawable) -> Drawable:
 
 
 def _refined(subject: Drawable) -> Drawable:
-    """Return bodies with no edge of their surface longer than a cell; cells carry the new points."""
+    """Return bodies with no edge of the surface longer than a cell; cells carry the new points."""
     rest, W = subject.rest, subject.embedding
     cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
     if cell == 0:

@@ -146,7 +146,7 @@ def corners_of(box: Positions) -> Positions:
 
 
 def _box(box: Positions, bodies: Positions) -> list[Positions]:
-    """Return the corners (8, 3) of a box (2, 3), clipped near the bodies; none for a distant box."""
+    """Return corners (8, 3) of a box (2, 3), clipped near the bodies; none for a distant box."""
     low, high = bodies.min(axis=0), bodies.max(axis=0)
     extent = high - low
     margin = (CUT - 1) / 2 * extent

@@ -73,7 +73,6 @@ class Renderer:
         view.clipping_range = (far / 100, 2 * far)
 
     def _draw(self, still: Still) -> None:
-        """Draw the bodies, obstacles and arrows of a still."""
         subject, colouring = self._composition.subject, self._composition.colouring
         surface = surface_of(subject.surface(still.index), subject.triangles)
         for ground in still.overlays.grounds:
@@ -154,7 +153,7 @@ def _draw_arrow(plotter: pv.Plotter, tail: Floats, along: Floats) -> None:
 
 @contextmanager
 def quiet_opengl() -> Iterator[None]:
-    """Keep messages of the graphics libraries off the terminal. Raises InputError without OpenGL."""
+    """Keep messages of graphics libraries off the terminal. Raises InputError without OpenGL."""
     terminal = os.dup(2)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 2)

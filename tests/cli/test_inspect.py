@@ -12,11 +12,10 @@ from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
 
 from msmpetsc.build import build_model, fill_cages, read_bodies
-from msmpetsc.cli.commands.inspect import BYTES
+from msmpetsc.cli.commands.inspect import BYTES, Partition, count_partition
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import assemble, assembly_bytes
 from msmpetsc.solve.linear.unknowns import Ghosted, Unknowns

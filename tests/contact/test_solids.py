@@ -15,8 +15,7 @@ from surfaces import surface_of
 
 import msmpetsc as msm
 from msmpetsc.build import build_model
-from msmpetsc.contact.obstacles.distance import FunctionSolid
-from msmpetsc.contact.obstacles.mesh_solid import MeshSolid
+from msmpetsc.contact.obstacles.distance import FunctionSolid, MeshSolid
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
 from msmpetsc.contact.obstacles.solids import Solid
 from msmpetsc.extensions import OBSTACLES

@@ -17,8 +17,7 @@ from vtk.util.numpy_support import vtk_to_numpy
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
-from msmpetsc.export.formats import FORMATS, export
-from msmpetsc.export.moments import normals
+from msmpetsc.export.formats import FORMATS, export, normals
 from msmpetsc.results.xdmf import write_xdmf
 
 PINNED = [0, 3]

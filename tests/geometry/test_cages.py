@@ -23,7 +23,7 @@ from surfaces import body_of
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.geometry.touched_cells import touched_cells
+from msmpetsc.geometry.valid_cells import touched_cells
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))

@@ -4,14 +4,14 @@ import numpy as np
 
 from msmpetsc.constraints.loads import Motion
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-from msmpetsc.contact.obstacles.solids import BallSolid, Faces
+from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Planes
 
 STILL = Motion.through(())
 
 
 def plane(point: list[float], normal: list[float], path: Motion = STILL, **times: float) -> Obstacle:
     normal = np.array(normal) / np.linalg.norm(normal)
-    return Obstacle(Faces(np.array([point], float), normal[None]), path, **times)
+    return Obstacle(Faces(Planes(np.array([point], float), normal[None])), path, **times)
 
 
 def box(low: list[float], high: list[float], path: Motion = STILL, **times: float) -> Obstacle:

@@ -22,8 +22,18 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import Case
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.sizing import trials
-from msmpetsc.study.sizing.answer import SizePlan, overrides, put_into, tables
-from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
+from msmpetsc.study.sizing.choice import (
+    Budget,
+    Candidate,
+    Choice,
+    CostModel,
+    SizePlan,
+    Solving,
+    Stepping,
+    overrides,
+    put_into,
+    tables,
+)
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 from msmpetsc.study.sizing.trials import Asked, Sizer
 from msmpetsc.study.table import Row

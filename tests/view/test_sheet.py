@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
-from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.motion import Pin
+from msmpetsc.scene.schema import OfBody
 from msmpetsc.view import renderer, sheet
 from msmpetsc.view.camera import YAW, camera_facing
 from msmpetsc.view.composition import Still, Style, composition_of

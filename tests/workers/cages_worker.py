@@ -8,8 +8,8 @@ from mpi4py import MPI
 from scipy import ndimage
 
 from msmpetsc.geometry.cages import BodySurface, fill
-from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.geometry.valid_cells import Slab, cells_of_gaps, enclosed_gaps
 
 comm = MPI.COMM_WORLD
 FILLED = [("closed", 0.11), ("open", 0.11), ("one cell", 2.5)]

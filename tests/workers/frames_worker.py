@@ -10,7 +10,7 @@ from mpi4py import MPI
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
-from msmpetsc.results import layout, transfer
+from msmpetsc.results import layout
 from msmpetsc.results.writer import ResultFile
 
 NODES, POINTS, STEPS = 23, 17, 9
@@ -40,7 +40,7 @@ def share(rows: int) -> slice:
 
 
 def write_all(path: str, gathers: bool = False) -> None:
-    transfer.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
+    layout.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
     nodes, points = share(NODES), share(POINTS)
     with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}, gathers=gathers) as file:
         file.write("lattice/nodes", positions(0, NODES)[nodes])
@@ -68,7 +68,7 @@ def refuse(path: str) -> None:
 def fill_disk(path: str, gathers: bool = True) -> None:
     """The disk is full at the third frame, when the other ranks are already sending; or, not gathered, for one of them
     in the midst of its rows."""
-    transfer.PIECE_BYTES = 100
+    layout.PIECE_BYTES = 100
     nodes = share(NODES)
     store = h5py.Dataset.__setitem__
 

@@ -20,7 +20,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _table() -> list[str]:
-    """Return a table of the models with file size, location and licence."""
     lines = [f"{'name':12} {'MB':>6}  {'found':26} licence"]
     for name, model in MODELS.items():
         size, where = "-", "not here"

@@ -10,12 +10,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.statics import STATIC
+from msmpetsc.scene.time import STATIC
 from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables, overrides, put_into, tables
-from msmpetsc.study.sizing.choice import Choice
+from msmpetsc.study.sizing.choice import Choice, SizePlan, SizeTrial, Tables, overrides, put_into, tables
 from msmpetsc.study.sizing.trials import Asked, Sizer
 
 NOTHING_MEETS = 3

@@ -55,7 +55,6 @@ def style_of(args: argparse.Namespace) -> Style:
 
 
 def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
-    """Draw a result: moments of it, a film, or a page."""
     if path.suffix.lower() in PICTURE_NAMES:
         contact_sheet(args.subject, path, args.frames, args.count, style)
         return
@@ -71,7 +70,6 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
 
 
 def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
-    """Draw a scene as it lies before anything is run."""
     refuse_other_format("render", args.subject, (*RESULT_NAMES, *SCENE_NAMES))
     for option in ("frames", "count", "speed"):
         if getattr(args, option) is not None:

@@ -10,8 +10,7 @@ from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
-from msmpetsc.scene.bodies import held_by
-from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.schema import SceneFile, held_by
 from msmpetsc.view.drawable import read_scene
 
 SERIES = (

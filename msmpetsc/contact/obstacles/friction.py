@@ -141,7 +141,7 @@ class NodeFriction(Friction):
         return tangential
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
+        """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) it acts on."""
         gradient[self.nodes] += self.force(q)
 
     def blocks(self, q: Positions, true: bool, secant: Mask | None = None) -> Rows:
@@ -160,13 +160,14 @@ def smallest(bounds: Rows) -> float:
 
 
 class Movers(NamedTuple):
-    """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, those
-    that move as rows or (n,) bool, and 1 / mass (n,) [1/kg]."""
+    """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, the rows
+    of those that move, 1 / mass (n,) [1/kg], and grad E (n or more, 3) [N]."""
 
     q: Positions
     v: Rows
-    rows: Indices | Mask
+    rows: Indices
     per_mass: Floats
+    gradient: Rows
 
 
 def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: float) -> None:

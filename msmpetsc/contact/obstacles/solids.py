@@ -6,6 +6,7 @@ Each at its place at time 0; where an obstacle has moved, positions are as seen 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -50,6 +51,29 @@ class Solid(ABC):
     def sent(self, send: Send) -> "Solid":
         """Return it with the arrays that each step works with sent where ``send`` takes them."""
         return self
+
+
+class Planes(NamedTuple):
+    """Planes of faces, (f, 3) each: a point [m], and the unit normal towards the free side."""
+
+    points: Positions
+    normals: Rows
+
+
+class Depths(NamedTuple):
+    """Sides (n or more,) of nodes; their depths (n,) [m] and faces (n,), to be written to."""
+
+    sides: Indices
+    depths: Floats
+    faces: Indices
+
+
+class Ways(NamedTuple):
+    """Ends (n, 3) [m] of nodes' ways, sides (n,) before, and after (n,), to be written to."""
+
+    ends: Positions
+    before: Indices
+    sides: Indices
 
 
 @numba.njit(cache=True, inline="always")
@@ -123,64 +147,57 @@ def side_of(q: Positions, end: Positions, i: int, points: Positions, normals: Ro
 
 
 @kernel
-def _depths_of(
-    first: int, count: int, step: int, q: Positions, points: Positions, normals: Rows,
-    sides: Indices, depths: Floats, face: Indices,
-) -> None:  # fmt: skip
+def _depths_of(first: int, count: int, step: int, q: Positions, planes: Planes, of: Depths) -> None:
+    points, normals = planes
     for i in range(first, count, step):
-        depths[i], face[i] = depth(q, i, points, normals, sides[i])
+        of.depths[i], of.faces[i] = depth(q, i, points, normals, of.sides[i])
 
 
 @kernel
-def _sides_of(
-    first: int, count: int, step: int, q: Positions, end: Positions, points: Positions,
-    normals: Rows, before: Indices, sides: Indices,
-) -> None:  # fmt: skip
+def _sides_of(first: int, count: int, step: int, q: Positions, planes: Planes, ways: Ways) -> None:
+    points, normals = planes
+    ends, before, sides = ways
     for i in range(first, count, step):
-        sides[i] = side_of(q, end, i, points, normals, before[i])
+        sides[i] = side_of(q, ends, i, points, normals, before[i])
 
 
 @dataclass(frozen=True)
 class Faces(Solid):
-    """The points behind all faces: one face is a plane, six are a box.
+    """The points behind all faces: one face is a plane, six are a box."""
 
-    points, normals : (f, 3) a point of each face [m], its unit normal towards the free side
-    """
-
-    points: Positions
-    normals_of_faces: Rows
+    planes: Planes
 
     @classmethod
     def of_box(cls, low: Positions, high: Positions) -> "Faces":
         """Return the box between two corners (3,) [m]."""
         points = np.repeat(np.array([low, high], float), 3, axis=0)  # the faces that meet at each of the two corners
-        return cls(points, np.concatenate([-np.eye(3), np.eye(3)]))
+        return cls(Planes(points, np.concatenate([-np.eye(3), np.eye(3)])))
 
     @property
     def has_sides(self) -> bool:
-        return len(self.points) > 1
+        return len(self.planes.points) > 1
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        depths, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
         sides = no_sides(q) if sides is None else sides
-        _depths_of(len(q), q, self.points, self.normals_of_faces, sides, depths, face)
-        return depths, face
+        of = Depths(sides, np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q))
+        _depths_of(len(q), q, self.planes, of)
+        return of.depths, of.faces
 
     def normals(self, q: Positions, face: Indices) -> Rows:
-        return self.normals_of_faces[face]
+        return self.planes.normals[face]
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        deeper: Floats = -(moved * self.normals_of_faces[face]).sum(axis=1)
+        deeper: Floats = -(moved * self.planes.normals[face]).sum(axis=1)
         return deeper
 
     def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
         """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3), ``before`` (n,) having sides."""
-        sides = no_sides(q)
-        _sides_of(len(q), q, end, self.points, self.normals_of_faces, before, sides)
-        return sides
+        ways = Ways(end, before, no_sides(q))
+        _sides_of(len(q), q, self.planes, ways)
+        return ways.sides
 
     def sent(self, send: Send) -> "Faces":
-        return replace(self, points=send(self.points), normals_of_faces=send(self.normals_of_faces))
+        return Faces(Planes(*map(send, self.planes)))
 
 
 @dataclass(frozen=True)

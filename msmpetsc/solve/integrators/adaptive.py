@@ -53,17 +53,14 @@ EXCESS = 2.0  # times what a step may spend: it is taken all the same, the next 
 CALM = 2  # steps that would have let the next be twice as long, before it is
 
 
-def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
-    """Local error (n, 3) [m] of a step of implicit Euler from q with velocity v to x with velocity w."""
-    return 0.5 * time_step * (w - v)
+ORDERS = {"implicit-euler": 1, "bdf2": 2}
 
 
-def bdf2_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
-    """Local error (n, 3) [m] of a step of BDF2 from q with velocity v to x with velocity w."""
+def local_error(order: int, q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
+    """Local error (n, 3) [m] of a step of an order from q with velocity v to x with velocity w."""
+    if order == 1:
+        return 0.5 * time_step * (w - v)
     return 1.6 * (x - q - 0.5 * time_step * (v + w))
-
-
-METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order, local error
 
 
 class NeighbourMean:
@@ -92,7 +89,7 @@ def refuse_bad_steps(time: Time) -> None:
         if time.shortest is not None or time.longest is not None:
             raise InputError("time.shortest and time.longest are for the steps that time.error chooses: give that, too")
         return
-    if time.integrator not in METHODS:
+    if time.integrator not in ORDERS:
         raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
     if not (time.shortest or time.step) <= time.step <= (time.longest or time.step):
         raise InputError(f"time.step = {time.step:g} s must lie between time.shortest and time.longest")
@@ -240,7 +237,7 @@ class Adaptive(Integrator):
         self.balance, self.comm = balance, balance.comm
         self.lattice, self.environment = balance.lattice, balance.environment
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
-        self.order, self.local_error = METHODS[scene.time.integrator]
+        self.order = ORDERS[scene.time.integrator]
         steps = scene.time.steps
         lowest = LOWEST
         if scene.time.shortest is not None:
@@ -347,7 +344,7 @@ class Adaptive(Integrator):
         end = self._reached(self.tick + self.ticks.length(level))
         free = mass * ~self.environment.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
-        local = self.mean(self.local_error(q, v, x, w, t) * (free > 0)[:, None])
+        local = self.mean(local_error(self.order, q, v, x, w, t) * (free > 0)[:, None])
         sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
         coming = t * v
         if not self.control.motion:  # of a run that begins from rest: what will move until the next frame

@@ -199,9 +199,12 @@ class ImplicitEuler(Integrator):
     def _new_stepper(self, lattice: Lattice) -> Stepper:
         """Make the solver for the free nodes of a lattice."""
         solver = self.solver
+        if self.retardation:
+            factor = self.retardation / self.tau
+            lattice = replace(lattice, stiffness=(1 + factor) * lattice.stiffness, viscous=factor)
         return Stepper(
             self.comm,
-            lattice.with_viscosity(self.retardation / self.tau) if self.retardation else lattice,
+            lattice,
             self.damped_tau,
             find_preset(solver.preset),
             solver.error,

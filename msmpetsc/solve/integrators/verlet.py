@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
+from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest, like
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -199,14 +199,17 @@ class Verlet(Integrator):
         """Change v by the forces at ``time``; obstacles move as in the substep to its end."""
         self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
-        load, before = self.environment.load(time), None if beyond is None else self.v.copy()
-        kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
+        load = self.environment.load(time)
+        before = None if beyond is None else self.v.copy()
+        kick(len(self.free), load, duration, self._movers())
         if beyond is not None and before is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
             self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
         self._damp(0.5 * duration)
         self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)
-        nodes = Movers(self.q, self.v, self.free, self.per_mass)
-        self.environment.apply_friction(nodes, time, duration, (begin, end), self.sides)
+        self.environment.apply_friction(self._movers(), time, duration, (begin, end), self.sides)
+
+    def _movers(self) -> Movers:
+        return Movers(self.q, self.v, self.free, self.per_mass, self.gradient)
 
     def _damp(self, duration: float) -> None:
         """Slow the free nodes down as damping by the mass does in this time [s]."""
@@ -216,7 +219,7 @@ class Verlet(Integrator):
     def _drift(self, begin: float, end: float) -> None:
         """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
         self._hold(end)
-        drift(len(self.free), self.free, self.v, end - begin, self.q)
+        drift(len(self.free), self.q, end - begin, self._movers())
         prescribed = self.environment.prescribed(self.position.values, end)
         if prescribed is not None:
             anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
@@ -345,21 +348,18 @@ def crushing_energy(lattice: Lattice) -> float:
 
 
 @kernel
-def kick(
-    first: int, count: int, step: int, rows: Indices, per_mass: Floats, load: Rows, gradient: Rows, duration: float,
-    v: Rows,
-) -> None:  # fmt: skip
-    """v += duration M^(-1) (f_ext - grad E) at the rows of (l, 3) arrays."""
+def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: Movers) -> None:
+    """v += duration M^(-1) (f_ext - grad E)."""
     for row in range(first, count, step):
-        i = rows[row]
+        i = nodes.rows[row]
         for c in range(3):
-            v[i, c] += duration * per_mass[i] * (load[i, c] - gradient[i, c])
+            nodes.v[i, c] += duration * nodes.per_mass[i] * (load[i, c] - nodes.gradient[i, c])
 
 
 @kernel
-def drift(first: int, count: int, step: int, rows: Indices, v: Rows, duration: float, q: Positions) -> None:
-    """q += duration v at the rows of (l, 3) arrays."""
+def drift(first: int, count: int, step: int, q: Positions, duration: float, nodes: Movers) -> None:
+    """q += duration v."""
     for row in range(first, count, step):
-        i = rows[row]
+        i = nodes.rows[row]
         for c in range(3):
-            q[i, c] += duration * v[i, c]
+            q[i, c] += duration * nodes.v[i, c]

@@ -5,6 +5,8 @@ then their y, then their z: so its local array is an m x 3 dense block, which a 
 can multiply at once.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -99,7 +101,7 @@ class Unknowns:
 
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
-        _scaled_sum(self.size, self.inertia, a, t2, b, self.rows, self.columns_to_write(vector))
+        _scaled_sum(self.size, self.columns_to_write(vector), Terms(self.inertia, a, t2, b, self.rows))
 
     def destroy(self) -> None:
         """Collective."""
@@ -166,10 +168,19 @@ def _collect(first: int, count: int, step: int, nodes: Rows, rows: Indices, colu
             columns[c, i] = nodes[rows[i], c]
 
 
+class Terms(NamedTuple):
+    """What the sum M a + t^2 b is made of, at some rows of arrays of nodes."""
+
+    mass: Floats
+    a: Array
+    t2: float
+    b: Array
+    rows: Array
+
+
 @kernel
-def _scaled_sum(
-    first: int, count: int, step: int, mass: Floats, a: Array, t2: float, b: Array, rows: Indices, columns: Rows
-) -> None:
+def _scaled_sum(first: int, count: int, step: int, columns: Rows, of: Terms) -> None:
     for i in range(first, count, step):
+        row = of.rows[i]
         for c in range(3):
-            columns[c, i] = mass[rows[i]] * a[rows[i], c] + t2 * b[rows[i], c]
+            columns[c, i] = of.mass[row] * of.a[row, c] + of.t2 * of.b[row, c]

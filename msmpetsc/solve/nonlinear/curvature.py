@@ -323,12 +323,9 @@ class LowestCurvature:
 
     def _unit(self, directions: Rows) -> Rows:
         """Directions scaled to unit length in the norm of M; those of no length stay so."""
-        lengths: Rows = like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
-        return directions / lengths
-
-    def _lengths(self, directions: Rows) -> Floats:
         squares: Floats = self.comm.allreduce(to_host(directions**2 @ self.functional.mass))
-        return np.sqrt(squares)
+        lengths: Rows = like(directions, np.maximum(np.sqrt(squares), TINY))[:, None]
+        return directions / lengths
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store the mode and what was searched: another long search at each checkpoint would cost a tenth of a run."""

@@ -14,8 +14,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, greatest
 from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import KNOWN
-from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
+from msmpetsc.solve.nonlinear.error_control import KNOWN, ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much

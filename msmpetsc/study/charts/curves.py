@@ -181,8 +181,11 @@ def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
         chart.title += f": {next(iter(scenes))}"
     for scene, rows in scenes.items():
         draw_sizes(chart, scene, rows.sort_values("cells", kind="stable"))
-        lines = [what_takes(rows, level) for level in (0.1, 0.03, 0.01)]
-        chart.findings[f"What an error of the surface takes: {scene}"] = lines
+        chart.findings[f"What an error of the surface takes: {scene}"] = lines = []
+        curves = grouped(rows, "label").items()
+        for level in (0.1, 0.03, 0.01):
+            ends = ", ".join(f"{label} {reached(of, level)}" for label, of in curves)
+            lines.append(f"{100 * level:g}%: {ends}.")
     return [chart]
 
 
@@ -194,12 +197,6 @@ def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
     over_cells = chart.panel("", log_axis("valid cells", rows["cells"], COUNT), y)
     for panel, columns in ((over_cost, SIZE), (over_cells, ("cells", "surface_error"))):
         panel.curves(rows, columns, (*columns[::-1], "cells", "time_step", "error"))
-
-
-def what_takes(rows: DataFrame, level: float) -> str:
-    """Return a sentence with the cells and the time that each way to step takes for an error."""
-    curves = ", ".join(f"{label} {reached(of, level)}" for label, of in grouped(rows, "label").items())
-    return f"{100 * level:g}%: {curves}."
 
 
 def reached(rows: DataFrame, level: float) -> str:

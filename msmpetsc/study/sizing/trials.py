@@ -9,13 +9,23 @@ from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.statics import STATIC
+from msmpetsc.scene.time import STATIC
 from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, inverted_bound, size_bounds
-from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
+from msmpetsc.study.sizing.choice import (
+    Budget,
+    Candidate,
+    Choice,
+    CostModel,
+    SizePlan,
+    SizeTrial,
+    Solving,
+    Stepping,
+    inverted_bound,
+    size_bounds,
+)
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
@@ -293,7 +303,6 @@ class Sizer:
     # What is said
 
     def _bounds(self, plan: SizePlan, model: CostModel) -> list[str]:
-        """Return what bounds the error, in words."""
         inverted = inverted_bound(self.trials, self.as_given.material.law)
         bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted]
         if not plan.met:

@@ -14,56 +14,6 @@ from msmpetsc.lattice.lattice import Lattice
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
 RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lung pressed to 30% torn
 
-# Floating point operations of the CPU's loops over springs and cells, for PETSc's log, one spring a turn: Hooke's law
-# first, what stiffening adds second. Each +, -, x, /, square root and maximum counts as one, as PETSc counts its own.
-# p_a - p_b 3, its length 6, the pull k (1 - r / l) 4, times p_a - p_b 3, added to both ends 6; its strain and law 6
-GRADIENT = 22, 6
-# three differences 9, two lengths 12, l + l' 1, how much longer it is 10, the energy 6; two strains and the law 11
-CHANGE = 38, 11
-# p_a - p_b 3, its length 7, 1 - r / l 2, along it 4, c and e 4; its strain and both moduli 10
-HESSIAN = 20, 10
-# v_a - v_b 3, e . d 5, c d + (e . d) e 9, added to both ends 6
-PRODUCT = 23
-# edges and cofactors of a corner 36, its lack of volume 8, its slope 4; those few that resist have more, not counted
-CORNER = 48
-# of a neo-Hookean cell: the seven sums of 3 components 72, their slopes and modes 63, forces of the modes 54 and of the
-# corners 144, F and its cofactors 36, J 5, U' and U'' 11, P 27; of a product more by what F x G and cof F : G take
-SOLID_GRADIENT, SOLID_PRODUCT, SOLID_HESSIAN, SOLID_CHANGE = 412, 510, 196, 760
-LEAST_VOLUME = 155  # of a cell: twelve edges 36, eight corners' volumes 112, their minimum 7
-# of a node, all its coordinates: M (x - y) + t^2 (grad E - f), the inertia and work of a change, M v + t^2 p
-GRADIENT_ROW, CHANGE_ROW, PRODUCT_ROW = 15, 36, 9
-
-
-@dataclass(frozen=True)
-class Flops:
-    """Operations of one call on this rank: the gradient of g, a change of g, the Hessian at a point, a product."""
-
-    gradient: int
-    change: int
-    hessian: int
-    product: int
-
-    @classmethod
-    def of_lattice(cls, lattice: Lattice) -> "Flops":
-        """Return the operations on a lattice, M included."""
-        springs, stiffens, owned = len(lattice.springs), lattice.stiffening > 0, lattice.owned
-        if lattice.solid is not None:
-            around = len(lattice.local_cells) * (2 if lattice.viscous else 1)
-            return cls(
-                SOLID_GRADIENT * around + GRADIENT_ROW * owned,
-                SOLID_CHANGE * lattice.cells_owned + CHANGE_ROW * owned,
-                SOLID_HESSIAN * around,
-                SOLID_PRODUCT * around + PRODUCT_ROW * owned,
-            )
-        cells = len(lattice.local_cells) if stiffens else 0
-        gradient, change, hessian = (a + stiffens * b for a, b in (GRADIENT, CHANGE, HESSIAN))
-        return cls(
-            gradient * springs + 8 * CORNER * cells + GRADIENT_ROW * owned,
-            change * lattice.springs_owned + 2 * LEAST_VOLUME * cells + CHANGE_ROW * owned,
-            hessian * springs + LEAST_VOLUME * cells,
-            PRODUCT * springs + PRODUCT_ROW * owned,
-        )
-
 
 class Elasticity:
     """E of this rank's part of a lattice, its gradient and its Hessian.
@@ -72,12 +22,12 @@ class Elasticity:
     that law stiffens, of stiffening ones and of cells that resist being turned inside out (elasticity.cell_volume).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the owned
-    nodes. ``springs``, ``cells``, ``solid`` and ``viscosity`` are None where the law has none; ``flops`` are of one
-    call. Where there is viscosity E has its D, of the step that it was given last.
+    nodes. ``springs``, ``cells``, ``solid`` and ``viscosity`` are None where the law has none. Where there is viscosity
+    E has its D, of the step that it was given last.
     """
 
     def __init__(self, lattice: Lattice):
-        self.owned, self.flops = lattice.owned, Flops.of_lattice(lattice)
+        self.owned = lattice.owned
         on_cpu = on_host(lattice.nodes)
         self.springs: SpringScatter | SpringGather | None = None
         self.cells: Cells | None = None

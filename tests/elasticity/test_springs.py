@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from lattices import one_spring
 
-from msmpetsc.elasticity.energy import Flops
 from msmpetsc.elasticity.springs import (
     OwnedSprings,
     Springs,
@@ -109,8 +107,3 @@ def test_springs_without_length_pull_nothing_and_give_no_nan(elastic: Springs):
     np.testing.assert_array_equal(gradient(q, elastic), 0)
     assert np.isfinite(hessian_times(q, Q, elastic=elastic)).all()
     assert OwnedSprings(elastic).energy(q) == pytest.approx((0.5 + elastic[3] / 4) * STIFFNESS @ REST**2)
-
-
-def test_a_lattice_has_the_operations_of_its_springs_and_nodes():
-    counts = Flops.of_lattice(one_spring(1.0, 1.0, 1.0))
-    assert (counts.gradient, counts.change, counts.hessian, counts.product) == (22 + 30, 38 + 72, 20, 23 + 18)

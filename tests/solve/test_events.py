@@ -1,4 +1,4 @@
-"""Events, stages and flops in PETSc's log, products with the Hessian, and what --measure makes of them."""
+"""Events and stages in PETSc's log, products with the Hessian, and what --measure makes of them."""
 
 import json
 import re
@@ -16,17 +16,17 @@ SWINGS = {
     "time": {"step": 1 / 60, "duration": FRAMES / 60},
     "solver": {"preset": "newton", "error": 1e-6},
 }
-LINE = re.compile(r"^(\S.*?) +(\d+) \S+ (\S+) \S+ (\S+) ")  # name, count, seconds, flops
+LINE = re.compile(r"^(\S.*?) +(\d+) \S+ (\S+) ")  # name, count, seconds
 
 
-def logged(text: str) -> dict[str, dict[str, tuple[int, float, float]]]:
-    """Of each stage of -log_view its events: count, seconds, flops."""
+def logged(text: str) -> dict[str, dict[str, tuple[int, float]]]:
+    """Of each stage of -log_view its events: count and seconds."""
     tables = text.split("\nEvent  ", 1)[1].split("Object Type", 1)[0]
     stages = {}
     for part in tables.split("--- Event Stage ")[1:]:
         name, _, rows = part.partition("\n")
         found = (LINE.match(row) for row in rows.splitlines())
-        stages[name.split(": ")[1]] = {m[1]: (int(m[2]), float(m[3]), float(m[4])) for m in found if m}
+        stages[name.split(": ")[1]] = {m[1]: (int(m[2]), float(m[3])) for m in found if m}
     return stages
 
 
@@ -57,15 +57,7 @@ def test_ghosts_and_contact_are_told_on_two_ranks(tmp_path: Path):
     done = on_ranks(2, "-m", "msmpetsc", "run", *words, status=0)
     steps = logged(done.stdout)["steps"]
     assert steps["msmpetsc ghosts"][0] >= steps["msmpetsc product"][0] + steps["msmpetsc gradient"][0]
-    assert steps["msmpetsc contact"][2] > 0
-
-
-def test_flops_of_a_product_are_those_of_its_springs(run: tuple):
-    stages, cost, _ = run
-    count, _, flops = stages["steps"]["msmpetsc product"]
-    assert 23 * cost["springs"] < flops / count < 27 * cost["springs"]
-    count, _, flops = stages["steps"]["msmpetsc gradient"]
-    assert 22 * cost["springs"] < flops / count < 27 * cost["springs"]
+    assert steps["msmpetsc contact"][0] > 0
 
 
 def test_times_are_of_all_stages_of_the_run_but_not_of_its_reference(run: tuple):

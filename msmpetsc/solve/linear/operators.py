@@ -16,7 +16,7 @@ from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.petsc.device import Memory
-from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
+from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT
 
 
 class Block:
@@ -60,7 +60,6 @@ class ContactBlocks:
             x, y = self.unknowns.columns(x), self.unknowns.columns_to_write(y)
             for rows, blocks in self.parts:
                 y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
-                count_flops(18 * len(rows))
 
 
 class ThreeColumns:
@@ -107,7 +106,6 @@ class TrueHessian:
         ``secants`` the true curvature of some friction (contact.obstacles.penalty)."""
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
-            count_flops(self.elasticity.flops.hessian)
             if self.contact:
                 self.contact.linearise(contact, q, True, secants)
             secant = secants[-1] if secants else None  # of the surface
@@ -130,7 +128,6 @@ class TrueHessian:
                 with CONTACT:
                     self.surface.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
-            count_flops(self.elasticity.flops.product)
             if self.contact:
                 self.contact.add(x, y)
 

@@ -29,7 +29,7 @@ from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import CoarseOperator, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import device
-from msmpetsc.solve.petsc.events import FINE, count_flops
+from msmpetsc.solve.petsc.events import FINE
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
@@ -293,7 +293,6 @@ class ProjectedHessian:
             if self.joined:
                 self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
-            count_flops(self.elasticity.flops.product + 18 * len(self.contact))
 
 
 class DiagonalBlocks:
@@ -308,7 +307,6 @@ class DiagonalBlocks:
         apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, moved)
         if self.hessian.smoother:
             self.hessian.smoother.correct(moved)
-        count_flops(15 * unknowns.size)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")

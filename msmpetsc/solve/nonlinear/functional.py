@@ -17,7 +17,7 @@ from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT, count_flops
+from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
 
 ROUNDINGS = 3 * np.finfo(float).eps  # of a row of F: in free fall one eps was passed now and then
 SINGLE_ROW = 10.0  # times as much in a single row
@@ -96,7 +96,6 @@ class StepFunctional:
                 with CONTACT:
                     problem.contact.add_gradient(q, gradient)
             self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
-            count_flops(self.elasticity.flops.gradient)
         return Iterate(q, f)
 
     def value(self, q: Positions, met: bool = False) -> float:
@@ -122,7 +121,6 @@ class StepFunctional:
             twice = q[owned] + base[owned] - 2 * problem.y[owned]
             inertia = 0.5 * self._inner(moved, twice)
             elastic = self.elasticity.change(q, base) - float(np.vdot(moved, problem.load))
-            count_flops(self.elasticity.flops.change)
             if problem.contact:
                 with CONTACT:
                     elastic += problem.contact.change(q, base)

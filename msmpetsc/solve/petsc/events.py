@@ -28,8 +28,6 @@ GHOSTS = PETSc.Log.Event("msmpetsc ghosts")
 FILES = PETSc.Log.Event("msmpetsc output")
 LOCAL = PETSc.Log.Event("msmpetsc local")  # all that is done spring by spring outside of KSP
 
-count_flops = PETSc.Log.logFlops
-
 
 def begun(stage: PETSc.Log.Stage) -> ExitStack:
     """Begin a stage, which ends when the stack is closed; -log_view shows it from then on."""

@@ -27,6 +27,7 @@ from msmpetsc.elasticity.neo_hookean import (
     volume_energy,
     write_state,
 )
+from msmpetsc.elasticity.springs import Way
 
 
 @numba.njit(cache=True, inline="always")
@@ -105,9 +106,8 @@ def _write_energies(first: int, count: int, step: int, q: Positions, cells: Cell
 
 
 @kernel
-def _write_changes(
-    first: int, count: int, step: int, moved: Rows, base: Positions, cells: CellRows, parts: Floats,
-) -> None:  # fmt: skip
+def _write_changes(first: int, count: int, step: int, parts: Floats, cells: CellRows, way: Way) -> None:
+    base, _, moved = way
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
         before, more = changes(gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4))
@@ -147,5 +147,5 @@ def cell_energies(blocks: Blocks, q: Positions, energies: Rows) -> None:
 def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
     """Return E(q) - E(base) [J] of the cells that the rank owns, by how the nodes moved: it keeps its digits."""
     parts = np.empty(LANES * blocks.owned, like=q)
-    _write_changes(len(parts), q - base, base, one_by_one(blocks), parts)
+    _write_changes(len(parts), parts, one_by_one(blocks), Way.to(q, base))
     return float(parts.sum())

@@ -12,8 +12,7 @@ row of its own, and each node sums those of its cells, so that sums come out the
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -22,7 +21,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_h
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.cell_blocks import add_corners, rows_of
 from msmpetsc.elasticity.cell_strain import Six, strain
-from msmpetsc.elasticity.springs import Product, Vector, between, dot
+from msmpetsc.elasticity.springs import Product, Vector, Way, between, dot
 from msmpetsc.lattice.lattice import Lattice
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed
@@ -31,6 +30,36 @@ FRAMES = np.array(
 )
 
 Frame = tuple[Vector, Vector, Vector]  # of a corner's three edges, one each
+
+
+class Resistance(NamedTuple):
+    """Cells that resist, and what their corners add to.
+
+    cells     : (c, 8) local corner nodes
+    stiffness : (c,) K [J] of each
+    volume    : J_0 h^3 [m^3]
+    rows      : (c, 8) rows of a sum: on a CPU those of the nodes
+    """
+
+    cells: Indices
+    stiffness: Floats
+    volume: float
+    rows: Indices
+
+
+class Shapes(NamedTuple):
+    """Corner nodes (c, 8) of a solid's cells, and their forms (c, FORM) (lattice.cell_moments)."""
+
+    cells: Indices
+    forms: Rows
+
+
+class ResistanceAt(NamedTuple):
+    """Cells that resist at positions q (l, 3) [m]; ``projected``: without what the curvature of J adds."""
+
+    law: Resistance
+    q: Positions
+    projected: bool = True
 
 
 @numba.njit(cache=True, inline="always")
@@ -136,30 +165,25 @@ def _least_volume_of(
 
 
 @kernel
-def _energy_of(
-    first: int, count: int, step: int, q: Positions, cells: Indices, resistance: Floats,
-    least: float, parts: Floats,
-) -> None:  # fmt: skip
+def _energy_of(first: int, count: int, step: int, parts: Floats, law: Resistance, q: Positions) -> None:
     for i in range(first, count, step):
         energy = 0.0
         for frame in range(8):
-            e = edges(q, cells[i], frame)
-            lack = max(lack_of(_volume(e[0], e[1], e[2]), least), 0.0)
-            energy += resistance[i] * lack**3
+            e = edges(q, law.cells[i], frame)
+            lack = max(lack_of(_volume(e[0], e[1], e[2]), law.volume), 0.0)
+            energy += law.stiffness[i] * lack**3
         parts[i] = energy
 
 
 @kernel
-def _change_of(
-    first: int, count: int, step: int, q: Positions, base: Positions, moved: Rows, cells: Indices,
-    stiffness: Floats, least: float, parts: Floats,
-) -> None:  # fmt: skip
+def _change_of(first: int, count: int, step: int, parts: Floats, law: Resistance, way: Way) -> None:
+    base, q, moved = way
     for i in range(first, count, step):
-        change = 0.0
-        if min(least_volume(q, cells[i]), least_volume(base, cells[i])) < least:  # of few; it reads each edge once
+        change, cell = 0.0, law.cells[i]
+        if min(least_volume(q, cell), least_volume(base, cell)) < law.volume:  # of few; it reads each edge once
             for frame in range(8):
-                e, before, d = edges(q, cells[i], frame), edges(base, cells[i], frame), edges(moved, cells[i], frame)
-                change += corner_change(e, before, d, stiffness[i], least)
+                e, before, d = edges(q, cell, frame), edges(base, cell, frame), edges(moved, cell, frame)
+                change += corner_change(e, before, d, law.stiffness[i], law.volume)
         parts[i] = change
 
 
@@ -178,28 +202,19 @@ def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
 
 
 @kernel
-def _volume_ratio_of(
-    first: int, count: int, step: int, q: Positions, cells: Indices, forms: Rows, volume: float, ratios: Floats,
-) -> None:  # fmt: skip
+def _mean_volume_of(first: int, count: int, step: int, volumes: Floats, q: Positions, shapes: Shapes) -> None:
+    cells, forms = shapes
     for i in range(first, count, step):
         f, c = forms[i], cells[i]
         form = f[0], f[1], f[2], f[3], f[4], f[5]
-        ratios[i] = _volume(_mean_slope(q, c, 0, form), _mean_slope(q, c, 1, form), _mean_slope(q, c, 2, form)) / volume
+        volumes[i] = _volume(_mean_slope(q, c, 0, form), _mean_slope(q, c, 1, form), _mean_slope(q, c, 2, form))
 
 
 def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -> Floats:
     """Return J (c,) of a solid's cells: det of the mean slope of q (l, 3) [m] over what is inside, 1 at rest [-]."""
-    ratios = np.empty(len(cells), like=q)
-    _volume_ratio_of(len(cells), q, cells, forms, (4.0 * cell_size) ** 3, ratios)
-    return ratios
-
-
-class Resistance(NamedTuple):
-    """Cells that resist: their local corner nodes (c, 8), K (c,) [J] of each, and J_0 h^3 [m^3]."""
-
-    cells: Indices
-    stiffness: Floats
-    volume: float
+    volumes: Floats = np.empty(len(cells), like=q)
+    _mean_volume_of(len(cells), volumes, q, Shapes(cells, forms))
+    return volumes / (4.0 * cell_size) ** 3
 
 
 @numba.njit(cache=True)
@@ -239,46 +254,42 @@ def vector_of(role: int, vectors: Frame) -> Vector:
 
 
 @kernel
-def _add_gradient(
-    first: int, count: int, step: int, q: Positions, cells: Indices, stiffness: Floats,
-    volume: float, at: Indices, gradient: Rows,
-) -> None:  # fmt: skip
+def _add_gradient(first: int, count: int, step: int, gradient: Rows, cells: ResistanceAt) -> None:
+    law, q, _ = cells
     for i in range(first, count, step):
         for frame in range(8):
-            e = edges(q, cells[i], frame)
+            e = edges(q, law.cells[i], frame)
             n = cofactors(e)
-            slope = corner_slope(e, n, stiffness[i], volume)
+            slope = corner_slope(e, n, law.stiffness[i], law.volume)
             if slope < 0.0:
-                _add_corner(gradient, at[i], frame, slope, n)
+                _add_corner(gradient, law.rows[i], frame, slope, n)
 
 
 @kernel
-def _add_product(
-    first: int, count: int, step: int, q: Positions, cells: Indices, stiffness: Floats,
-    volume: float, at: Indices, projected: bool, v: Rows, product: Rows,
-) -> None:  # fmt: skip
+def _add_product(first: int, count: int, step: int, product: Rows, cells: ResistanceAt, v: Rows) -> None:
+    law, q, projected = cells
     for i in range(first, count, step):
         for frame in range(8):
-            e = edges(q, cells[i], frame)
+            e = edges(q, law.cells[i], frame)
             n = cofactors(e)
-            if corner_slope(e, n, stiffness[i], volume) < 0.0:
-                p = corner_product(e, n, edges(v, cells[i], frame), stiffness[i], volume, projected)
-                _add_corner(product, at[i], frame, 1.0, p)
+            if corner_slope(e, n, law.stiffness[i], law.volume) < 0.0:
+                w = edges(v, law.cells[i], frame)
+                _add_corner(
+                    product, law.rows[i], frame, 1.0, corner_product(e, n, w, law.stiffness[i], law.volume, projected)
+                )
 
 
 @kernel
-def _add_bound(
-    first: int, count: int, step: int, q: Positions, cells: Indices, stiffness: Floats,
-    volume: float, at: Indices, blocks: Rows,
-) -> None:  # fmt: skip
+def _add_bound(first: int, count: int, step: int, blocks: Rows, cells: ResistanceAt) -> None:
+    law, q, _ = cells
     for i in range(first, count, step):
         for frame in range(8):
-            e = edges(q, cells[i], frame)
+            e = edges(q, law.cells[i], frame)
             n = cofactors(e)
-            curvature = corner_curvature(e, n[0], stiffness[i], volume)
+            curvature = corner_curvature(e, n[0], law.stiffness[i], law.volume)
             if curvature > 0.0:
                 for role in range(4):
-                    add_square(blocks[at[i, FRAMES[frame, role]]], 2.0 * curvature, vector_of(role, n))
+                    add_square(blocks[law.rows[i, FRAMES[frame, role]]], 2.0 * curvature, vector_of(role, n))
 
 
 @dataclass(frozen=True)
@@ -297,7 +308,8 @@ class Cells:
     def of_lattice(cls, lattice: Lattice, stiffness: Floats, volume: float) -> "Cells":
         """Return the cells of a lattice, in the memory that its nodes are in."""
         cells, stiffness, owned = lattice.local_cells, like(lattice.nodes, stiffness), slice(lattice.cells_owned)
-        laws = Resistance(cells, stiffness, volume), Resistance(cells[owned], stiffness[owned], volume)
+        own = cells[owned]
+        laws = Resistance(cells, stiffness, volume, cells), Resistance(own, stiffness[owned], volume, own)
         if on_host(lattice.nodes):
             return cls(*laws)
         around = rows_of(to_host(cells).ravel(), lattice.owned)
@@ -306,38 +318,42 @@ class Cells:
     def energy(self, q: Positions) -> float:
         """Return the energy [J] of the cells that this rank owns."""
         parts = np.empty(len(self.owned.cells), like=q)
-        _energy_of(len(parts), q, *self.owned, parts)
+        _energy_of(len(parts), parts, self.owned, q)
         return float(parts.sum())
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy at q less that at base [J], corner by corner so that a small change keeps its digits."""
         parts = np.empty(len(self.owned.cells), like=q)
-        _change_of(len(parts), q, base, q - base, *self.owned, parts)
+        _change_of(len(parts), parts, self.owned, Way.to(q, base))
         return float(parts.sum())
 
-    def resisting(self, q: Positions) -> tuple[Resistance, Indices]:
-        """Return the cells that resist at q, few, so that sums need not visit the others, and the rows (k, 8) that
-        their corners add to."""
+    def resisting(self, q: Positions) -> Resistance:
+        """Return the cells that resist at q, few, so that sums need not visit the others."""
         few = np.flatnonzero(least_volumes(q, self.law.cells) < self.law.volume)
-        law = Resistance(self.law.cells[few], self.law.stiffness[few], self.law.volume)
-        return law, law.cells if self.around is None else 8 * few[:, None] + like(few, np.arange(8))
+        cells = self.law.cells[few]
+        rows = cells if self.around is None else 8 * few[:, None] + like(few, np.arange(8))
+        return Resistance(cells, self.law.stiffness[few], self.law.volume, rows)
 
-    def _sum(self, loop: Callable[..., None], q: Positions, few: tuple[Resistance, Indices], *arguments: Any) -> None:
-        """Let a loop over the ``few`` cells that resist at q add to the rows of the last of its arguments."""
-        (law, at), (*given, rows) = few, arguments
+    def _sum(self, loop: Callable[..., None], cells: ResistanceAt, rows: Rows, *given: Rows) -> None:
+        """Let a loop over the cells add to rows of nodes."""
+
+        def write(to: Rows) -> None:
+            loop(len(cells.law.cells), to, cells, *given)
+
         if self.around is None:
-            loop(len(at), q, *law, at, *given, rows)
+            write(rows)
         else:
-            add_corners(partial(loop, len(at), q, *law, at, *given), self.around, 8 * len(self.law.cells), rows)
+            add_corners(write, self.around, 8 * len(self.law.cells), rows)
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] to the owned rows of ``gradient`` (l, 3)."""
-        self._sum(_add_gradient, q, self.resisting(q), gradient)
+        self._sum(_add_gradient, ResistanceAt(self.resisting(q), q), gradient)
 
     def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian at q) v [N] to its second argument, ``projected`` without the curvature of J."""
-        return partial(self._sum, _add_product, q.copy(), self.resisting(q), projected)
+        cells = ResistanceAt(self.resisting(q), q.copy(), projected)
+        return lambda v, product: self._sum(_add_product, cells, product, v)
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add twice the diagonal blocks of the projected Hessian at q to ``blocks`` (l, 9) [N/m]."""
-        self._sum(_add_bound, q, self.resisting(q), blocks)
+        self._sum(_add_bound, ResistanceAt(self.resisting(q), q), blocks)

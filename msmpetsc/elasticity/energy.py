@@ -80,7 +80,7 @@ class Elasticity:
 
     def resists(self, q: Positions) -> bool:
         """Return whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
-        return self.cells is not None and len(self.cells.resisting(q)[1]) > 0
+        return self.cells is not None and len(self.cells.resisting(q).cells) > 0
 
     def hessian_at(self, q: Positions, projected: bool = False, dtype: type = np.float64) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].

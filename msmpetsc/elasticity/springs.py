@@ -121,6 +121,19 @@ class Springs(NamedTuple):
         return cls(ends, rest_length, stiffness, lattice.stiffening)
 
 
+class Way(NamedTuple):
+    """A way of nodes (l, 3) [m]: from ``base`` to ``end``, and how they ``moved``, which has digits of its own."""
+
+    base: Positions
+    end: Positions
+    moved: Rows
+
+    @classmethod
+    def to(cls, end: Positions, base: Positions) -> "Way":
+        """Return the way from ``base`` to ``end``."""
+        return cls(base, end, end - base)
+
+
 @numba.njit(cache=True, inline="always")
 def between(q: Positions, a: int, b: int) -> Vector:
     """Return the way from node a to node b."""
@@ -128,10 +141,8 @@ def between(q: Positions, a: int, b: int) -> Vector:
 
 
 @kernel
-def _elastic_energy(
-    first: int, count: int, step: int, q: Positions, ends: Indices, rest_length: Floats,
-    stiffness: Floats, stiffening: float, sums: Floats,
-) -> None:  # fmt: skip
+def _elastic_energy(first: int, count: int, step: int, sums: Floats, springs: Springs, q: Positions) -> None:
+    ends, rest_length, stiffness, stiffening = springs
     energy = 0.0
     for s in range(first, count, step):
         energy += spring_energy(between(q, ends[s, 1], ends[s, 0]), rest_length[s], stiffness[s], stiffening)
@@ -140,10 +151,9 @@ def _elastic_energy(
 
 
 @kernel
-def _elastic_change(
-    first: int, count: int, step: int, base: Positions, moved: Rows, ends: Indices,
-    rest_length: Floats, stiffness: Floats, stiffening: float, sums: Floats,
-) -> None:  # fmt: skip
+def _elastic_change(first: int, count: int, step: int, sums: Floats, springs: Springs, way: Way) -> None:
+    ends, rest_length, stiffness, stiffening = springs
+    base, _, moved = way
     change = 0.0
     for s in range(first, count, step):
         before = between(base, ends[s, 1], ends[s, 0])
@@ -167,12 +177,12 @@ class OwnedSprings:
     def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of these springs, summed spring by spring so that a small change keeps its
         digits."""
-        return self._sum(_elastic_change, base, q - base)
+        return self._sum(_elastic_change, Way.to(q, base))
 
-    def _sum(self, loop: Callable[..., None], *positions: Positions) -> float:
-        count, q = len(self.owned.ends), positions[0]
-        sums = np.zeros(1 if on_host(q) else count, like=q)
-        loop(count, *positions, *self.owned, sums)
+    def _sum(self, loop: Callable[..., None], at: Positions | Way) -> float:
+        count, ends = len(self.owned.ends), self.owned.ends
+        sums = np.zeros(1 if on_host(ends) else count, like=ends, dtype=float)
+        loop(count, sums, self.owned, at)
         return float(sums.sum())
 
 
@@ -308,20 +318,36 @@ def add_spring_block(block: Floats, c: float, ex: float, ey: float, ez: float) -
     block[8] += c + ez * ez
 
 
-@dataclass(frozen=True)
-class SpringGather(OwnedSprings):
-    """The springs around each owned node, a column of the arrays for each: how a GPU sums them.
+class Around(NamedTuple):
+    """The springs around each owned node, a column of the arrays for each.
 
     neighbour : (w, owned) int32, local number of the node at the far end, -1 past the last
     kind      : (w, owned) u1, which of the lengths
     stiffness : (w, owned) [N/m]
     lengths   : (k,) rest lengths [m]
+    stiffening : b of their law [-]
     """
 
     neighbour: Indices
     kind: Array
     stiffness: Floats
     lengths: Floats
+    stiffening: float
+
+
+class AroundAt(NamedTuple):
+    """These springs at positions q (l, 3) [m], linearised there, ``projected`` without the negative parts."""
+
+    around: Around
+    q: Positions
+    projected: bool = True
+
+
+@dataclass(frozen=True)
+class SpringGather(OwnedSprings):
+    """The springs around each owned node: how a GPU sums them."""
+
+    around: Around
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringGather":
@@ -335,37 +361,37 @@ class SpringGather(OwnedSprings):
         lengths, kind = np.unique(to_host(lattice.rest_length), return_inverse=True)
         shape = (int(slot.max(initial=0)) + 1, owned)
         neighbour, kinds, stiffness = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape)
-        neighbour[slot, node], kinds[slot, node] = ends[by_node, 1], kind[spring]
+        neighbour[slot, node] = ends[by_node, 1]
+        kinds[slot, node] = kind[spring]
         stiffness[slot, node] = to_host(lattice.stiffness)[spring]
-        arrays = (like(lattice.nodes, values) for values in (neighbour, kinds, stiffness, lengths))
-        return cls(Springs.of_lattice(lattice, lattice.springs_owned), *arrays)
+        around = [like(lattice.nodes, values) for values in (neighbour, kinds, stiffness, lengths)]
+        owned_springs = Springs.of_lattice(lattice, lattice.springs_owned)
+        return cls(owned_springs, Around(around[0], around[1], around[2], around[3], lattice.stiffening))
 
-    @property
-    def _all(self) -> tuple[Indices, Array, Floats, Floats, float]:
-        return self.neighbour, self.kind, self.stiffness, self.lengths, self.owned.stiffening
+    def _sum_around(self, loop: Callable[..., None], rows: Array, q: Positions) -> None:
+        loop(self.around.neighbour.shape[1], rows, AroundAt(self.around, q))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to the owned rows of ``gradient``."""
-        _gradient_around(self.neighbour.shape[1], q, *self._all, gradient)
+        self._sum_around(_gradient_around, gradient, q)
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add to the owned rows of ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
-        _concavity_around(self.neighbour.shape[1], q, *self._all, concavity)
+        self._sum_around(_concavity_around, concavity, q)
 
     def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
-        return partial(_product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
+        springs = AroundAt(self.around, q.copy(), projected)
+        return lambda v, product: _product_around(self.around.neighbour.shape[1], product, springs, v)
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
-        _diagonal_around(self.neighbour.shape[1], q, *self._all, blocks)
+        self._sum_around(_diagonal_around, blocks, q)
 
 
 @kernel
-def _gradient_around(
-    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
-    stiffness: Floats, lengths: Floats, stiffening: float, gradient: Rows,
-) -> None:  # fmt: skip
+def _gradient_around(first: int, count: int, step: int, gradient: Rows, springs: AroundAt) -> None:
+    (neighbour, kind, stiffness, lengths, stiffening), q, _ = springs
     for i in range(first, count, step):
         gx, gy, gz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):
@@ -383,10 +409,8 @@ def _gradient_around(
 
 
 @kernel
-def _concavity_around(
-    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
-    stiffness: Floats, lengths: Floats, stiffening: float, concavity: Floats,
-) -> None:  # fmt: skip
+def _concavity_around(first: int, count: int, step: int, concavity: Floats, springs: AroundAt) -> None:
+    (neighbour, kind, stiffness, lengths, stiffening), q, _ = springs
     for i in range(first, count, step):
         total = 0.0
         for s in range(neighbour.shape[0]):
@@ -398,11 +422,8 @@ def _concavity_around(
 
 
 @kernel
-def _product_around(
-    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
-    stiffness: Floats, lengths: Floats, stiffening: float, projected: bool, v: Rows,
-    product: Rows,
-) -> None:  # fmt: skip
+def _product_around(first: int, count: int, step: int, product: Rows, springs: AroundAt, v: Rows) -> None:
+    (neighbour, kind, stiffness, lengths, stiffening), q, projected = springs
     for i in range(first, count, step):
         px, py, pz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):
@@ -421,10 +442,8 @@ def _product_around(
 
 
 @kernel
-def _diagonal_around(
-    first: int, count: int, step: int, q: Positions, neighbour: Indices, kind: Indices,
-    stiffness: Floats, lengths: Floats, stiffening: float, blocks: Rows,
-) -> None:  # fmt: skip
+def _diagonal_around(first: int, count: int, step: int, blocks: Rows, springs: AroundAt) -> None:
+    (neighbour, kind, stiffness, lengths, stiffening), q, _ = springs
     for i in range(first, count, step):
         for s in range(neighbour.shape[0]):
             j = neighbour[s, i]

@@ -11,6 +11,7 @@ precision, too.
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from petsc4py import PETSc
@@ -276,7 +277,8 @@ class ProjectedHessian:
         self.elastic, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), contact
         unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
         self.elasticity.add_bound(q, blocks)
-        invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
+        nodes = FreeNodes(unknowns.free, unknowns.ballast, contact, self.t2)
+        invert_blocks(unknowns.size, self.inverse, blocks, nodes)
         self.joined = joined
         self.smoother = ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
 
@@ -328,11 +330,18 @@ def apply_blocks(first: int, count: int, step: int, x: Rows, inverse: Array, y: 
             y[r, i] = inverse[i, 3 * r] * a + inverse[i, 3 * r + 1] * b + inverse[i, 3 * r + 2] * c
 
 
+class FreeNodes(NamedTuple):
+    """The unknowns (m,) of a step: their nodes, mass and contact (owned, 9), or (0, 9), of all nodes, t^2 [s^2]."""
+
+    free: Indices
+    mass: Floats
+    contact: Rows
+    t2: float
+
+
 @kernel
-def invert_blocks(
-    first: int, count: int, step: int, blocks: Rows, free: Indices, mass: Floats, contact: Rows, t2: float,
-    inverse: Array,
-) -> None:  # fmt: skip
+def invert_blocks(first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes) -> None:
+    free, mass, contact, t2 = nodes
     for i in range(first, count, step):
         node = free[i]
         m, d = mass[node], blocks[node]

@@ -76,7 +76,8 @@ def described(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dt
 def type_of(kind: Kind) -> object:
     """Return numba's type of a kind of argument."""
     if isinstance(kind, tuple):
-        return numba.types.NamedTuple([type_of(one) for one in kind[1:]], kind[0])  # type: ignore[no-untyped-call]
+        fields = [type_of(one) for one in kind[1:]]
+        return numba.types.BaseTuple.from_types(fields, kind[0])  # type: ignore[no-untyped-call]
     if kind in TYPES:
         return TYPES[kind]
     dtype, dimensions, layout = kind.split()

@@ -138,6 +138,19 @@ def simplify(surface: Surface, faces: int, haste: int = 7) -> Surface:
     return reduced
 
 
+def refine(surface: Surface, share: float) -> Surface:
+    """Split the edges of a closed surface that are longer than this share of its longest side."""
+    import manifold3d  # of the extra "mesh"
+
+    surface = merge(surface)
+    low, high = bounds_of(surface)
+    solid = manifold3d.Manifold(manifold3d.Mesh64(surface.points, surface.triangles.astype(np.uint64)))
+    if solid.status() != manifold3d.Error.NoError:
+        raise InputError("it is no closed, consistently wound surface")
+    mesh = solid.refine_to_length(share * float((high - low).max())).to_mesh64()
+    return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
+
+
 def orient(surface: Surface) -> Surface:
     """Wind the triangles consistently, and each connected patch outwards (a cavity's too).
 
@@ -172,7 +185,7 @@ def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
 
 
 STEPS: dict[str, Callable[..., Surface]] = {
-    step.__name__: step for step in (merge, largest_part, union, repair, simplify, orient, rotate)
+    step.__name__: step for step in (merge, largest_part, union, repair, simplify, refine, orient, rotate)
 }
 
 

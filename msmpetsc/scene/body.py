@@ -35,8 +35,9 @@ class Rotate(Table):
 class StepTable(Table):
     """A step of mesh preparation that needs a value."""
 
-    one_of = ("simplify", "rotate")
+    one_of = ("simplify", "refine", "rotate")
     simplify: int | None = Field(None, ge=4, lt=2**63, description="triangles to keep [-]")
+    refine: float | None = Field(None, ge=1e-3, le=1, description="longest edge, of the body's longest side [-]")
     rotate: Rotate | None = Field(None, description="turn the surface")
 
 
@@ -66,7 +67,8 @@ class MeshTable(Table):
     prepare: ListOf[PrepareStep] = Field(
         (),
         description="steps in this order: merge, largest_part, union, repair, orient, "
-        "{ simplify = triangles [-] }, { rotate = { axis = [x, y, z] [-], degrees = angle [degrees] } }",
+        "{ simplify = triangles [-] }, { refine = longest edge, of the longest side [-] }, "
+        "{ rotate = { axis = [x, y, z] [-], degrees = angle [degrees] } }",
     )
     size: Positive | None = Field(None, description="longest side of the bounding box [m]; as in the file if absent")
     base: Vector | None = Field(None, description="where the middle of the bounding box's bottom face stands [m]")

@@ -24,7 +24,7 @@ from msmpetsc.scene.reading import Scene
 
 NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
 MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
-LONG = 2.0  # cells: an edge of more is split
+LONG = 2.0  # cells
 FEWEST = 20  # triangles of a body
 HASTE = 4  # of the decimation: with its usual 7 bunny and lung were twice and four times as far off
 PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (lattice.material)
@@ -68,8 +68,8 @@ def collision_surface(
 def _prepared(
     bodies: list[Surface], table: SelfContactTable, meets_itself: bool, cell_size: float
 ) -> tuple[list[Surface], float, float]:
-    """Return the bodies' surfaces, of about as many triangles together as asked for, or as fine as the cells if None,
-    without those that cut others, the median distance [m] of their own points from them, and their edges' mean
+    """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without
+    those that cut others, the median distance [m] of their own points from them, and their edges' mean
     length [m].
 
     Raises InputError where too many do.
@@ -80,7 +80,7 @@ def _prepared(
         coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     else:
-        bodies = [_as_fine_as(body, max(cell_size, 2 * (table.distance or 0.0))) for body in bodies]
+        _warn_of_long_triangles(bodies, max(cell_size, 2 * (table.distance or 0.0)))
     if meets_itself:
         bodies = _without_cut(bodies)
     ends = np.concatenate([b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies])
@@ -144,28 +144,19 @@ def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> floa
     return float(np.median(off))
 
 
-def _as_fine_as(surface: Surface, length: float) -> Surface:
-    """Return the surface with triangles about so long [m] at the most.
+def _warn_of_long_triangles(bodies: list[Surface], length: float) -> None:
+    """Warn where triangles are much longer than this [m]: contact is known where the surface has points.
 
-    Contact is known where the surface has points: two cubes of long triangles would touch at their corners, and what
-    bulges between would pass.
+    Two cubes of twelve triangles touch at their corners, and what bulges between passes.
     """
-    corners = surface.points[surface.triangles]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
-    if longest <= LONG * length:
-        return surface
-    import manifold3d  # of the extra "contact"
-
-    solid = manifold3d.Manifold(manifold3d.Mesh64(surface.points, np.ascontiguousarray(surface.triangles, np.uint64)))
-    if solid.status() != manifold3d.Error.NoError:
+    corners = [body.points[body.triangles] for body in bodies]
+    longest = max(np.linalg.norm(each - np.roll(each, 1, axis=1), axis=2).max() for each in corners)
+    if longest > LONG * length:
         log.warning(
-            "self_contact: triangles of %.2g m in cells of %.2g m, of a surface that is not closed: what bulges "
-            'between their points may cross; mesh.prepare = ["repair"] mends the mesh',
+            "self_contact: a triangle is %.2g m long in cells of %.2g m: what bulges between its points may pass "
+            "unseen; mesh.prepare = [{ refine = 0.05 }] splits those longer than a twentieth of the body",
             longest, length,
         )  # fmt: skip
-        return surface
-    fine = solid.refine_to_length(length).to_mesh64()
-    return Surface(fine.vert_properties[:, :3].copy(), fine.tri_verts.astype(np.int64))
 
 
 def _coarser(surface: Surface, triangles: int) -> Surface:

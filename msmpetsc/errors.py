@@ -44,7 +44,7 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
     "mesh": ("meshio", "manifold3d", "fast_simplification"),
     "render": ("pyvista", "scipy", "pydantic", "tomli_w", "trimesh", "igl", "tqdm"),
     "study": ("pandas", "vl_convert", "jinja2", "tomlkit"),
-    "contact": ("ipctk", "manifold3d"),
+    "contact": ("ipctk",),
     "movie": ("imageio", "imageio_ffmpeg"),
     "usd": ("pxr",),
     "repair": ("pymeshfix",),

@@ -39,7 +39,7 @@ def test_the_side_is_the_face_that_a_way_first_goes_through(start: np.ndarray, e
         if first == 0:
             assert side == 1 + face[0]
         else:
-            ahead = ((way[first - 1] - CUBE.solid.points) * CUBE.solid.normals_of_faces).sum(axis=1)
+            ahead = ((way[first - 1] - CUBE.solid.planes.points) * CUBE.solid.planes.normals).sum(axis=1)
             entered = np.flatnonzero(ahead >= 0)
             assert side - 1 in entered and (len(entered) > 1 or side == 1 + entered[0])
 

@@ -179,6 +179,7 @@ ALLOWED = {
     "cli/commands/new.py": "under the name that the one way gave",
     "export/formats.py": "the same",
     "backend/launcher.py": "a cache",
+    "study/forkserver.py": "/proc",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",
     "view/renderer.py": "/dev/null",

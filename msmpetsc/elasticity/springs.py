@@ -321,10 +321,10 @@ def add_spring_block(block: Floats, c: float, ex: float, ey: float, ez: float) -
 class Around(NamedTuple):
     """The springs around each owned node, a column of the arrays for each.
 
-    neighbour : (w, owned) int32, local number of the node at the far end, -1 past the last
-    kind      : (w, owned) u1, which of the lengths
-    stiffness : (w, owned) [N/m]
-    lengths   : (k,) rest lengths [m]
+    neighbour  : (w, owned) int32, local number of the node at the far end, -1 past the last
+    kind       : (w, owned) u1, which of the lengths
+    stiffness  : (w, owned) [N/m]
+    lengths    : (k,) rest lengths [m]
     stiffening : b of their law [-]
     """
 
@@ -364,9 +364,9 @@ class SpringGather(OwnedSprings):
         neighbour[slot, node] = ends[by_node, 1]
         kinds[slot, node] = kind[spring]
         stiffness[slot, node] = to_host(lattice.stiffness)[spring]
-        around = [like(lattice.nodes, values) for values in (neighbour, kinds, stiffness, lengths)]
-        owned_springs = Springs.of_lattice(lattice, lattice.springs_owned)
-        return cls(owned_springs, Around(around[0], around[1], around[2], around[3], lattice.stiffening))
+        sent = partial(like, lattice.nodes)
+        around = Around(sent(neighbour), sent(kinds), sent(stiffness), sent(lengths), lattice.stiffening)
+        return cls(Springs.of_lattice(lattice, lattice.springs_owned), around)
 
     def _sum_around(self, loop: Callable[..., None], rows: Array, q: Positions) -> None:
         loop(self.around.neighbour.shape[1], rows, AroundAt(self.around, q))
@@ -382,7 +382,8 @@ class SpringGather(OwnedSprings):
     def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
         springs = AroundAt(self.around, q.copy(), projected)
-        return lambda v, product: _product_around(self.around.neighbour.shape[1], product, springs, v)
+        count = self.around.neighbour.shape[1]
+        return lambda v, product: _product_around(count, product, springs, v)
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""

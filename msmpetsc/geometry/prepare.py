@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -20,6 +20,9 @@ from scipy.sparse.csgraph import connected_components
 from msmpetsc.backend.arrays import Indices
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.geometry.surface import Surface, bounds_of, compact, edge_use, examine, first_of_equal, merged_triangles
+
+if TYPE_CHECKING:
+    import manifold3d
 
 # A repair that keeps less than this of the area did not mend the body but lost it: of
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
@@ -82,15 +85,32 @@ def union(surface: Surface) -> Surface:
         part = compact(surface.points, surface.triangles[labels == number])
         report = examine(part)
         outwards = part.triangles if report.volume > 0 else part.triangles[:, ::-1]
-        solid = manifold3d.Manifold(manifold3d.Mesh64(part.points, np.ascontiguousarray(outwards, np.uint64)))
-        if solid.status() != manifold3d.Error.NoError or solid.is_empty():
+        solid = solid_of(Surface(part.points, outwards))
+        if solid is None:
             raise InputError(
                 f"part {number} is no closed, consistently wound surface "
                 f"({report.boundary_edges} boundary edges, {report.nonmanifold_edges} with more than "
                 f"two triangles, {report.inconsistent_edges} inconsistent)"
             )
         solids.append(solid)
-    mesh = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).to_mesh64()
+    return surface_of(manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add))
+
+
+def solid_of(surface: Surface) -> "manifold3d.Manifold | None":
+    """Return what a surface encloses as a solid of manifold3d, of the extra "mesh".
+
+    None stands for a surface that is not closed, or not wound consistently.
+    """
+    import manifold3d
+
+    triangles = np.ascontiguousarray(surface.triangles, np.uint64)
+    solid = manifold3d.Manifold(manifold3d.Mesh64(surface.points, triangles))
+    return None if solid.status() != manifold3d.Error.NoError or solid.is_empty() else solid
+
+
+def surface_of(solid: "manifold3d.Manifold") -> Surface:
+    """Return the surface of a solid of manifold3d."""
+    mesh = solid.to_mesh64()
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
 
 
@@ -140,15 +160,12 @@ def simplify(surface: Surface, faces: int, haste: int = 7) -> Surface:
 
 def refine(surface: Surface, share: float) -> Surface:
     """Split the edges of a closed surface that are longer than this share of its longest side."""
-    import manifold3d  # of the extra "mesh"
-
     surface = merge(surface)
     low, high = bounds_of(surface)
-    solid = manifold3d.Manifold(manifold3d.Mesh64(surface.points, surface.triangles.astype(np.uint64)))
-    if solid.status() != manifold3d.Error.NoError:
+    solid = solid_of(surface)
+    if solid is None:
         raise InputError("it is no closed, consistently wound surface")
-    mesh = solid.refine_to_length(share * float((high - low).max())).to_mesh64()
-    return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
+    return surface_of(solid.refine_to_length(share * float((high - low).max())))
 
 
 def orient(surface: Surface) -> Surface:

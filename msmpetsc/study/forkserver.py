@@ -12,11 +12,12 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import NoReturn
 
 PROGRAM = "msmpetsc.cli.main"
 COLD = [sys.executable, "-m", "msmpetsc"]  # a command that starts it begins with this
@@ -27,7 +28,6 @@ SERVER.set_forkserver_preload(
         "msmpetsc.geometry.readers",
     ]
 )  # fmt: skip  # all but PETSc
-PEAK = Path("/proc/self/clear_refs"), "5"  # where Linux is told to forget the most memory that a process has had
 
 
 class Forked:
@@ -77,6 +77,33 @@ class Forked:
 
 
 def _serve(commands: Connection, folder: str, environment: dict[str, str]) -> None:
+    enter(folder, environment)
+    from mpi4py import MPI
+
+    from msmpetsc.solve.petsc.initialise import start_for_runs
+
+    gc.freeze()  # what was imported is not looked through again
+    status = 0
+    with suppress(EOFError):  # no more commands
+        while status == 0:
+            arguments, files, last = commands.recv()
+            speak_into(files)
+            _forget()
+            if not last:
+                start_for_runs(MPI.COMM_WORLD, [])  # options are then lent to a run, and no later one has them
+            sys.argv = ["msmpetsc", *arguments]
+            status = import_module(PROGRAM).main()
+            sys.stdout.flush()
+            ctypes.CDLL(None).fflush(None)
+            commands.send(status)
+    leave(status)
+
+
+def enter(folder: str, environment: Mapping[str, str]) -> None:
+    """Make of a fork of the server a process in a session of its own, with MPI started.
+
+    environment : all that it has
+    """
     os.setsid()
     for number in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
         signal.signal(number, signal.SIG_DFL)
@@ -85,34 +112,29 @@ def _serve(commands: Connection, folder: str, environment: dict[str, str]) -> No
     os.environ.update(environment)
     from mpi4py import MPI
 
-    from msmpetsc.solve.petsc.initialise import start_for_runs
-
     MPI.Init()
-    gc.freeze()  # what was imported is not looked through again
-    status = 0
-    with suppress(EOFError):  # no more commands
-        while status == 0:
-            arguments, files, last = commands.recv()
-            _speak_into(files)
-            if not last:
-                start_for_runs(MPI.COMM_WORLD, [])  # options are then lent to a run, and no later one has them
-            sys.argv = ["msmpetsc", *arguments]
-            status = import_module(PROGRAM).main()
-            sys.stdout.flush()
-            ctypes.CDLL(None).fflush(None)
-            commands.send(status)
+
+
+def speak_into(files: Iterable[str | Path]) -> None:
+    """Let standard output and error go to two files."""
+    for stream, path in enumerate(files, 1):
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(file, stream)
+        os.close(file)
+
+
+def leave(status: int) -> NoReturn:
+    """End such a process, its PETSc and its MPI."""
+    from mpi4py import MPI
+
     if "petsc4py.PETSc" in sys.modules:
         sys.modules["petsc4py.PETSc"]._finalize()
     MPI.Finalize()
     sys.exit(status)
 
 
-def _speak_into(files: Sequence[str]) -> None:
-    """Let standard output and error go to two files, and count the most memory from now on."""
-    for stream, path in enumerate(files, 1):
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        os.dup2(file, stream)
-        os.close(file)
-    gc.collect()  # of the command before
+def _forget() -> None:
+    """Collect the garbage of the command before, and let Linux count the most memory from now on."""
+    gc.collect()
     with suppress(OSError):
-        PEAK[0].write_text(PEAK[1])
+        Path("/proc/self/clear_refs").write_text("5")

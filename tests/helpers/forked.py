@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
 
-from msmpetsc.study.forkserver import SERVER, Forked
+from msmpetsc.study.forkserver import SERVER, Forked, enter, leave, speak_into
 
 STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new; mv $OMPI_COMM_WORLD_RANK.new $OMPI_COMM_WORLD_RANK.env
 read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
@@ -85,26 +85,14 @@ def _hand_on(children: list, mpiexec: subprocess.Popen, folder: str, end: float)
 
 
 def _rank(arguments: list[str], streams: list[Path], environment: dict[str, str]) -> None:
-    os.setsid()
-    for number in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
-        signal.signal(number, signal.SIG_DFL)
-    for stream, path in enumerate(streams, 1):
-        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
-    os.environ.clear()
-    os.environ.update(environment)
-    os.chdir(environment["PWD"])
-    from mpi4py import MPI
-
-    MPI.Init()
+    enter(environment["PWD"], environment)
+    speak_into(streams)
     status = 0
     try:
         _python(arguments)
     except SystemExit as ended:
         status = ended.code or 0
-    if "petsc4py.PETSc" in sys.modules:
-        sys.modules["petsc4py.PETSc"]._finalize()
-    MPI.Finalize()
-    sys.exit(status)
+    leave(status)
 
 
 def _python(arguments: list[str]) -> None:

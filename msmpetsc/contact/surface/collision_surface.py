@@ -79,12 +79,13 @@ def _prepared(
         share = table.surface / sum(len(body.triangles) for body in bodies)
         coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
-    else:
-        _warn_of_long_triangles(bodies, max(cell_size, 2 * (table.distance or 0.0)))
     if meets_itself:
         bodies = _without_cut(bodies)
     ends = np.concatenate([b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies])
-    return bodies, off, float(np.linalg.norm(ends, axis=2).mean())
+    edges = np.linalg.norm(ends, axis=2)
+    if table.surface is None:
+        _warn_of_long_triangles(edges.max(), max(cell_size, 2 * (table.distance or 0.0)))
+    return bodies, off, float(edges.mean())
 
 
 def _refuse_touching(surface: CollisionSurface) -> None:
@@ -144,13 +145,11 @@ def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> floa
     return float(np.median(off))
 
 
-def _warn_of_long_triangles(bodies: list[Surface], length: float) -> None:
-    """Warn where triangles are much longer than this [m]: contact is known where the surface has points.
+def _warn_of_long_triangles(longest: float, length: float) -> None:
+    """Warn of an edge that is much longer than a length [m]: contact is known where the surface has points.
 
     Two cubes of twelve triangles touch at their corners, and what bulges between passes.
     """
-    corners = [body.points[body.triangles] for body in bodies]
-    longest = max(np.linalg.norm(each - np.roll(each, 1, axis=1), axis=2).max() for each in corners)
     if longest > LONG * length:
         log.warning(
             "self_contact: a triangle is %.2g m long in cells of %.2g m: what bulges between its points may pass "

@@ -25,7 +25,6 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
-from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
@@ -237,11 +236,7 @@ class LowestCurvature:
 
     def _random(self, count: int) -> Rows:
         """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
-        lattice, free = self.functional.lattice, to_host(self.unknowns.free)
-        numbers = lattice.global_numbers[: lattice.owned][free]
-        seeds = lattice.table.total * np.arange(count)
-        random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
-        return self._unit(self._of_each(self.preconditioner.apply, like(self.functional.mass, random)))
+        return self._unit(self._of_each(self.preconditioner.apply, self.functional.noise(count)))
 
     def _iterate(self, start: Rows, block: int, most: int, least: int, weigh: Act | None = None) -> tuple[Floats, Rows]:
         """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l,

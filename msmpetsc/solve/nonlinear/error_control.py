@@ -15,15 +15,19 @@ first and |e_k|_M hardly grows, or when that is over the error that would do. It
 k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes so much stiffer hide the others for that long.
 
 What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends, too, once |e_k|_M
-and that, or |r_k|_(P^-1) / sqrt(lambda), are together an error that will do; their sum is then the estimate.
+and that, or |r_k|_(P^-1) / sqrt(lambda), are together an error that will do; their sum is then the estimate. Where
+nodes may come to touch something within what is missing, more than half of it must be known, so that g can be looked
+at there (minimum.Minimum).
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions
+from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
@@ -61,11 +65,14 @@ MOST = 512
 LOWER = 0.7  # of the least eigenvalue that some iterations of CG have come to
 GREATEST = 1.1  # eigenvalue of P^(-1) H, where P has all that H has: not contact that came up since
 FEW, MANY = 2, 4  # iterations: fewer have not come near the least eigenvalue; so many may have
+PROBED = 4  # iterations on noise, which an eigenvalue far below the others takes to show
 RISE = 2.0  # of it in a solve: where one had come to 5e-4, the next, of a few iterations, came to 0.38
 
 
 class ErrorEstimate:
     """Estimates |x - x*|_M of a step; of the last one ``correction`` is e, ``residual`` F - H e."""
+
+    state: ClassVar[dict[str, Range]] = {"floor": ANY}
 
     def __init__(
         self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner, prefix: str
@@ -81,6 +88,8 @@ class ErrorEstimate:
         self.trusted = self.begun = 0.0  # |F|_(P^-1) up to which that norm bounds errors, and as it was
         self.missing: float | None = None  # of a length that will do
         self.least = 0.0  # eigenvalue of P^(-1) H that CG has come to; 0 where none is known
+        self.floor = np.inf  # that it has come to on noise; infinite where that was not tried
+        self.is_probe = False  # whether the solve in progress is one of noise
         self.lengths: dict[int, float] = {}  # |e_k|_M by iteration
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
@@ -117,6 +126,8 @@ class ErrorEstimate:
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
             self.linearise(iterate.q)
+            if self.preconditioner.is_uniform and np.isinf(self.floor):
+                self._probe()
             self.ksp.solve(iterate.f, self.correction)
             self.learn(self.ksp)
             self.length = self._length() if self.ksp.reason > 0 else np.inf
@@ -144,6 +155,8 @@ class ErrorEstimate:
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
+        if self.is_probe:
+            return reasons.ITERATING if its < PROBED else reasons.CONVERGED_ITS
         every = 1 if self.preconditioner.is_uniform else CHECK_EVERY
         if its == 0:
             self.begun = residual
@@ -164,7 +177,8 @@ class ErrorEstimate:
         if length + residual > self.will_do:  # as the preconditioner is no more than M^(-1), |r_k|_(M^-1) is no less
             return False
         missing = self._missing(residual)
-        if length + missing > self.will_do:
+        is_unknown = missing > length and self.functional.problem.contact is not None
+        if is_unknown or length + missing > self.will_do:
             return False
         self.missing = missing
         return True
@@ -190,14 +204,27 @@ class ErrorEstimate:
         least = float(ksp.computeExtremeSingularValues()[1])
         if not 0 < least <= GREATEST:
             return 0.0
+        least = min(least, self.floor)
         return min(least, (RISE if ksp.its >= MANY else 1.0) * self.least) if self.least else least
 
     def learn(self, ksp: PETSc.KSP) -> None:
         """A solve by CG with this Hessian and preconditioner has ended."""
         self.least = self._least(ksp)
 
-    def forget(self) -> None:
+    def _probe(self) -> None:
+        """Look for an eigenvalue of P^(-1) H far below the others by CG on noise, which has something of each mode: the
+        few iterations of a step's solve miss one of 2e-5, as a cell has that hangs by an edge."""
+        self.functional.memory.write(self.residual)[:] = self.functional.mass * self.functional.noise(1)[0]
+        self.is_probe = True
+        self.ksp.solve(self.residual, self.correction)
+        self.is_probe = False
+        self.floor = max(float(self.ksp.computeExtremeSingularValues()[1]), 0.0)
+        self.least = min(self.least, self.floor)
+
+    def forget(self, modes: bool) -> None:
         self.least = 0.0
+        if modes:
+            self.floor = np.inf
 
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Whether e is near in the norm of H, as far as CG can show."""
@@ -330,9 +357,9 @@ class ErrorControl:
             return None
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, left=np.inf, corrected=False)
 
-    def forget(self) -> None:
+    def forget(self, modes: bool) -> None:
         self.ratio = FIRST_RATIO
-        self.estimate.forget()
+        self.estimate.forget(modes)
 
 
 def not_converged(

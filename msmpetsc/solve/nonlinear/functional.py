@@ -11,11 +11,12 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest, like, to_host
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import StepFailed
+from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
 
@@ -141,6 +142,13 @@ class StepFunctional:
             return 1.0
         with CONTACT:
             return self.surface.contacts.free_share(base, q, with_obstacles)
+
+    def noise(self, count: int) -> Rows:
+        """Random numbers (count, n) in [-1/2, 1/2), the same for any number of ranks."""
+        lattice, free = self.lattice, to_host(self.unknowns.free)
+        numbers = lattice.global_numbers[: lattice.owned][free]
+        seeds = lattice.table.total * np.arange(count)
+        return like(self.mass, np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds]))
 
     def _inner(self, a: Rows, b: Rows) -> float:
         """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""

@@ -66,7 +66,9 @@ class Minimum:
         estimate.residual.aypx(-1.0, self.f)
         bent = functional.dual_norm(estimate.residual)  # what H at x did not know
         hint = estimate.correction if alarm else None
-        value, direction = self.curvature.lowest(nearer.q, compression, alarm, hint)
+        value, direction = compression.least_curvature, None
+        if value <= CONVEX:
+            value, direction = self.curvature.lowest(nearer.q, compression, alarm, hint)
         if value < 0:
             return Verdict(np.inf, direction, value)
         value = min(value, 1.0)
@@ -98,10 +100,11 @@ class Minimum:
         second = self.estimate(nearer, bound, enough, will_do, lowest)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
+        known = second - (self.estimate.missing or 0.0)
+        if first > 0 and known > SMALL * first:
+            return DOUBTFUL * relative(max(first, second), distance)
         if self.estimate.missing is not None:
             return relative(first + second, distance)
-        if first > 0 and second > SMALL * first:
-            return DOUBTFUL * relative(max(first, second), distance)
         self.first.axpy(second / max(functional.norm(correction), sys.float_info.min), correction)
         return relative(functional.norm(self.first), functional.distance(nearer.q, correction))
 

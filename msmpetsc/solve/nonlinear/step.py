@@ -219,8 +219,9 @@ class Stepper:
 
     def forget(self, modes: bool = True) -> None:
         """Forget what earlier steps showed, so that the next step does not depend on it; modes: the lowest mode too."""
-        for part in (self.first_guess, self.control, self.jacobian.preconditioner):
-            part.forget()
+        self.first_guess.forget()
+        self.jacobian.preconditioner.forget()
+        self.control.forget(modes)
         self.minimum.curvature.forget(modes)
 
     def work_so_far(self) -> Work:
@@ -290,7 +291,7 @@ class Stepper:
         """Whether x is a minimum, and how far from it (collective)."""
         control, functional, q = self.control, self.functional, self.functional.positions(self.x)
         compression = self.minimum.curvature.compression(q)
-        if compression.least_curvature > 0:
+        if compression.least_curvature > 0 and not self.budget:  # a budget may end where g is no parabola yet
             return Verdict(outcome.error, is_minimum=True)
         enough = control.target * functional.distance(q) if control.target else np.inf
         verdict = self.minimum.examine(self.x, outcome.corrected, compression, outcome.alarm, enough)

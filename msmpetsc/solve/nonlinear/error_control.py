@@ -16,8 +16,8 @@ k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes so much stiffer hide the others f
 
 What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends, too, once |e_k|_M
 and that, or |r_k|_(P^-1) / sqrt(lambda), are together an error that will do; their sum is then the estimate. Where
-nodes may come to touch something within what is missing, more than half of it must be known, so that g can be looked
-at there (minimum.Minimum).
+F was not quite what the linear solve had left of it, more than half of that sum must be |e_k|_M, so that g can be looked
+at there (minimum.Minimum). Where H has come to be less than M in a step, bounds are over the least that was seen.
 """
 
 from dataclasses import dataclass, replace
@@ -45,6 +45,7 @@ EARLY = 2.0  # times the error that would do: when a step is first estimated
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabola there
+STRAIGHT = 0.6  # of that: up to there it is one as far as what no iteration has found yet
 NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
 STAYS = 0.5  # of the bound before: F no longer falls though each correction was known
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
@@ -85,6 +86,7 @@ class ErrorEstimate:
         self.right_side: PETSc.Vec | None = None  # of the solve in progress, as the next four
         self.bound = self.enough = np.inf
         self.lowest, self.will_do = 1.0, 0.0
+        self.convexity = 1.0  # lowest eigenvalue of M^(-1) H that the step has come by, if it is below 1
         self.trusted = self.begun = 0.0  # |F|_(P^-1) up to which that norm bounds errors, and as it was
         self.missing: float | None = None  # of a length that will do
         self.least = 0.0  # eigenvalue of P^(-1) H that CG has come to; 0 where none is known
@@ -121,7 +123,7 @@ class ErrorEstimate:
         Infinite where the Hessian is not positive definite: no linear correction shows the way.
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
-        self.lowest, self.lengths = min(lowest, 1.0), {}
+        self.lowest, self.lengths = min(lowest, self.convexity), {}
         self.will_do, self.missing, self.trusted = will_do, None, trusted
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
@@ -177,7 +179,7 @@ class ErrorEstimate:
         if length + residual > self.will_do:  # as the preconditioner is no more than M^(-1), |r_k|_(M^-1) is no less
             return False
         missing = self._missing(residual)
-        is_unknown = missing > length and self.functional.problem.contact is not None
+        is_unknown = missing > length and self.trusted >= self.begun > STRAIGHT * self.trusted
         if is_unknown or length + missing > self.will_do:
             return False
         self.missing = missing

@@ -72,6 +72,7 @@ class Minimum:
         if value < 0:
             return Verdict(np.inf, direction, value)
         value = min(value, 1.0)
+        estimate.convexity = min(estimate.convexity, value)
         first, rest = functional.norm(self.first), functional.dual_norm(self.f) / value
         if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
             return Verdict(self.rounding.relative(first + rest, functional.distance(nearer.q)))

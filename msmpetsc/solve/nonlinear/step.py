@@ -201,6 +201,7 @@ class Stepper:
         self.functional.begin(problem)
         self.base[:] = problem.fixed
         self.kinks.begin(problem.contact)
+        self.control.estimate.convexity = 1.0
         self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
         multigrid = self.jacobian.preconditioner.to_balance
         if start is None and multigrid:

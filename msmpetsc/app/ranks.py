@@ -1,4 +1,4 @@
-"""The ranks of a program: started by a launcher, or one process alone."""
+"""The ranks of a program: started by a launcher, or one process alone; and the environment of its children."""
 
 import os
 from collections.abc import Iterator
@@ -17,6 +17,13 @@ LAUNCHED = {  # variables that Open MPI, MPICH, PMIx, Slurm, Flux and the launch
 ALONE = {
     "OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_orte_create_session_dirs": "0",
 }  # fmt: skip
+VARIABLES_OF_MPI = (  # of a launcher around us: not for our children
+    "PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_MCA_ess", "OMPI_MCA_orte_ess_",
+    "OMPI_MCA_orte_hnp_uri",
+    "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
+)  # fmt: skip
+# more ranks than cores are the user's to ask for: as Open MPI 4 calls it, and as 5 does
+OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
 
 
 class OneProcess:
@@ -54,3 +61,10 @@ def _variables(values: dict[str, str]) -> Iterator[None]:
     finally:
         for name in added:
             del os.environ[name]
+
+
+def environment(alone: bool = False) -> dict[str, str]:
+    """Return the environment for a child, without the variables of the MPI of this process."""
+    ours = {name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)}
+    # one thread a rank, or ranks and threads would fight for the cores
+    return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | ours

@@ -11,17 +11,10 @@ from threading import Lock
 
 import psutil
 
-from msmpetsc.app.ranks import ALONE
+from msmpetsc.app.ranks import environment
 from msmpetsc.study.forkserver import COLD, Forked
 
 GRACE = 3.0  # [s] between the request to end and the end
-VARIABLES_OF_MPI = (  # of a launcher around us: not for our children
-    "PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_MCA_ess", "OMPI_MCA_orte_ess_",
-    "OMPI_MCA_orte_hnp_uri",
-    "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
-)  # fmt: skip
-# more ranks than cores are the user's to ask for: as Open MPI 4 calls it, and as 5 does
-OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
 
 
 @dataclass(frozen=True)
@@ -101,13 +94,6 @@ class Processes:
             self._running.discard(process)
             if isinstance(process, Forked) and serves:
                 self._idle.append(process)
-
-
-def environment(alone: bool = False) -> dict[str, str]:
-    """Return the environment for a child, without the variables of the MPI of this process."""
-    ours = {name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)}
-    # one thread a rank, or ranks and threads would fight for the cores
-    return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | ours
 
 
 def too_long(timeout: float) -> str:

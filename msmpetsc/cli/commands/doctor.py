@@ -5,7 +5,6 @@ What could end the process, libraries that do not fit together above all, is loa
 
 import argparse
 import json
-import os
 import platform
 import re
 import subprocess
@@ -15,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import msmpetsc
+from msmpetsc.app.ranks import environment
 from msmpetsc.errors import EXTRAS, extra_of
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
@@ -64,9 +64,6 @@ BRINGS = {  # where an extra alone does not
 }
 NO_INSTALL = {"cuda", "peers"}  # extras for few machines: what lacks them lacks nothing
 NEEDED = {"PETSc", "MPI", "HDF5", "packages", "extra run"}  # by every run
-ONE_CORE = {  # two ranks may share it, by Open MPI 4 and by 5
-    "OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
-}  # fmt: skip
 
 Finding = tuple[str, str, str]  # what, its state, and in words
 
@@ -104,11 +101,9 @@ def installed(package: str) -> bool:
 def probed(code: str, *launcher: str) -> tuple[str, str]:
     """Return the state of a probe run in its own Python, with its output or the reason of its failure."""
     command = [*launcher, sys.executable, "-c", code]
-    alone = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_COMM", "PMIX_", "PMI_"))}
-    alone |= ONE_CORE
     try:
         done = subprocess.run(
-            command, env=alone, timeout=PATIENCE, stdin=subprocess.DEVNULL, capture_output=True, text=True
+            command, env=environment(), timeout=PATIENCE, stdin=subprocess.DEVNULL, capture_output=True, text=True
         )
     except FileNotFoundError:
         remedy = "apt install openmpi-bin, or load the module of the cluster's MPI"

@@ -11,6 +11,7 @@ Where no choice meets the error, the best one is held against a finer run. SCENE
 import json
 from argparse import Namespace
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
@@ -19,8 +20,8 @@ import lab
 
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.time import STATIC
-from msmpetsc.study.cases import inline
 from msmpetsc.study.metrics import surface_error
+from msmpetsc.study.sizing.choice import Candidate, overrides, tables
 
 ERRORS, LIMIT = (0.1, 0.03, 0.01), 900.0  # [s] a finer run
 FINER = 32, 8  # times the cells: 8 are half the edge, and err by half as much where the order is 1
@@ -49,40 +50,33 @@ class Planned(NamedTuple):
     """What the plan of a scene file chose on its first frames.
 
     frames  : None for all
-    method  : integrator, time_step [s], preset, step_error (None of verlet)
     seconds : that the plan took
     """
 
     file: Path
     frames: int | None
-    method: dict
+    method: Candidate
     cells: int
     answer: dict
     seconds: float
 
-    def run(self, method: dict, cells: int, limit: float) -> lab.Run:
+    def run(self, method: Candidate, cells: int, limit: float) -> lab.Run:
         """Run so many cells by a method, with the surface at the scene's own frames."""
-        scene = load_scene(self.file)
-        cages = scene.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
-        step = {"integrator": method["integrator"], "step": method["time_step"]}
-        time = scene.time.model_dump(exclude_unset=True) | step
+        step = load_scene(self.file).time.step
+        changes = overrides(self.file, {**tables(method), "cages": {"count": cells, "cell_size": None}})
+        changes += ["output.surface=true", f"output.every={max(1, round(step / method.time_step))}"]
         if self.frames:
-            time["duration"] = self.frames * scene.time.step
-        changes = [f"cages={inline(cages)}", f"time={inline(time)}", "output.surface=true"]
-        changes += [f"output.every={max(1, round(scene.time.step / method['time_step']))}"]
-        if method["step_error"]:
-            changes += [f"solver={inline({'preset': method['preset'], 'error': method['step_error']})}"]
-        path = FOLDER / f"{self.file.stem}_{cells}_{method['integrator']}.h5"
+            changes += [f"time.duration={self.frames * step}"]
+        path = FOLDER / f"{self.file.stem}_{cells}_{method.integrator}.h5"
         return lab.run(self.file, path, ["--quiet"], changes, timeout=limit)
 
-    def finer(self) -> Iterator[tuple[int, dict]]:
+    def finer(self) -> Iterator[tuple[int, Candidate]]:
         """Yield cells and methods of finer runs."""
         method, finest = self.method, max(each["cells"] for each in self.answer["tried"])
-        if method["integrator"] == STATIC:
-            method = method | {"step_error": 1e-3}
-        elif method["integrator"] != "verlet":  # whose substeps are as short as the cells ask
-            shorter = {"integrator": "bdf2", "time_step": method["time_step"] / SHORTER, "preset": "newton"}
-            method = shorter | {"step_error": min(1e-3, method["step_error"])}
+        if method.integrator == STATIC:
+            method = replace(method, step_error=1e-3)
+        elif method.integrator != "verlet":  # whose substeps are as short as the cells ask
+            method = Candidate("bdf2", method.time_step / SHORTER, "newton", min(1e-3, method.step_error))
         for times in FINER:
             yield round(max(times * self.cells, MORE * finest)), method
 
@@ -98,7 +92,7 @@ def planned(file: Path, target: float, frames: int | None, cells: int) -> Planne
         return ended.reason
     answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])  # behind what was tried
     choice = answer["choice"]
-    return Planned(file, frames, choice["method"], choice["cells"], answer, perf_counter() - begin)
+    return Planned(file, frames, Candidate(**choice["method"]), choice["cells"], answer, perf_counter() - begin)
 
 
 def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
@@ -122,10 +116,10 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
         return found | {"chosen, cells": plan}
     error, why = true_error(plan, limit)
     method, choice = plan.method, plan.answer["choice"]
-    step = "" if method["step_error"] is None else f", {1000 * method['time_step']:.3g} ms to {method['step_error']:g}"
+    step = "" if method.step_error is None else f", {1000 * method.time_step:.3g} ms to {method.step_error:g}"
     bounds = [*([] if plan.answer["met"] else ["**not met**"]), why, *plan.answer["bounds"]]
     return found | {
-        "chosen, cells": f"{method['integrator']}{step}, {plan.cells}",
+        "chosen, cells": f"{method.integrator}{step}, {plan.cells}",
         "expected: cells + time + step": " + ".join(f"{100 * value:.2g}%" for value in choice["budget"].values()),
         "true error": None if error is None else f"{100 * error:.2g}%",
         "over asked": None if error is None else f"{error / target:.2g}",

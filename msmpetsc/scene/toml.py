@@ -34,10 +34,12 @@ def plain(value: Any) -> Any:
 
 
 def toml_value(value: Any) -> str:
-    """Return a value as it stands in a line of TOML."""
+    """Return a value as it stands in a line of TOML; a key that is None is absent."""
     value = plain(value)
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {toml_value(inner)}" for key, inner in value.items()) + "}"
+        return (
+            "{" + ", ".join(f"{key} = {toml_value(inner)}" for key, inner in value.items() if inner is not None) + "}"
+        )
     if isinstance(value, list):
         return f"[{', '.join(map(toml_value, value))}]"
     return json.dumps(value, default=str)

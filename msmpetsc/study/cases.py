@@ -14,6 +14,7 @@ from typing import Any
 from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import Scene, load_scene
+from msmpetsc.scene.toml import toml_value
 from msmpetsc.study.forkserver import COLD
 from msmpetsc.study.study_file import Axis, Length, Map, MapCase, Study, StudyScene, Sweep
 
@@ -140,20 +141,15 @@ def with_solver(case: Case, scene: Scene) -> Case:
     solver = scene_tables(vars(case)).get("solver")
     if solver is None:
         return case
-    return case.changed(f"solver={inline(scene.solver.model_dump(exclude_unset=True) | solver)}")
+    return case.changed(f"solver={toml_value(scene.solver.model_dump(exclude_unset=True) | solver)}")
 
 
 def with_time(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
     """Return a case with the overrides of its time and output tables, which store the surface if asked to."""
     time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
     time |= scene_tables(vars(case))["time"]
-    case = case.changed(f"time={inline(time)}", SURFACE if surface else "output.surface=false")
+    case = case.changed(f"time={toml_value(time)}", SURFACE if surface else "output.surface=false")
     return case.changed(f"output.every={every}") if every > 1 else case
-
-
-def inline(table: Mapping[str, Any]) -> str:
-    """Return a TOML inline table of plain values; None is left out."""
-    return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None) + "}"
 
 
 def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
@@ -271,7 +267,7 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
         raise InputError(f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s")
     case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
-    solver = inline({"preset": reference.preset, "error": reference.error})
+    solver = toml_value({"preset": reference.preset, "error": reference.error})
     return with_time(case.changed(f"solver={solver}"), duration, every, as_given, surface)
 
 

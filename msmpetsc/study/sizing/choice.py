@@ -12,8 +12,9 @@ import tomlkit
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import read_toml
 from msmpetsc.scene.time import STATIC
+from msmpetsc.scene.toml import toml_value
 from msmpetsc.scene.values import IntegratorName
-from msmpetsc.study.cases import inline, scene_tables
+from msmpetsc.study.cases import scene_tables
 from msmpetsc.study.sizing.orders import ErrorLaw
 
 STEEPEST = 1.6  # power of the cells that the cost of a step goes by, at most: what is more is the noise of a clock
@@ -201,7 +202,7 @@ def overrides(scene: Path, tables: Tables) -> list[str]:
     for name, table in tables.items():
         given = document.get(name, {})
         if any(value is None and key in given for key, value in table.items()):
-            changes.append(f"{name}={inline({**given, **table})}")  # --set changes keys, and takes none away
+            changes.append(f"{name}={toml_value({**given, **table})}")  # --set changes keys, and takes none away
         else:
             changes += [f"{name}.{key}={value}" for key, value in table.items() if value is not None]
     return changes

@@ -10,8 +10,9 @@ from typing import NamedTuple
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.time import STATIC
+from msmpetsc.scene.toml import toml_value
 from msmpetsc.scene.values import IntegratorName
-from msmpetsc.study.cases import Case, inline, with_solver, with_time
+from msmpetsc.study.cases import Case, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.sizing.choice import (
@@ -343,7 +344,7 @@ class Sizer:
         cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
         timeout = TIME if cells < self.cells else LONG_TIME
         case = Case(
-            scene=self.scene.stem, file=self.scene, content="", set=(f"cages={inline(cages)}",), ranks=self.ranks,
+            scene=self.scene.stem, file=self.scene, content="", set=(f"cages={toml_value(cages)}",), ranks=self.ranks,
             integrator=method.integrator, time_step=method.time_step, preset=method.preset, error=method.step_error,
             timeout=timeout,
         )  # fmt: skip

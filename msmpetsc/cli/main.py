@@ -28,7 +28,6 @@ from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean
 
 DRAWING = ("render", "export", "compare")  # which the extra "render" is enough for
 OUR_SHORT = ("-o", "-h")
-TAKE_PETSC_OPTIONS = ("run",)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -142,9 +141,9 @@ def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
     valid = option_names(name)
     for word in petsc:
         doubled = f"-{word.partition('=')[0]}"
-        if doubled in valid and not (name in TAKE_PETSC_OPTIONS and doubled == "--help"):  # PETSc has a -help, too
+        if doubled in valid and not (name == "run" and doubled == "--help"):  # PETSc has a -help, too
             raise InputError(f"{word}: options of one dash are PETSc's, did you mean {doubled!r}?")
-    if petsc and name not in TAKE_PETSC_OPTIONS:
+    if petsc and name != "run":
         raise InputError(f"{petsc[0]}: {name} takes no PETSc options{did_you_mean(f'-{petsc[0]}', valid)}")
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.errors import InputError, one_line, printable
 from msmpetsc.fields import FIELDS
+from msmpetsc.results.disk import refuse_no_file
 from msmpetsc.scene.toml import toml_of
 
 if TYPE_CHECKING:  # who reads frames needs neither
@@ -232,9 +233,9 @@ class Result:
 def open_result(path: str | Path) -> h5py.File:
     """Open a result file for reading. Raises InputError if it is none."""
     path = Path(path)
-    if not path.is_file():
-        kind = "a folder" if path.is_dir() else "a pipe or a device"
-        raise InputError(f"{path} is {kind}, not a file" if path.exists() else f"{path}: no such file")
+    refuse_no_file(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
     with plain_damage(path):
         path.open("rb").close()  # is_hdf5 does not tell why it cannot read
         if not h5py.is_hdf5(path):

@@ -143,11 +143,5 @@ def spread(table: "DataFrame", cost: str) -> "DataFrame":
     return table.assign(least=least.where(known), greatest=greatest.where(known))[["least", "greatest"]]
 
 
-def reach(table: "DataFrame", cost: str) -> "DataFrame":
-    """Return the spread of the repeats, with the cost itself where it is not known."""
-    ends: DataFrame = spread(table, cost).apply(lambda column: column.fillna(table[cost]))
-    return ends
-
-
 def is_repeated(table: "DataFrame") -> bool:
     return bool(table["time_frame_min"].notna().all())

@@ -26,7 +26,7 @@ from msmpetsc.study.charts.plot import (
     log_axis,
     points,
 )
-from msmpetsc.study.table import ONCE_NOTE, Row, grouped, is_repeated, measured, reach, records, spread, succeeded
+from msmpetsc.study.table import ONCE_NOTE, Row, grouped, is_repeated, measured, records, spread, succeeded
 
 KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
@@ -131,13 +131,13 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     step = formatting.worded("time_step", rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
     x = log_axis(measure.x_label, rows[measure.error], ERROR)
-    y = log_axis(measure.y_label, reach(rows, measure.cost).to_numpy().ravel(), SECONDS)
+    rows = rows.join(spread(rows, measure.cost))
+    y = log_axis(measure.y_label, rows[["least", "greatest", measure.cost]].to_numpy(), SECONDS)
     panel = chart.panel(f"over the {measure.name}{at_step}", x, y)
     front = front_rows(rows, measure)
     (_, right), (_, top) = x["scale"]["domain"], y["scale"]["domain"]
     errors, costs = list(front[measure.error]), list(front[measure.cost])
     panel.stair([errors[0], *errors, right], [top, *costs, costs[-1]])
-    rows = rows.join(spread(rows, measure.cost))
     best = concat([front_rows(group, measure) for group in grouped(rows, "label").values()])
     columns = (*measure.columns, *TIP)
     panel.whiskers(rows, measure.columns)

@@ -86,8 +86,8 @@ def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dic
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
-    """Return a logarithmic axis around positive values, with margins, at least a decade long."""
-    low, high = math.log10(np.min(values)), math.log10(np.max(values))
+    """Return a logarithmic axis around positive values, NaN left out, with margins, at least a decade long."""
+    low, high = math.log10(np.nanmin(values)), math.log10(np.nanmax(values))
     middle, half = (low + high) / 2, max(high - low, 0.85) * 0.58
     low, high = middle - half, middle + half
     steps = (1, 2, 5) if high - low < 2.5 else (1,)

@@ -1,23 +1,21 @@
 #!/usr/bin/env python3
-"""The measures of a tree of msmpetsc: rooms, functions, names, density of lines, findings.
+"""The measures of a tree of msmpetsc: rooms, functions, names, density of lines.
 
-    scripts/house.py [FOLDER] [--quick]
+    scripts/house.py [FOLDER]
 
-FOLDER is a clone, this one if none is given. --quick leaves out mypy, whose rules are this clone's. A walk counts the
-functions, and the modules that they stand in, which take a value of such a type: a Scene, or the request as Namespace
-or Request.
+FOLDER is a clone, this one if none is given. A walk counts the functions, and the modules that they stand in, which
+take a value of such a type: a Scene, or the request as Namespace or Request.
 """
 
 import ast
 import re
-import subprocess
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 
 import lab
-from clone import PYTHON, ROOT
+from clone import ROOT
 
 WALKS = {"scene": r"\bScene\b", "request": r"\bNamespace\b|Request\b"}  # types of what is handed on
 LONGEST, MOST_ARGUMENTS, WIDE = 35, 6, 100  # lines of a function without its docstring; columns
@@ -146,31 +144,12 @@ def density(tree: Tree) -> Facts:
         yield f"{name}: all, in 1,000 lines", f"{count:,}, {1000 * count / len(lines):.1f}"
 
 
-# ---- findings
-
-
-def findings(tree: Tree) -> Facts:
-    """Yield what mypy --strict by the rules of this clone says of the tree, by room."""
-    words = [str(PYTHON), "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), "--strict", "msmpetsc"]
-    done = subprocess.run(words, cwd=tree.folder, capture_output=True, text=True)
-    found = Counter(re.findall(r"^msmpetsc/(\w+).*: error: ", done.stdout, re.M))
-    yield "mypy --strict findings", f"{found.total()}: {', '.join(f'{room} {count}' for room, count in found.items())}"
-
-
-def measures(folder: Path, quick: bool) -> dict[str, object]:
-    """Return all measures of a tree by their names."""
-    tree = Tree(folder)
-    rows = dict(rooms(tree)) | dict(shape(tree)) | dict(density(tree))
-    return rows if quick else rows | dict(findings(tree))
-
-
 def main() -> None:
     options = lab.parser(__doc__)
     options.add_argument("folder", nargs="?", type=Path, default=ROOT, metavar="FOLDER", help="a clone (this one)")
-    options.add_argument("--quick", action="store_true", help="read files only")
     args = options.parse_args()
-    found = measures(args.folder.resolve(), args.quick)
-    lab.table({"measure": name, "now": value} for name, value in found.items())
+    tree = Tree(args.folder.resolve())
+    lab.table({"measure": name, "now": value} for facts in (rooms, shape, density) for name, value in facts(tree))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """One lattice in two programs: time and trajectory error of ours and of NVIDIA's Newton.
 
-    scripts/bench_peers.py [--cells X Y Z] [--frames N] [--only WORD] [--timeout S]
+    scripts/bench_peers.py [--cells X Y Z] [--frames N] [--only WORD]
 
 A beam of 40 x 15 x 15 cells of 25 mm (E = 5e5 Pa, 1000 kg/m^3), one end pinned, is let go under its weight; frames are
 of 1/60 s. Both programs get the same nodes, masses, springs and stiffnesses, and a process of their own on one core;
@@ -28,6 +28,7 @@ CELL, FRAME, G = 0.025, 1 / 60, 9.81  # [m], [s], [m/s^2]
 REFERENCE = ['time.integrator="verlet"', "time.substep=5e-5"]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 OURS = "msmpetsc"
+TIMEOUT = 600.0  # [s] of each program
 
 
 class Beam(NamedTuple):
@@ -119,7 +120,6 @@ class Setup(NamedTuple):
     changes: list[str]
     reference: Path
     frames: int
-    timeout: float  # [s]
 
 
 CASES = [
@@ -139,21 +139,21 @@ def use_one_core() -> None:
     os.environ.update(dict.fromkeys(THREADS, "1"))
 
 
-def set_up(cells: list[int], frames: int, timeout: float) -> Setup:
+def set_up(cells: list[int], frames: int) -> Setup:
     """Run the reference, whose lattice all programs take."""
     changes = [
         lab.box(FOLDER / "beam.obj", CELL * np.array(cells)),
         f"cages.cell_size={CELL}",
         f"time.duration={frames * FRAME}",
     ]
-    reference = lab.run(SCENE, FOLDER / "reference.h5", (), [*changes, *REFERENCE], timeout=timeout)
-    return Setup(changes, reference.path, frames, timeout)
+    reference = lab.run(SCENE, FOLDER / "reference.h5", (), [*changes, *REFERENCE], timeout=TIMEOUT)
+    return Setup(changes, reference.path, frames)
 
 
 def ours(case: Case, setup: Setup) -> Trajectory | str:
     """Run a case of our own; why it failed if it did. Verlet's steps solve nothing and have no error."""
     changes = [*setup.changes, f'time.integrator="{case.integrator}"']
-    run = lab.run(SCENE, FOLDER / f"{case.integrator}.h5", (), changes, timeout=setup.timeout)
+    run = lab.run(SCENE, FOLDER / f"{case.integrator}.h5", (), changes, timeout=TIMEOUT)
     if run.failure:
         return run.failure
     frames = run.frames("wall_time", "step_error")
@@ -169,7 +169,7 @@ def theirs(case: Case, setup: Setup) -> Trajectory | str:
     """Run Newton in a process of its own; why it failed if it did."""
     path = FOLDER / "newton.npz"
     words = ["--frames", setup.frames, "--play", setup.reference, path, case.substeps, case.iterations]
-    ended = lab.python([Path(__file__), *words], path.with_suffix(".log"), timeout=setup.timeout)
+    ended = lab.python([Path(__file__), *words], path.with_suffix(".log"), timeout=TIMEOUT)
     if ended.reason:
         return ended.reason
     with np.load(path) as left:
@@ -215,7 +215,6 @@ def main() -> None:
     options.add_argument("--cells", type=int, nargs=3, default=[40, 15, 15], metavar="N", help="along x, y, z")
     options.add_argument("--frames", type=int, default=30, metavar="N")
     options.add_argument("--only", default="", metavar="WORD", help="cases whose program or method has this word")
-    options.add_argument("--timeout", type=float, default=600, metavar="S", help="of each program [s]")
     options.add_argument("--play", nargs=4, help=SUPPRESS)  # what theirs() starts
     args = options.parse_args()
     if args.play:
@@ -224,7 +223,7 @@ def main() -> None:
     use_one_core()
     cases = [case for case in CASES if args.only.lower() in f"{case.program} {case.method}".lower()]
     lab.heading()
-    lab.table(rows(cases, set_up(args.cells, args.frames, args.timeout)))
+    lab.table(rows(cases, set_up(args.cells, args.frames)))
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ def small(tmp_path_factory: pytest.TempPathFactory):
     """A beam of 4 x 2 x 2 cells and three frames of it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench_peers, "FOLDER", tmp_path_factory.mktemp("bench_peers"))
-        yield bench_peers.set_up([4, 2, 2], 3, 100)
+        yield bench_peers.set_up([4, 2, 2], 3)
 
 
 def test_the_beam_that_peers_get_is_that_of_the_run(small: bench_peers.Setup):

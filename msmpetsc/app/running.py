@@ -51,17 +51,6 @@ class RunPlan:
     logged: dict[str, float]
 
 
-@dataclass(frozen=True)
-class RunEnd:
-    """How the steps of a run ended: at its last step, by a signal, or by a step that failed."""
-
-    simulation: TimeLoop
-    file: ResultFile
-    cost: Cost
-    signal: int
-    failure: StepFailed | None
-
-
 def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, started: float) -> int:
     """Run from the start, or go on from an earlier run; return the exit status (collective).
 
@@ -72,7 +61,7 @@ def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None,
         write_companions(comm, request, whole=True)
         log.info("%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished)
         return 0
-    return finish(comm, plan, take_steps(comm, plan), started)
+    return finish(comm, plan, *take_steps(comm, plan), started)
 
 
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
@@ -90,8 +79,11 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     return RunPlan(request, scene, resumed, began, logged)
 
 
-def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
-    """Take the steps; after each, keep its frame and a checkpoint that is due (collective)."""
+def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, StepFailed | None]:
+    """Take the steps; after each, keep its frame and a checkpoint that is due (collective).
+
+    Returns where the steps ended, at the last or by a signal; what they cost; and the failure of one that ended them.
+    """
     failure = None
     if cache_is_empty():
         log.info("compiling kernels, once, about a minute")
@@ -125,22 +117,24 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
         except StepFailed as error:
             failure = error  # the frames before it are worth a look
         file.close(trim=not checkpoints.signal)
-    return RunEnd(simulation, file, cost, checkpoints.signal, failure)
+    return checkpoints, cost, failure
 
 
-def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) -> int:
+def finish(
+    comm: MPI.Intracomm, plan: RunPlan, ended: Checkpoints, cost: Cost, failure: StepFailed | None, started: float
+) -> int:
     """Write what stands beside the result, tell the end, and return the exit status (collective).
 
     Raises the StepFailed that ended the run.
     """
     request = plan.request
     if request.measured:
-        ended.cost.write(request.measured, request.command, plan.logged, ended.failure)
-    left = write_companions(comm, request, whole=not ended.signal and ended.failure is None)
-    on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, ended.cost.setup, left))
-    ended.cost.log_hardest()
-    if ended.failure:
-        raise ended.failure
+        cost.write(request.measured, request.command, plan.logged, failure)
+    left = write_companions(comm, request, whole=not ended.signal and failure is None)
+    on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, cost.setup, left))
+    cost.log_hardest()
+    if failure:
+        raise failure
     if ended.signal:
         return tell_stop(ended.signal, request.path, ended.simulation)
     ended.simulation.refuse_unused_options(at_end=True)

@@ -5,7 +5,7 @@ between them. Beside each body stand the obstacles and forces of its own time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage
 from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
-from msmpetsc.view.composition import Style, composition_of
+from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_result
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
@@ -23,15 +23,6 @@ from msmpetsc.view.renderer import Renderer
 PANEL, NARROWEST = np.array([400, 870]), 240  # [px]: at most, and the least that a caption needs
 ROW = 2000  # [px]: wider ones are broken into several
 COUNT = 5  # moments, where nothing is said
-
-
-@dataclass(frozen=True)
-class Moment:
-    """One panel: number of its frame, a caption of two lines, and whether the body is cut open."""
-
-    index: int
-    caption: tuple[str, str]
-    cells: bool = False
 
 
 def contact_sheet(
@@ -49,24 +40,19 @@ def contact_sheet(
     with plain_damage(Path(h5_path)), Result(h5_path) as run:
         subject = drawable_of_result(run)
         chosen = _moments(run, subject, frames, count)
-        times = subject.times
-        moments = [Moment(i, (f"t = {times[i]:.3f} s", text), style.cells) for i, text in chosen.items()]
-        draw_moments(subject, Path(png_path), moments, style)
+        composition = composition_of(drawn(subject), list(chosen), style)
+        stills = zip(composition.stills(list(chosen)), chosen.values(), strict=True)
+        draw_panels(composition, [replace(still, caption=(still.caption[0], text)) for still, text in stills], png_path)
     return Path(png_path)
 
 
-def draw_moments(subject: Drawable, path: Path, moments: Sequence[Moment], style: Style) -> None:
-    """Draw bodies at some moments, in rows of panels above the legend.
+def draw_panels(composition: Composition, stills: Sequence[Still], path: str | Path) -> None:
+    """Draw stills of a composition, in rows of panels above the legend.
 
     The panels are drawn one by one: a graphics library's own pictures end at some width, and beyond it they are black.
     """
-    composition = composition_of(drawn(subject), [moment.index for moment in moments], style)
-    stills = [
-        replace(still, caption=moment.caption, cut=composition.cut(moment.cells))
-        for still, moment in zip(composition.stills([moment.index for moment in moments]), moments, strict=True)
-    ]
     low, high, _ = composition.room(stills)
-    scale = ((style.size or PANEL) / (high - low)).min()  # [px/m]
+    scale = ((composition.style.size or PANEL) / (high - low)).min()  # [px/m]
     width, height = (int(side) for side in np.maximum([NARROWEST, 1], np.round(scale * (high - low))))  # [px]
     rows = -(-len(stills) // max(1, ROW // width))
     columns = -(-len(stills) // rows)
@@ -77,7 +63,7 @@ def draw_moments(subject: Drawable, path: Path, moments: Sequence[Moment], style
             sheet[number // columns, :, number % columns] = np.concatenate(captioned)
     sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
     entries = entries_of(composition, stills)
-    with whole_file(path) as part:
+    with whole_file(Path(path)) as part:
         Image.fromarray(np.concatenate([sheet, legend_picture(entries, columns * width)])).save(part)
 
 

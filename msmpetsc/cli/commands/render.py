@@ -12,11 +12,12 @@ from msmpetsc.errors import InputError
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.view.composition import Style
+from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result
 from msmpetsc.view.film import playback_of, write_film
+from msmpetsc.view.mesh import drawn
 from msmpetsc.view.page import write_page
-from msmpetsc.view.sheet import Moment, contact_sheet, draw_moments
+from msmpetsc.view.sheet import contact_sheet, draw_panels
 
 SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
 STILL = (760, 900)  # [px]: a panel of a scene
@@ -80,10 +81,12 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     if path.suffix.lower() not in PICTURE_NAMES:
         write_page(subject, path, [0], style)
         return
-    moments = [Moment(0, (subject.title, about[0]), style.cells)]
+    composition = composition_of(drawn(subject), [0], replace(style, size=style.size or STILL))
+    (still,) = composition.stills([0])
+    stills = [replace(still, caption=(subject.title, about[0]))]
     if not style.cells:
-        moments.append(Moment(0, ("cut open", about[1]), True))
-    draw_moments(subject, path, moments, replace(style, size=style.size or STILL))
+        stills.append(replace(still, caption=("cut open", about[1]), cut=composition.cut(True)))
+    draw_panels(composition, stills, path)
 
 
 def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:

@@ -26,22 +26,6 @@ Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # a quarter turn about x
 CLAY = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0}, "doubleSided": True}
 
 
-class Moments:
-    """The exported frames of a result's surface, independent of the format, one in memory at a time.
-
-    frames : numbers of those chosen
-    times  : (t,) [s]
-    cells  : (f, 3) corner points
-    """
-
-    def __init__(self, run: Result, frames: Sequence[int]):
-        """Choose frames. Raises InputError for a result without a surface, or a damaged one."""
-        self.run, self.frames = run, list(frames)
-        if "surface/points" not in run:
-            raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
-        self.times, self.cells = run.frames.time[:][self.frames], run.indices("surface/triangles")
-
-
 def normals(points: Array, triangles: Indices) -> Array:
     """Return area-weighted unit normals (v, 3) float32 at points (v, 3) of triangles (f, 3)."""
     corners = points[triangles].astype(float)
@@ -88,23 +72,24 @@ class Chunk:
         return {"POSITION": self.add(points, POINTS, bounds=True), "NORMAL": self.add(normals, POINTS)}
 
 
-def write_glb(moments: Moments, path: Path) -> None:
+def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
     """Write frames as glTF. Raises InputError for more bytes than the format allows."""
-    first, *others = moments.frames
-    base = moments.run.surface_at(first).astype(np.float32)
-    upright = normals(base, moments.cells)
+    first, *others = frames
+    triangles = run.indices("surface/triangles")
+    base = run.surface_at(first).astype(np.float32)
+    upright = normals(base, triangles)
     chunk = Chunk()
-    indices = chunk.add(moments.cells.astype("<u4").ravel(), TRIANGLES)
+    indices = chunk.add(triangles.astype("<u4").ravel(), TRIANGLES)
     shape = chunk.add_shape(base, upright)
     targets = []
     for frame in others:
-        points = moments.run.surface_at(frame).astype(np.float32)
-        targets.append(chunk.add_shape(points - base, normals(points, moments.cells) - upright))
+        points = run.surface_at(frame).astype(np.float32)
+        targets.append(chunk.add_shape(points - base, normals(points, triangles) - upright))
         if chunk.size > MOST_BYTES:
             raise InputError(f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)")
-    document = _document(shape, indices, targets, moments.run.path.stem)
+    document = _document(shape, indices, targets, run.path.stem)
     if others:
-        document["animations"] = [_animation(chunk, moments.times, len(others))]
+        document["animations"] = [_animation(chunk, run.frames.time[:][frames], len(others))]
     document |= {"accessors": chunk.accessors, "bufferViews": chunk.views, "buffers": [{"byteLength": chunk.size}]}
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
@@ -140,22 +125,22 @@ def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
     return {"samplers": [sampler], "channels": [channel]}
 
 
-def write_usd(moments: Moments, path: Path) -> None:
+def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
     """Write frames as USD, by a library that only this format needs."""
     from msmpetsc.export import usd
 
-    usd.write_usd(moments, path)
+    usd.write_usd(run, frames, path)
 
 
-def write_one_frame(moments: Moments, path: Path) -> None:
+def write_one_frame(run: Result, frames: Sequence[int], path: Path) -> None:
     """Write a single frame by meshio."""
     import meshio
 
-    (frame,) = moments.frames
-    meshio.write(path, meshio.Mesh(moments.run.surface_at(frame), [("triangle", moments.cells)]))
+    (frame,) = frames
+    meshio.write(path, meshio.Mesh(run.surface_at(frame), [("triangle", run.indices("surface/triangles"))]))
 
 
-FORMATS: dict[str, Callable[[Moments, Path], None]] = {
+FORMATS: dict[str, Callable[[Result, Sequence[int], Path], None]] = {  # of the surface at frames
     ".glb": write_glb,
     ".usd": write_usd,
     ".usda": write_usd,
@@ -179,9 +164,10 @@ def export(result: str | Path, path: str | Path, frames: Frames | None = None) -
         raise InputError(f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}")
     with Result(result) as run:
         numbers = _frames(run, path, write is not write_one_frame, frames)
-        moments = Moments(run, numbers)
+        if "surface/points" not in run:
+            raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
         with whole_file(path) as part:
-            write(moments, part)
+            write(run, numbers, part)
     return path
 
 

@@ -3,6 +3,7 @@
 .usda is text, .usdc and .usd are binary. Normals go with the points, for without them programs draw each triangle flat.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,32 +12,35 @@ from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import one_line
-from msmpetsc.export.formats import Moments, normals
+from msmpetsc.export.formats import normals
+from msmpetsc.results.reader import Result
 
 CLAY = (0.8, 0.55, 0.4)
 UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}  # the axes that USD knows as upward
 SAVED = 16  # frames: so many are in memory at a time, where the format is binary
 
 
-def write_usd(moments: Moments, path: Path) -> None:
+def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
     """Write frames as USD. Raises OSError where the library cannot."""
     path.touch()  # or the library would say why not, in many lines
     try:
         stage = Usd.Stage.CreateNew(str(path))
-        root = UsdGeom.Xform.Define(stage, f"/{Tf.MakeValidIdentifier(moments.run.path.stem)}")
+        root = UsdGeom.Xform.Define(stage, f"/{Tf.MakeValidIdentifier(run.path.stem)}")
         stage.SetDefaultPrim(root.GetPrim())
-        UsdGeom.SetStageUpAxis(stage, up_axis(moments.run.scene))
+        UsdGeom.SetStageUpAxis(stage, up_axis(run.scene))
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        rate = frames_a_second(moments.times)
+        times = run.frames.time[:][frames]
+        rate = frames_a_second(times)
         stage.SetTimeCodesPerSecond(rate)
         stage.SetFramesPerSecond(rate)
-        codes = np.round(moments.times * rate, 6)
+        codes = np.round(times * rate, 6)
         stage.SetStartTimeCode(codes[0])
         stage.SetEndTimeCode(codes[-1])
-        of_point = moments.run.body_of("surface")
-        bodies = [UsdBody(stage, root.GetPath(), moments, of_point, number) for number in np.unique(of_point)]
-        for count, (frame, code) in enumerate(zip(moments.frames, codes, strict=True), 1):
-            points = moments.run.surface_at(frame)
+        triangles = run.indices("surface/triangles")
+        of_point = run.body_of("surface")
+        bodies = [UsdBody(stage, root.GetPath(), triangles, of_point, number) for number in np.unique(of_point)]
+        for count, (frame, code) in enumerate(zip(frames, codes, strict=True), 1):
+            points = run.surface_at(frame)
             for body in bodies:
                 body.add(points, float(code))
             if path.suffix != ".usda" and count % SAVED == 0:
@@ -49,10 +53,10 @@ def write_usd(moments: Moments, path: Path) -> None:
 class UsdBody:
     """The USD mesh of one body, to which frames are added."""
 
-    def __init__(self, stage: Any, root: Any, moments: Moments, of_point: Indices, number: int):
+    def __init__(self, stage: Any, root: Any, triangles: Indices, of_point: Indices, number: int):
         """Define the constant parts: triangles and colour."""
         self._rows = np.flatnonzero(of_point == number)
-        own = moments.cells[of_point[moments.cells[:, 0]] == number]
+        own = triangles[of_point[triangles[:, 0]] == number]
         self._triangles = np.searchsorted(self._rows, own)
         name = "body" if of_point.max() == 0 else f"body_{number}"
         self._mesh = UsdGeom.Mesh.Define(stage, root.AppendChild(name))

@@ -9,11 +9,11 @@ import numpy as np
 import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
-from msmpetsc.backend.arrays import Array, Floats, Mask, Positions
+from msmpetsc.backend.arrays import Array, Floats, Mask
 from msmpetsc.errors import InputError
 from msmpetsc.view.colours import ARROW, BODY, FIXED, GLASS, GLASS_EDGE, GROUND, SHADOW, rgb
 from msmpetsc.view.composition import Composition, Still
-from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, surface_of
+from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, surface_of
 from msmpetsc.view.overlays import Ground, Overlays
 
 GLASS_OPACITY = 0.22
@@ -87,14 +87,18 @@ class Renderer:
             shading |= dict(scalars="colours", rgb=True)
         if not fixed.all():
             self._plotter.add_mesh(_faces(surface, ~fixed), color=BODY, **shading)
-        if still.cut:
-            _draw_lattice(self._plotter, still.cut, subject.nodes(still.index))
+        for kind, cells in (still.cut or {}).items():
+            grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, subject.nodes(still.index)).shrink(SHRUNK)
+            self._plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
         self._draw_obstacles(still.overlays)
         for tail, tip in still.overlays.arrows:  # nearer to the eye is the same point of the picture
             _draw_arrow(self._plotter, tail + 2 * self._depth * self._composition.camera.to_eye, tip - tail)
 
     def _draw_obstacles(self, overlays: Overlays) -> None:
-        for box in map(_hexahedron, overlays.glass):
+        for corners in overlays.glass:
+            box = pv.StructuredGrid()
+            box.points = corners
+            box.dimensions = (2, 2, 2)
             self._plotter.add_mesh(box, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
             self._plotter.add_mesh(box.extract_all_edges(), color=GLASS_EDGE, line_width=2, lighting=False)
         for ball in overlays.balls:
@@ -113,19 +117,6 @@ def _faces(surface: pv.PolyData, chosen: Mask) -> pv.PolyData:
     part = surface_of(surface.points, surface.regular_faces[chosen])
     part.point_data.update(surface.point_data)
     return part
-
-
-def _hexahedron(corners: Positions) -> pv.StructuredGrid:
-    """Return a hexahedron of corners (8, 3) numbered 4i + 2j + k."""
-    grid = pv.StructuredGrid()
-    grid.points, grid.dimensions = corners, (2, 2, 2)
-    return grid
-
-
-def _draw_lattice(plotter: pv.Plotter, cut: Cut, nodes: Positions) -> None:
-    for kind, cells in cut.items():
-        grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, nodes).shrink(SHRUNK)
-        plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None:

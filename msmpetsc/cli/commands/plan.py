@@ -30,12 +30,8 @@ def run(args: argparse.Namespace) -> int:
         plan = size_all(args, target)
         print_size(plan, target)
         command = print_command(args, plan.choice) if plan.met else None
-    tried = [{"method": each.method.integrator, "cells": each.cells, "cost": each.cost} for each in plan.tried]
-    record = {
-        "met": plan.met, "target": target, "choice": asdict(plan.choice), "error": plan.choice.budget.total,
-        "bounds": plan.bounds, "tried": tried, "command": command,
-    }  # fmt: skip
     if args.json:
+        record = asdict(plan) | {"target": target, "error": plan.choice.budget.total, "command": command}
         print(json.dumps(record, indent=1, default=str))  # of paths the names
     return 0 if plan.met else NOTHING_MEETS
 

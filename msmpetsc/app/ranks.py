@@ -19,8 +19,7 @@ ALONE = {
 }  # fmt: skip
 VARIABLES_OF_MPI = (  # of a launcher around us: not for our children
     "PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_MCA_ess", "OMPI_MCA_orte_ess_",
-    "OMPI_MCA_orte_hnp_uri",
-    "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
+    "OMPI_MCA_orte_hnp_uri", "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
 )  # fmt: skip
 # more ranks than cores are the user's to ask for: as Open MPI 4 calls it, and as 5 does
 OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}

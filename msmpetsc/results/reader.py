@@ -211,9 +211,7 @@ class Result:
 
         if not self._embedding:
             return None
-        if len(self._embedding) < 3:
-            raise InputError(f"{self.path}: a part of embedding is missing")
-        parts = [self._embedding[name][:] for name in ("weights", "indices", "indptr")]
+        parts = [self[f"embedding/{name}"][:] for name in ("weights", "indices", "indptr")]
         try:
             W = csr_array(tuple(parts), shape=(len(parts[2]) - 1, len(self.lattice.nodes)))
             W.check_format(full_check=True)

@@ -172,7 +172,7 @@ def springs_out_of_range(file: h5py.File) -> None:
         (attribute("scene", None), "scene", "does not say its scene"),
         (attribute("scene", "a = [[["), "scene", "its scene is not TOML"),
         (damage(indices_out_of_range), "embedding", "embedding is no matrix"),
-        (replaced("embedding/weights"), "embedding", "a part of embedding is missing"),
+        (replaced("embedding/weights"), "embedding", "it has no embedding/weights"),
         (replaced("embedding/indptr", np.array([0, 32])), "embedding", "has 1 rows for 4 points"),
         (damage(springs_out_of_range), "springs", "lattice/springs names what is not among its 12 nodes"),
     ],

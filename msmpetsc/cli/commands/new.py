@@ -85,8 +85,6 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     log.info("%s: %s", mesh, measures.words)
     for warning in warnings:
         log.warning("%s: %s", mesh, warning)
-    if warnings or len(measures.parts) > 1:
-        log.info("what the scene does about that stands in its comments")
     if up is None:
         is_y = mesh.suffix.lower() in Y_BY_DEFINITION or uprightness(surface, 1) > uprightness(surface, 2) + SURER
         up = "y" if is_y else "z"

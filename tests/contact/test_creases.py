@@ -9,7 +9,7 @@ import trimesh
 from block_scene import block_scene, play
 from crossings import count_crossings
 
-from msmpetsc.contact.surface.barrier import Acting, Barrier, BarrierLaw, energy_of, gradient_of, hessian_of
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
 from msmpetsc.geometry.surface import Surface
 
 LONG, HIGH, BOTTOM, HALF = 0.5, 0.25, 0.0625, 0.07  # [m]: of a block, of the groove's bottom, and its half width
@@ -50,7 +50,7 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     barrier, points, (folded, dropped) = barrier_of()
     assert folded > 0 and dropped == 0
     candidates = barrier.candidates(points, 0.0)
-    assert not barrier.pushing(barrier.contacts(candidates, points))
+    assert all(pairs.empty() for pairs in barrier.contacts(candidates, points))
     tight = DISTANCE / 4  # the upper edges are 0.14 m apart: no more than half of that, of 0.15 m over powers of 4
     level = barrier.distances.index(tight)
     assert barrier.contacts(None, closed(points, 1.1 * tight))[level].empty()  # to walls it is less
@@ -69,15 +69,15 @@ def test_the_derivatives_in_a_crease_are_those_of_its_energy():
     direction = np.random.default_rng(0).normal(size=points.shape)
     candidates, step = barrier.candidates(points, 0.01), 1e-7
 
-    def at(share: float) -> tuple[list[Acting], np.ndarray]:
+    def at(share: float) -> tuple[ContactSets, np.ndarray]:
         moved = points + share * step * direction
-        return barrier.pushing(barrier.contacts(candidates, moved)), moved
+        return barrier.contacts(candidates, moved), moved
 
-    slope = (energy_of(*at(1)) - energy_of(*at(-1))) / (2 * step)
-    gradient = gradient_of(*at(0))
+    slope = (barrier.energy(*at(1)) - barrier.energy(*at(-1))) / (2 * step)
+    gradient = barrier.gradient(*at(0))
     assert slope == pytest.approx(np.vdot(gradient, direction), rel=1e-5) and np.abs(gradient).max() > 0
-    bend = (gradient_of(*at(1)) - gradient_of(*at(-1))) / (2 * step)
-    product = sum(hessian_of(*at(0), False)) @ direction.ravel()
+    bend = (barrier.gradient(*at(1)) - barrier.gradient(*at(-1))) / (2 * step)
+    product = sum(barrier.hessian(*at(0), False)) @ direction.ravel()
     np.testing.assert_allclose(product, bend.ravel(), atol=1e-5 * np.abs(product).max())
     assert 0 < barrier.least(barrier.contacts(candidates, points), points) < DISTANCE / 4
 
@@ -90,7 +90,7 @@ def test_walls_are_clear_as_long_as_they_cannot_come_near():
     for seed in range(10):
         way = np.random.default_rng(seed).normal(size=points.shape)
         moved = points + 0.999 * anywhere * way / np.linalg.norm(way, axis=1)[:, None]
-        assert not barrier.pushing(barrier.contacts(candidates, moved))
+        assert all(pairs.empty() for pairs in barrier.contacts(candidates, moved))
 
 
 def test_walls_that_all_but_touch_are_left_out_and_counted():

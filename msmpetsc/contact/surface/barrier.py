@@ -13,7 +13,7 @@ ipctk is used on one thread, so that sums are the same each time; its arrays are
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -140,10 +140,28 @@ class Barrier:
         pairs.build(candidates, self.mesh, np.asfortranarray(points), distance)
         return pairs
 
-    def pushing(self, contacts: ContactSets) -> "list[Acting]":
+    def _pushing(self, contacts: ContactSets) -> "list[tuple[ipctk.BarrierPotential, ipctk.NormalCollisions]]":
         """Return the sets that are not empty, each with its barrier."""
-        kinds = zip(self.potentials, contacts, strict=True)
-        return [Acting(potential, pairs, self.mesh) for potential, pairs in kinds if not pairs.empty()]
+        kinds = zip(self.potentials, contacts, strict=False)  # of none there are no sets
+        return [(potential, pairs) for potential, pairs in kinds if not pairs.empty()]
+
+    def energy(self, contacts: ContactSets, points: Positions) -> float:
+        """Return the energy [J] of contacts at points S (p, 3) [m]."""
+        at = np.asfortranarray(points)
+        return float(sum(potential(pairs, self.mesh, at) for potential, pairs in self._pushing(contacts)))
+
+    def gradient(self, contacts: ContactSets, points: Positions) -> Rows:
+        """Return its gradient (p, 3) [N]."""
+        gradient, at = np.zeros(points.size), np.asfortranarray(points)
+        for potential, pairs in self._pushing(contacts):
+            gradient += potential.gradient(pairs, self.mesh, at)
+        return gradient.reshape(-1, 3)
+
+    def hessian(self, contacts: ContactSets, points: Positions, projected: bool) -> "list[csc_matrix]":
+        """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
+        kinds, at = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
+        kind = kinds.CLAMP if projected else kinds.NONE
+        return [potential.hessian(pairs, self.mesh, at, kind) for potential, pairs in self._pushing(contacts)]
 
     def friction(
         self, contacts: ContactSets, points: Positions, start: Positions, stick: float
@@ -165,16 +183,16 @@ class Barrier:
 
     def _tangential(self, contacts: ContactSets, points: Positions) -> "Tangential":
         of_all: Tangential = []
-        for potential, pairs, mesh in self.pushing(contacts):
+        for potential, pairs in self._pushing(contacts):
             built = self.ipctk.TangentialCollisions()
-            built.build(mesh, np.asfortranarray(points), pairs, potential, self.law.friction)
+            built.build(self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction)
             # by kind, in copies: to go over ``built`` itself ends in a crash now and then (ipctk 1.6)
             of_all += [*built.vv_collisions, *built.ev_collisions, *built.ee_collisions, *built.fv_collisions]
         return of_all
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite where there are no contacts."""
-        return min((self._least(pairs, points) for _, pairs, _ in self.pushing(contacts)), default=np.inf)
+        return min((self._least(pairs, points) for _, pairs in self._pushing(contacts)), default=np.inf)
 
     def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
@@ -214,34 +232,3 @@ class Barrier:
     def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
         return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
-
-
-class Acting(NamedTuple):
-    """A barrier of pairs, whose potential [J] is of the points S (p, 3) [m]."""
-
-    potential: "ipctk.BarrierPotential"
-    pairs: "ipctk.NormalCollisions"
-    mesh: "ipctk.CollisionMesh"
-
-
-def energy_of(acting: list[Acting], points: Positions) -> float:
-    """Return the sum of potentials [J] at points S (p, 3) [m]."""
-    at = np.asfortranarray(points)
-    return float(sum(each.potential(each.pairs, each.mesh, at) for each in acting))
-
-
-def gradient_of(acting: list[Acting], points: Positions) -> Rows:
-    """Return the gradient (p, 3) [N] of potentials."""
-    gradient, at = np.zeros(points.size), np.asfortranarray(points)
-    for each in acting:
-        gradient += each.potential.gradient(each.pairs, each.mesh, at)
-    return gradient.reshape(-1, 3)
-
-
-def hessian_of(acting: list[Acting], points: Positions, projected: bool) -> "list[csc_matrix]":
-    """Return the terms (3p, 3p) [N/m] of the Hessian; ``projected`` leaves out the negative part of each pair."""
-    import ipctk
-
-    kinds, at = ipctk.PSDProjectionMethod, np.asfortranarray(points)
-    kind = kinds.CLAMP if projected else kinds.NONE
-    return [each.potential.hessian(each.pairs, each.mesh, at, kind) for each in acting]

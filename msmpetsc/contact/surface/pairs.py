@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets, energy_of
+from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -27,6 +27,7 @@ FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew:
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 2.0  # times the move that is expected
 TINY = np.finfo(float).tiny
+NO_POINTS = np.empty((0, 3))
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,15 @@ class ContactsAt:
     """Contacts at positions q (owned, 3) [m] and a time [s] of obstacles.
 
     count    : their number
-    points   : S (p, 3) [m], on rank 0; None on all where it was not needed
-    contacts : on rank 0
+    points   : S (p, 3) [m], on rank 0; none where nothing was near
+    contacts : on rank 0; none where nothing was near
     """
 
     q: Positions
     time: float
     count: int = 0
-    points: Positions | None = None
-    contacts: "ContactSets | None" = None
+    points: Positions = NO_POINTS
+    contacts: ContactSets = ()
 
 
 class NearPairs:
@@ -197,8 +198,8 @@ class Contacts:
             if bound > pairs.reach and not self._serve(pairs, points):
                 pairs = self.near.look(q, time, LEAST * self.near.edge)
             candidates = pairs.candidates
-        contacts = self.barrier.contacts(candidates, points) if self.barrier else None
-        count = self.comm.bcast(sum(map(len, contacts or ())))
+        contacts = self.barrier.contacts(candidates, points) if self.barrier else ()
+        count = self.comm.bcast(sum(map(len, contacts)))
         self.near.touching = count > 0
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
@@ -228,9 +229,9 @@ class Contacts:
         """Return what there is of contacts at q and a time [s]."""
         moment = self.find(q, time)
         touch = Touch()
-        if self.barrier and moment.contacts is not None and moment.points is not None and moment.count:
+        if self.barrier and moment.count:
             least = self.barrier.least(moment.contacts, moment.points)
-            touch = Touch(moment.count, least, energy_of(self.barrier.pushing(moment.contacts), moment.points))
+            touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))
         of_all: Touch = self.comm.bcast(touch)
         return of_all
 
@@ -247,7 +248,7 @@ class Contacts:
         contacts, start = self.find(q, begin).contacts, self.points_at(q, begin)
         moved, pairs = self.points_at(end, self.time) - start, self.near.around(q, begin)
         way = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
-        clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts is not None else 0.0
+        clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts else 0.0
         if 2 * way < self.comm.bcast(clearance):
             return 1.0
         if bound >= pairs.apart and not self._serve(pairs, start + moved):

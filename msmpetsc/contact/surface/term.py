@@ -12,7 +12,6 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
-from msmpetsc.contact.surface.barrier import Acting, energy_of, gradient_of, hessian_of
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.points import Carried
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
@@ -131,7 +130,7 @@ class SurfaceContact:
             step of BDF2, which ``extrapolates`` the push
         """
         contacts, barrier, stick = self.contacts, self.contacts.barrier, self.contacts.law.stick * time_step
-        if barrier is None or moment.contacts is None or moment.points is None:
+        if barrier is None:
             return None
         if came is None:
             return barrier.friction(moment.contacts, moment.points, points, stick)
@@ -145,7 +144,7 @@ class SurfaceContact:
     def friction_limits(self, q: Positions) -> Floats:
         """Return the sums (2,) of mu N [N] that friction goes by, and with the push at q, on rank 0."""
         moment, barrier = self.contacts.find(q), self.contacts.barrier
-        if self.contacts.law.friction == 0 or not barrier or moment.contacts is None or moment.points is None:
+        if self.contacts.law.friction == 0 or not barrier:
             return np.zeros(2)
         by = self.friction.limit.sum() if self.friction else 0.0
         return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
@@ -155,9 +154,7 @@ class SurfaceContact:
         moment = self.contacts.find(q)
         if moment.count == 0 and not self.rubs:
             return None
-        if moment.points is not None:
-            return moment
-        return replace(moment, points=self.contacts.points_at(moment.q, moment.time))
+        return moment if moment.count else replace(moment, points=self.contacts.points_at(moment.q, moment.time))
 
     def presses(self, q: Positions) -> bool:
         """Return whether it acts at q."""
@@ -173,11 +170,10 @@ class SurfaceContact:
             return 0.0
         is_small, rubbed = self._is_small(q, base), 0.0
         moved = self.contacts.points.moved(q - base) if is_small or self.rubs else np.zeros((0, 3))
-        if self.friction and after and before and after.points is not None and before.points is not None:
+        if self.friction and after and before:
             rubbed = self.friction.change(after.points, before.points, moved)
         if is_small:
-            moments = [moment for moment in (before, after) if moment and moment.points is not None]
-            return rubbed + sum(0.5 * float(np.vdot(self._pushes(moment), moved)) for moment in moments)
+            return rubbed + sum(0.5 * float(np.vdot(self._pushes(m), moved)) for m in (before, after) if m)
         return rubbed + self._energy(after) - self._energy(before)
 
     def _is_small(self, q: Positions, base: Positions) -> bool:
@@ -187,12 +183,8 @@ class SurfaceContact:
         return bool(self.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
     def _energy(self, moment: ContactsAt | None) -> float:
-        return energy_of(self._pushing(moment), moment.points) if moment and moment.points is not None else 0.0
-
-    def _pushing(self, moment: ContactsAt) -> list[Acting]:
-        """Return the barriers that act, on rank 0."""
         barrier = self.contacts.barrier
-        return barrier.pushing(moment.contacts) if barrier and moment.contacts is not None else []
+        return barrier.energy(moment.contacts, moment.points) if barrier and moment else 0.0
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
@@ -205,7 +197,7 @@ class SurfaceContact:
 
     def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
         """Return on rank 0 the points (k,) that are pushed, and the gradient there (k, 3) [N]."""
-        if self.contacts.barrier is None or moment.points is None:
+        if self.contacts.barrier is None:
             return None
         forces = self._gradient(moment)
         touched = np.flatnonzero(forces[: self.contacts.points.bodies].any(axis=1))
@@ -213,13 +205,12 @@ class SurfaceContact:
 
     def _gradient(self, moment: ContactsAt) -> Rows:
         """Return the gradient (total, 3) [N] on rank 0, friction included."""
-        assert moment.points is not None
         rubs = self.friction.gradient(moment.points) if self.friction else 0.0
         return self._pushes(moment) + rubs
 
     def _pushes(self, moment: ContactsAt) -> Rows:
-        assert moment.points is not None
-        return gradient_of(self._pushing(moment), moment.points)
+        barrier = self.contacts.barrier
+        return barrier.gradient(moment.contacts, moment.points) if barrier else np.zeros_like(moment.points)
 
     def of_obstacles(self, q: Positions) -> tuple[Rows, float]:
         """Return the pushes of obstacles (k, 3) [N] on the bodies, and their work [J] in the step that ends at q.
@@ -230,7 +221,7 @@ class SurfaceContact:
         points, obstacles = self.contacts.points, self.contacts.obstacles
         found = np.zeros((len(obstacles.numbers), 3)), 0.0
         if obstacles.total and moment is not None:
-            if moment.points is not None and len(moment.points):
+            if len(moment.points):
                 forces = self._gradient(moment)[points.bodies :]
                 way = obstacles.way(self.contacts.begin, self.contacts.time)
                 found = obstacles.sums(forces), float((forces * way).sum())
@@ -240,14 +231,14 @@ class SurfaceContact:
     def released(self, q: Positions) -> float:
         """Return how much less energy [J] elastic slips store at q than where the step begins, on rank 0."""
         moment = self._acting(q)
-        if self.friction is None or moment is None or moment.points is None:
+        if self.friction is None or moment is None:
             return 0.0
         return self.friction.released(moment.points)
 
     def passes_kink(self, q: Positions, base: Positions) -> Mask | None:
         """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
         after, before, passes = self._acting(q), self._acting(base), None
-        if self.friction and after and before and after.points is not None and before.points is not None:
+        if self.friction and after and before:
             passes = self.friction.passes_kink(after.points, before.points)
         of_root: Mask | None = self.comm.bcast(passes if passes is not None and passes.any() else None)
         return of_root
@@ -283,9 +274,10 @@ class SurfaceContact:
 
     def _curvature(self, moment: ContactsAt, projected: bool, secant: Mask | None) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
-        if self.contacts.barrier is None or moment.points is None:
+        barrier = self.contacts.barrier
+        if barrier is None:
             return None
-        parts = hessian_of(self._pushing(moment), moment.points, projected)
+        parts = barrier.hessian(moment.contacts, moment.points, projected)
         if self.friction:
             parts.append(self.friction.hessian(moment.points, secant))
         whole = csr_array(sum(parts))

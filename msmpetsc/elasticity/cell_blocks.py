@@ -75,7 +75,9 @@ def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
     _, first, which = np.unique(_whole_rows(rows), return_index=True, return_inverse=True)
     around = np.empty((8, 0), np.int64)
     if not on_host(lattice.nodes):
-        around = _around(nodes, rows.reshape(-1, ROWS, LANES)[:, -2] > 0, lattice.owned)
+        is_cell = rows.reshape(-1, ROWS, LANES)[:, -2] > 0  # and does not fill up a last block
+        corners = np.where(is_cell[:, None], nodes.transpose(0, 2, 1), lattice.owned)
+        around = rows_of(corners.ravel().astype(np.int64), lattice.owned)
     arrays = nodes, which.astype(np.int32), rows[first], around
     nodes, which, distinct, around = (like(lattice.nodes, array) for array in arrays)
     return Blocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size)
@@ -94,17 +96,15 @@ def _whole_rows(rows: Rows) -> Array:
     return np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
 
 
-def _around(nodes: Indices, is_cell: Indices, owned: int) -> Indices:
-    """Return ``Blocks.around``; is_cell (b, LANES) is false of what fills up the last blocks."""
-    corners = np.where(is_cell[:, None], nodes.transpose(0, 2, 1), owned).ravel().astype(np.int64)
-    return rows_of(corners, owned)
-
-
 def add_corners(write: Callable[[Rows], None], around: Indices, corners: int, rows: Rows) -> None:
-    """Let a loop write so many rows, one a corner of cells, and add those of each owned node to its row (l, k).
+    """Let a loop add to the rows (l, k) of nodes; on a GPU to so many of its own, one a corner of cells, which each
+    owned node then sums.
 
     around : of ``rows_of``
     """
+    if on_host(rows):
+        write(rows)
+        return
     own = np.zeros((corners + 1, rows.shape[1]), like=rows)  # the last is of no corner
     write(own)
     rows[: around.shape[1]] += own[around].sum(axis=0)

@@ -297,12 +297,12 @@ class Cells:
     """The cells of a rank that resist: all that its nodes are corners of, and those that it owns, which stand first.
 
     around : (8, owned) on a GPU the rows of each owned node among those of all cells' corners, the last row past them;
-        None on a CPU
+        (8, 0) on a CPU
     """
 
     law: Resistance
     owned: Resistance
-    around: Indices | None = None
+    around: Indices
 
     @classmethod
     def of_lattice(cls, lattice: Lattice, stiffness: Floats, volume: float) -> "Cells":
@@ -310,9 +310,9 @@ class Cells:
         cells, stiffness, owned = lattice.local_cells, like(lattice.nodes, stiffness), slice(lattice.cells_owned)
         own = cells[owned]
         laws = Resistance(cells, stiffness, volume, cells), Resistance(own, stiffness[owned], volume, own)
-        if on_host(lattice.nodes):
-            return cls(*laws)
-        around = rows_of(to_host(cells).ravel(), lattice.owned)
+        around = np.empty((8, 0), np.int64)
+        if not on_host(cells):
+            around = rows_of(to_host(cells).ravel(), lattice.owned)
         return cls(*laws, like(lattice.nodes, around))
 
     def energy(self, q: Positions) -> float:
@@ -331,19 +331,13 @@ class Cells:
         """Return the cells that resist at q, few, so that sums need not visit the others."""
         few = np.flatnonzero(least_volumes(q, self.law.cells) < self.law.volume)
         cells = self.law.cells[few]
-        rows = cells if self.around is None else 8 * few[:, None] + like(few, np.arange(8))
+        rows = cells if on_host(cells) else 8 * few[:, None] + like(few, np.arange(8))
         return Resistance(cells, self.law.stiffness[few], self.law.volume, rows)
 
     def _sum(self, loop: Callable[..., None], cells: ResistanceAt, rows: Rows, *given: Rows) -> None:
         """Let a loop over the cells add to rows of nodes."""
-
-        def write(to: Rows) -> None:
-            loop(len(cells.law.cells), to, cells, *given)
-
-        if self.around is None:
-            write(rows)
-        else:
-            add_corners(write, self.around, 8 * len(self.law.cells), rows)
+        count, corners = len(cells.law.cells), 8 * len(self.law.cells)
+        add_corners(lambda to: loop(count, to, cells, *given), self.around, corners, rows)
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] to the owned rows of ``gradient`` (l, 3)."""

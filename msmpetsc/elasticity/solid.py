@@ -1,7 +1,7 @@
 """A neo-Hookean solid on a lattice: what Elasticity asks of a law, by the loops of a CPU or of a GPU."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
@@ -58,18 +58,6 @@ def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: Cell
             add_square(block, curvature, along_cofactors(n, g))
 
 
-def _add_at_corners(kernel: Callable[..., None], rows: Rows, cells: CellRows, around: Indices, *given: Array) -> None:
-    """Let cells add to the rows (l, k) of their nodes; on a GPU to rows of their own, which each node then sums."""
-
-    def write(to: Rows) -> None:
-        kernel(len(cells.nodes), to, cells, *given)
-
-    if cells.by_node:
-        write(rows)
-    else:
-        add_corners(write, around, 8 * len(cells.nodes), rows)
-
-
 def _loops(array: Array) -> ModuleType:
     """Return the loops over cells where an array is."""
     return cell_lanes if on_host(array) else cell_threads
@@ -92,7 +80,9 @@ class CellHessians:
 
     def add_diagonal(self, diagonal: Rows) -> None:
         """Add the diagonal blocks to ``diagonal`` (l, 9) [N/m], but for what U' adds, which is none."""
-        _add_at_corners(_add_diagonal, diagonal, one_by_one(self.blocks, self.state), self.blocks.around)
+        cells = one_by_one(self.blocks, self.state)
+        count = len(cells.nodes)
+        add_corners(lambda rows: _add_diagonal(count, rows, cells), self.blocks.around, 8 * count, diagonal)
 
 
 @dataclass(frozen=True)
@@ -159,7 +149,9 @@ class NeoHookean:
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add to ``concavity`` (l,) [N/m] how much less than 0 the Hessian may be."""
-        _add_at_corners(_add_concavity, concavity.reshape(-1, 1), one_by_one(self.blocks), self.blocks.around, q)
+        cells, of_nodes = one_by_one(self.blocks), concavity.reshape(-1, 1)
+        count = len(cells.nodes)
+        add_corners(lambda rows: _add_concavity(count, rows, cells, q), self.blocks.around, 8 * count, of_nodes)
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
         """Return what adds (Hessian of E at q) v [N] to its second argument: of F, V U' and V U'' of all cells."""

@@ -9,9 +9,8 @@ for a rank has every spring of them; the ghosts' rows are not complete and not t
 Energies are summed spring by spring. Of nodes' forces there are two sums: ``SpringScatter`` takes each spring once and
 adds to both its ends: the CPU's way. ``SpringGather`` lets each node sum over its neighbours, one thread a node: the
 GPU's way, for no two threads write to the same row, so sums come out the same, to the last bit, every time. It stores
-nothing of a Hessian: reading positions again is less than reading the blocks of 26 springs. On a CPU (bunny of 10,000
-and 30,000 cells, beam of 10,240) gathering took 1.5 times as long for a gradient and 6 to 10 times for a product, with
-stored blocks 1.5 to 2.1 times: so there are two loops.
+nothing of a Hessian: reading positions again is less than reading the blocks of 26 springs. On a CPU gathering took 1.5
+times as long for a gradient and 6 to 10 times for a product: so there are two loops.
 """
 
 import math

@@ -27,7 +27,6 @@ FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew:
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 2.0  # times the move that is expected
 TINY = np.finfo(float).tiny
-NO_POINTS = np.empty((0, 3))
 
 
 @dataclass(frozen=True)
@@ -95,9 +94,9 @@ class ContactsAt:
 
     q: Positions
     time: float
-    count: int = 0
-    points: Positions = NO_POINTS
-    contacts: ContactSets = ()
+    count: int
+    points: Positions
+    contacts: ContactSets
 
 
 class NearPairs:
@@ -192,7 +191,7 @@ class Contacts:
         pairs = self.near.around(q, time)
         bound = self.near.moved(q, time, pairs)
         if bound < pairs.clear:
-            return ContactsAt(q, time)
+            return ContactsAt(q, time, 0, np.empty((0, 3)), ())
         points, candidates = self.points_at(q, time), None
         if bound >= pairs.apart:
             if bound > pairs.reach and not self._serve(pairs, points):

@@ -185,19 +185,9 @@ def quadratic(w: Floats, k: int, a: Strains, b: Strains) -> float:
 
 
 @numba.njit(cache=True, inline="always")
-def _half_way(base: Seven, a: Seven) -> Seven:
-    """Return base + a / 2."""
-    return (
-        base[0] + 0.5 * a[0], base[1] + 0.5 * a[1], base[2] + 0.5 * a[2],
-        base[3] + 0.5 * a[3], base[4] + 0.5 * a[4], base[5] + 0.5 * a[5], base[6] + 0.5 * a[6],
-    )  # fmt: skip
-
-
-@numba.njit(cache=True, inline="always")
 def quadratic_change(w: Floats, k: int, moved: Strains, base: Strains) -> float:
     """Return by how much half of ``quadratic`` changes as strains go from ``base`` by ``moved``."""
-    mean = _half_way(base[0], moved[0]), _half_way(base[1], moved[1]), _half_way(base[2], moved[2])
-    return quadratic(w, k, moved, mean)
+    return quadratic(w, k, moved, base) + 0.5 * quadratic(w, k, moved, moved)
 
 
 @numba.njit(cache=True, inline="always")

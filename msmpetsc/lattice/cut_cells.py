@@ -7,10 +7,7 @@ over what is inside. Of a whole cell's spring there is then
     a face diagonal:    the integral of its face's linear function, the mean share of the face's four corners;
     a space diagonal:   the volume inside, the mean share of all eight.
 
-So uniform strain costs the energy of the volume inside, exactly, and where strain varies, as in bending, it is taken
-where the body is. Each corner's mass goes as the diagonal of L that its springs make. Then the diagonal of A is a
-multiple of M as of whole cells, and so is the bound of the highest frequency: light corners make no stiff ones, and no
-explicit step need be shorter. What is inside weighs what it should.
+Each corner's mass goes as the diagonal of L that its springs make: why, and what follows, the README tells.
 """
 
 import numpy as np

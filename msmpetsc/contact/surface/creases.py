@@ -1,10 +1,8 @@
 """Pairs of a surface's parts in its creases, which push each other from smaller distances than others do.
 
-At a sharp crease, or between needle-shaped triangles, parts of the surface that share no point are
-nearer than dhat at rest. They would push each other from the start, and bend what should be at
-rest. A few rings of triangles apart at the most, they are one piece of surface. Each of their pairs
-pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that is no more than half of its distance
-at rest: there it does nothing, and yet it does not cross. Others as near at rest do push.
+Parts nearer than dhat at rest, a few rings of triangles apart at the most, are one piece of surface. Each of their
+pairs pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that is no more than half of its distance at rest:
+there it does nothing, and yet it does not cross. Others as near at rest do push.
 """
 
 from collections.abc import Mapping

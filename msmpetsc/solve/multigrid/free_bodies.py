@@ -1,7 +1,6 @@
 """Bodies that no spring joins, as a step's unknowns see them: what is held lies between them, too.
 
-Each has coarse grids of its own, and what no spring holds moves freely: its translations are kept
-exactly, so that nothing falls or drifts by what a cycle leaves.
+Each has coarse grids of its own, and translations of what no spring holds are kept exactly.
 
 With T the translations and Q = T (T^T M T)^-1 T^T M, a cycle B becomes (I - Q) B (I - Q)^T + T (T^T M T)^-1 T^T. They
 are eigenvectors of M^-1 H, so that forces that balance never move a body as a whole.

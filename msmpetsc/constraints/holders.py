@@ -1,7 +1,5 @@
 """Pins and anchors: the nodes that each holds, what their edges cut, and their reactions.
 
-Anchors and forces that could not have any effect are refused; what is overruled in part is warned of.
-
 Springs, and cells of a solid, that the edge of a clamp cuts: a pin holds nodes, but its region ends between them. Of a
 spring from a free node to a held one a part theta is free, and only that gives: it is 1 / theta as stiff. Where the
 held node sticks out of the body, as at a clamped face, the spring has been made of what is inside, a part sigma of its

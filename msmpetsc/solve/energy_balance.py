@@ -8,7 +8,7 @@ T of the free nodes; C the push of obstacles, both times as they stand at the en
 anchors lead where they will be; W no less than the work of obstacles that drag, and that of those that strike, the
 impulse times their velocity. What the left side has more, and what later steps have not lost again, came from nowhere.
 What nodes gain when they bounce off a solved step counts to the next step, which mostly loses it before a frame shows
-it. Solved loosely, or where springs are pressed, steps do gain a little; a run that is out of hand gains without end.
+it.
 
 Verlet counts in W what moving obstacles push, so that C(q'_n) is that of where they stand at the start, and what forces
 that change pull in its substeps beyond f_ext of the end. The energy of

@@ -3,8 +3,7 @@ an obstacle, and Coulomb friction (contact.obstacles.friction) on those that wer
 
 A node at depth d > 0 has the energy 1/2 k d^2. It is convex for one face, and so is what a step minimises.
 
-With the push of the start friction is of first order in the step's length. A step of BDF2 takes what the two last
-states lead to, N_(n+1) = 2 N_n - N_(n-1), and u = tau v_(n+1), the velocity that it ends with: of second order.
+A step of BDF2 takes N_(n+1) = 2 N_n - N_(n-1) for the push of friction, and u = tau v_(n+1) (README: BDF2).
 
 A node that came into a box by one of its faces has that for its ``side``, and its depth is the way back through it,
 also beyond the far face: a plate that a node passes within a step pushes it back. Without a side the nearest counts.

@@ -7,7 +7,8 @@ Each substep kicks, drifts and kicks, with a = M^(-1) (f_ext - grad E), contact 
 The two half kicks at one time are one, but for a step's first and last: so v is of the same time as q wherever a
 frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eigenvalue of M^(-1) (Hessian of E).
 
-That limit is of small swings (README). What all substeps of a step then gain is the error of the trapezoidal rule for the springs' work,
+That limit is of small swings (README). What all substeps of a step then gain is the error of the trapezoidal rule for
+the springs' work,
 
     E(q_N) - E(q_0) - sum_n 1/2 (grad E(q_n) + grad E(q_(n+1))) . (q_(n+1) - q_n)
 

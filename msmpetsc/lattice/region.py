@@ -1,8 +1,7 @@
 """Nodes and cells in the regions of a scene, the materials of its parts, and its probes.
 
-A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is. Where
-skin widens from a clamp's edge, nodes just past that are nearest to skin that is free. So of nodes that lie in the
-region themselves those count, too, that have it half a cell away: else a clamp were too small by half a cell.
+A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is. Of
+nodes that lie in the region themselves those count, too, that have it half a cell away (README: regions and clamps).
 """
 
 from collections.abc import Callable, Sequence

@@ -5,8 +5,7 @@ What a step adds to the error of the trajectory is its local error: from positio
     implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
-Of these, means over neighbours count, and the changes of velocity by impacts and by pushes of penalties, times a step
-(README: steps as long as the motion allows). ``StepControl`` adds all up and chooses the next step.
+Means of these over neighbours, and what the README counts besides, ``StepControl`` adds up; it chooses the next step.
 
 A run whose motion is of size U may end with its trajectory off by ``error`` U. Steps pay for that
 with their local errors, from a credit that grows as the motion does, and with time:

@@ -16,8 +16,8 @@ k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes so much stiffer hide the others f
 
 What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends, too, once |e_k|_M
 and that, or |r_k|_(P^-1) / sqrt(lambda), are together an error that will do; their sum is then the estimate.
-Where F was not quite what the linear solve had left of it, more than half of that sum must be |e_k|_M, for g to be looked
-at there (minimum.Minimum). Where H has come to be less than M in a step, bounds are over the least that was seen.
+Where F was not quite what the linear solve had left of it, more than half of that sum must be |e_k|_M, so that g can
+be looked at there (minimum.Minimum). Where H was seen to be less than M in a step, bounds are over the least of it.
 """
 
 from dataclasses import dataclass, replace

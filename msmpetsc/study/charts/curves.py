@@ -277,8 +277,11 @@ def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
         if shown.empty:
             continue
         x = log_axis("valid cells (k: thousand, M: million)", shown["cells"], COUNT)
-        heights = reach(shown, column).to_numpy().ravel() if timed else shown[column]
-        panel = chart.panel(title, x, log_axis("", heights, words))
+        drawn = [column]
+        if timed:
+            shown = shown.join(spread(shown, column))
+            drawn += ["least", "greatest"]
+        panel = chart.panel(title, x, log_axis("", shown[drawn].to_numpy(), words))
         if timed:
             panel.whiskers(shown, ("cells", column), "curve")
         panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TIP), "curve")

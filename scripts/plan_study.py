@@ -76,7 +76,7 @@ class Planned(NamedTuple):
         if method.integrator == STATIC:
             method = replace(method, step_error=1e-3)
         elif method.integrator != "verlet":  # whose substeps are as short as the cells ask
-            method = Candidate("bdf2", method.time_step / SHORTER, "newton", min(1e-3, method.step_error))
+            method = Candidate("bdf2", method.time_step / SHORTER, "newton", min(1e-3, method.step_error or 1e-3))
         for times in FINER:
             yield round(max(times * self.cells, MORE * finest)), method
 

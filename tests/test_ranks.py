@@ -90,7 +90,6 @@ CASES = {
         "time": steps(1, 1.0, "static"),
     }),
 }  # fmt: skip
-pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture(scope="module")

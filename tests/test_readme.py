@@ -152,14 +152,12 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_commands_of_the_front_door_run(clone: Path):
     names = {path.name for path in (clone / "out").iterdir()}
     assert {"coarse.h5", "coarse.xdmf", "coarse.png", "loose.h5", "my.h5", "my.png", "bunny_fall.h5"} <= names
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", RUN)
 def test_commands_run(name: str, clone: Path):
     carry_out(ROOT / name, clone)

@@ -123,7 +123,7 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
     """No other rank waits for them."""
     scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.1})
     worker = WORKERS / "alone_worker.py"
-    done = run(3, worker, ranks, where, what, "run", scene, "-o", tmp_path / "x.h5", timeout=40)
+    done = run(3, worker, ranks, where, what, "run", scene, "-o", tmp_path / "x.h5")
     said = {"input": "it fails", "memory": "there is not enough memory (Unable"}[what]
     (line,) = errors(done.stderr)
     assert done.returncode == 2 and line.startswith(f"msmpetsc: error: {said}") and "Traceback" not in done.stderr

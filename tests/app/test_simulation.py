@@ -195,7 +195,7 @@ for modulus in (1e5, 2e5):
 
 
 def test_on_ranks_each_has_its_rows(scene: Path, tmp_path: Path):
-    done = run(3, "-c", ON_RANKS, scene, tmp_path, timeout=60, status=0)
+    done = run(3, "-c", ON_RANKS, scene, tmp_path, status=0)
     assert done.stdout.count("refused:") == done.stdout.count(" exists") == 3  # the second time, on all ranks
     assert done.stderr.count("frame 1/1") == 1
     for modulus in (1e5, 2e5):

@@ -55,7 +55,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.timeout(100)
 @pytest.mark.parametrize("path", PATHS)
 def test_a_path_that_cannot_be_used_is_refused_in_one_line(folder, monkeypatch, capsys, path):
     monkeypatch.chdir(folder)
@@ -80,7 +79,6 @@ TOO_MUCH = {
 }
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("what", TOO_MUCH)
 def test_what_no_machine_holds_is_refused_before_it_is_made(folder, monkeypatch, what):
     monkeypatch.chdir(folder)

@@ -11,7 +11,6 @@ from one_process import command_error
 from msmpetsc.cli.commands.check import Numbers, Recipe, allowed, judged, read
 from msmpetsc.cli.main import main
 
-pytestmark = pytest.mark.timeout(200)
 STEPS = 3
 
 

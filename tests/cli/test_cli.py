@@ -65,7 +65,7 @@ def scene(folder: Path) -> Path:
 
 
 def on(ranks: int, *arguments: object, status: int | None = None) -> subprocess.CompletedProcess:
-    return run(ranks, *COMMAND, *arguments, timeout=60, status=status)
+    return run(ranks, *COMMAND, *arguments, status=status)
 
 
 # What it writes

@@ -81,7 +81,6 @@ BODIES = {
 }
 
 
-@pytest.mark.timeout(200)
 @pytest.mark.parametrize("name", BODIES)
 def test_a_first_scene_runs_at_once(name: str, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -85,12 +85,11 @@ def test_who_stops_reading_ends_the_command_quietly(command: str):
     reader, writer = os.pipe()
     os.close(reader)
     words = [sys.executable, "-m", "msmpetsc", command]
-    done = subprocess.run(words, env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE, timeout=60)
+    done = subprocess.run(words, env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE)
     os.close(writer)
     assert done.stderr == b"" and done.returncode == 128 + signal.SIGPIPE
 
 
-@pytest.mark.timeout(200)
 def test_doctor_finds_a_sound_installation_sound():
     done = python("-m", "msmpetsc", "doctor")
     states = {line[9:26].strip(): line[:8].strip() for line in done.stdout.splitlines()}

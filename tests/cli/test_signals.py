@@ -25,7 +25,6 @@ from msmpetsc.cli.main import main
 from msmpetsc.results.reader import finished
 
 STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
-pytestmark = pytest.mark.timeout(100)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from msmpetsc.fields import Frame
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
-pytestmark = pytest.mark.timeout(200)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +89,7 @@ def test_on_three_ranks_they_end_as_on_one(folder: Path):
     tight = {"preset": "newton", "error": 1e-9}
     path = fall(folder, "ranks", 0.002, time={"step": 0.01, "duration": 0.04}, solver=tight)
     _, frames = play(path)
-    three = result_on(3, path, timeout=150)
+    three = result_on(3, path)
     assert three["frames/self_contacts"][-1] > 0
     expected, rest = np.array([frame.position for frame in frames]), three["lattice/nodes"][:]
     assert np.abs(three["frames/position"] - expected).max() < 1e-6 * np.abs(expected - rest).max()

@@ -18,7 +18,6 @@ from msmpetsc.fields import Frame
 
 G, SIDE = 9.81, 0.1
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
-pytestmark = pytest.mark.timeout(300)
 
 
 def write(folder: Path, **tables: Any) -> Path:

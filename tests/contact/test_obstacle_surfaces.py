@@ -26,7 +26,6 @@ FOOT = [{"region": {"box": [[-1, -1, -1], [1, 1, 0.01]]}}]
 WEIGHT = DENSITY * G * SIDES.prod()
 GRAVITY = {"acceleration": [0, 0, -G]}
 ERROR = {"preset": "newton", "error": 1e-4}
-pytestmark = pytest.mark.timeout(300)
 
 
 def fine_block(folder: Path, **tables) -> Path:

@@ -27,7 +27,6 @@ from msmpetsc.solve.simulate import refuse_bad_options
 COMM = MPI.COMM_SELF
 GAP = 4e-4  # [m] between the arms, of a distance of 1e-3 m
 T = 0.01
-pytestmark = pytest.mark.timeout(200)
 
 
 @pytest.fixture(scope="module")

@@ -159,10 +159,10 @@ def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path):
     obstacles = [pushing, wall, inside]
     path = block_scene(tmp_path, np.array([1.0, 0.25, 0.25]), time=time, obstacle=obstacles, material=STIFF)
     _, frames = play(path)
-    done = msmpetsc(2, "run", path, "-o", tmp_path / "o.h5", "--set", "time.duration=0.04", timeout=60)
+    done = msmpetsc(2, "run", path, "-o", tmp_path / "o.h5", "--set", "time.duration=0.04")
     assert done.returncode == 0 and done.stderr.count("1 node inside obstacle.2") == 1, done.stderr
     more = ("--set", "time.duration=0.046", "--force")
-    done = msmpetsc(2, "run", "--resume", tmp_path / "o.h5", *more, timeout=60)
+    done = msmpetsc(2, "run", "--resume", tmp_path / "o.h5", *more)
     assert done.returncode == 0 and "inside obstacle" not in done.stderr, done.stderr
     with h5py.File(tmp_path / "o.h5") as file:
         np.testing.assert_allclose(file["frames/position"][:], [frame.position for frame in frames], atol=1e-7)

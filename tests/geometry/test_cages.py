@@ -183,7 +183,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Ca
 @pytest.mark.parametrize("ranks", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_enclose(filled, ranks):
     folder, serial = filled
-    done = run(ranks, "-m", "mpi4py", WORKER, folder, timeout=60, status=0)
+    done = run(ranks, "-m", "mpi4py", WORKER, folder, status=0)
     assert done.stdout.count("passed") == ranks
     for name, cages in serial.items():
         with np.load(folder / f"{name}.cells.npz") as cells:

@@ -38,7 +38,7 @@ def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers
     None leaves a PETSc object to Python's collector: what one rank alone has collected, PETSc waits for at its end.
     """
     words = [[*map(str, command)] for command in commands]
-    done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(words), timeout=300, status=0)
+    done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(words), status=0)
     assert done.stderr.strip() == "", "not even the C libraries speak"
     lines = done.stdout.splitlines()
     assert ranks == 1 or sum(line.endswith("Total entries: 0") for line in lines) == ranks, lines

@@ -19,7 +19,7 @@ from msmpetsc.results.reader import finished
 from msmpetsc.solve.simulate import REMEMBERED
 from msmpetsc.study.forkserver import Forked
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 
 
 def is_killed(ranks: int, arguments: list[str], wait: float, log: Path) -> bool:

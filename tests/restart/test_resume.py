@@ -46,7 +46,6 @@ GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
 PRESSING = [GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}]
 THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}  # passed within a step
 SOFT = {"young_modulus": 1e4, "density": 1000.0}
-pytestmark = pytest.mark.timeout(100)
 
 
 def swing(**tables) -> dict:

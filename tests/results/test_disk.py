@@ -14,7 +14,6 @@ from msmpetsc.results.reader import finished
 
 STEPS, BEFORE = 12, 5  # steps; the one after which there is no room
 FINE = {"cages": {"cell_size": 1 / 32}, "output": {"surface": False}}  # 2,601 nodes, 62 kB a frame
-pytestmark = pytest.mark.timeout(100)
 
 
 @pytest.fixture(scope="module")

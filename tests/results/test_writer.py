@@ -20,11 +20,10 @@ from msmpetsc.results.reader import finished, newest_slot, open_result
 from msmpetsc.results.writer import Begin, ResultFile
 
 WORKER = WORKERS / "frames_worker.py"
-pytestmark = pytest.mark.timeout(60)
 
 
 def run_on_ranks(ranks: int, action: str, path: Path) -> str:
-    done = run(ranks, WORKER, action, path, timeout=40, status=0)
+    done = run(ranks, WORKER, action, path, status=0)
     return done.stdout
 
 

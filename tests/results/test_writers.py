@@ -35,7 +35,6 @@ from msmpetsc.view.film import write_pictures
 from msmpetsc.view.page import write_page
 from msmpetsc.view.sheet import contact_sheet
 
-pytestmark = pytest.mark.timeout(100)
 PACKAGE = ROOT / "msmpetsc"
 Write = Callable[[Path], object]
 

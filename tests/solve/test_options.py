@@ -103,7 +103,7 @@ def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options:
     """Which is not there."""
     scene = block_scene(tmp_path, **SCENE, mesh={"source": "gone.ply"})
     before = sorted(tmp_path.iterdir())
-    done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split(), timeout=60)
+    done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split())
     assert_one_line(done, 2, BEFORE_THE_MESH[options])
     assert "gone.ply" not in done.stderr
     assert sorted(tmp_path.iterdir()) == before
@@ -121,7 +121,7 @@ def test_an_option_of_ours_with_one_dash_is_told_its_name():
 @pytest.mark.parametrize("options", WITH_THE_SOLVERS)
 def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(tmp_path: Path, options: str, ranks: int):
     scene = block_scene(tmp_path, **SCENE)
-    done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split(), timeout=60)
+    done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split())
     assert_one_line(done, 2, WITH_THE_SOLVERS[options])
 
 
@@ -164,7 +164,7 @@ def test_shown_options_given_back_change_nothing(petsc_options, preset: str):
 
 
 def test_options_are_shown_without_a_mesh_as_a_file_that_can_be_given(tmp_path: Path):
-    shown = run(2, *COMMAND, "--show-options", "--preset", "anderson", "-ksp_max_it", "77", timeout=60)
+    shown = run(2, *COMMAND, "--show-options", "--preset", "anderson", "-ksp_max_it", "77")
     assert shown.returncode == 0, shown.stderr
     assert shown.stdout.splitlines().count("-snes_type anderson") == 1
     assert "-ksp_max_it 77" in shown.stdout and "# -ksp_rtol 1e-1" in shown.stdout
@@ -173,12 +173,12 @@ def test_options_are_shown_without_a_mesh_as_a_file_that_can_be_given(tmp_path: 
         tmp_path, **SCENE, mesh={"source": "gone.ply"}, solver={"preset": "paper", "max_iterations": 2000}
     )
     other = ("--show-options", scene, "--true-error", "1", "-pc_type", "sor")
-    shown = run(1, *COMMAND, *other, timeout=60)
+    shown = run(1, *COMMAND, *other)
     assert "-reference_pc_type mg" in shown.stdout and "-snes_max_it 2000" in shown.stdout, shown.stderr
     assert "-pc_type sor" in shown.stdout and "-pc_type none" not in shown.stdout
     scene = block_scene(tmp_path, **SCENE)
     given = ("--preset", "anderson", "--frames", "1", "-options_file", tmp_path / "options")
-    run(1, *COMMAND, scene, "-o", tmp_path / "o.h5", *given, timeout=60, status=0)
+    run(1, *COMMAND, scene, "-o", tmp_path / "o.h5", *given, status=0)
 
 
 @pytest.mark.parametrize(("option", "wanted"), [("ksp_type=pipcg", "pipecg"), ("pc_type=jacoby", "jacobi")])

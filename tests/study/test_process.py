@@ -90,7 +90,7 @@ for alone, launcher in ((True, []), (False, ["mpiexec", "-n", "2"])):
 
 
 def test_a_study_may_be_one_rank_of_mpiexec():
-    done = run(1, "-c", RUNS_WITHIN_A_RUN, timeout=60)
+    done = run(1, "-c", RUNS_WITHIN_A_RUN)
     assert done.returncode == 0 and "".join(done.stdout.split()) == "122", done.stderr
 
 
@@ -98,5 +98,5 @@ def test_a_case_may_have_more_ranks_than_cores(monkeypatch):
     for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
     command = ["mpiexec", "-n", str(os.cpu_count() + 1), "true"]
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

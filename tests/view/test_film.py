@@ -14,7 +14,6 @@ from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.view.film import playback_of, usual_speed
 
-pytestmark = pytest.mark.timeout(60)
 TIMES = np.arange(11) / 10  # of the ball's frames [s]
 
 

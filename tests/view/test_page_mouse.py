@@ -10,7 +10,7 @@ from ball_result import BARE, EAST_HELD, write_ball
 from browser import Browser, in_browser
 from test_film import render
 
-pytestmark = [in_browser, pytest.mark.timeout(120)]
+pytestmark = in_browser
 
 
 @pytest.fixture(scope="module")

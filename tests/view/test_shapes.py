@@ -83,7 +83,6 @@ def test_a_sheet_has_it_where_it_is_and_none_when_it_is_gone(result: Path):
 
 
 @in_browser
-@pytest.mark.timeout(120)
 def test_a_page_has_it_once_and_moves_it(result: Path):
     path = result.with_suffix(".html")
     render(result, "-o", path, "--eye", "0,-1,0")
@@ -101,7 +100,6 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
 
 
 @in_browser
-@pytest.mark.timeout(120)
 def test_a_bar_that_turns_is_drawn_as_it_has_turned(tmp_path: Path):
     """Lying at first, upright at the end; a box and a mesh alike."""
     path = with_mesh(write_ball(tmp_path / "x.h5", scene=BARE + "picture.eye = [0, -1, 0]" + TWO_BARS), BAR)

@@ -20,8 +20,6 @@ from msmpetsc.view.camera import YAW, camera_facing
 from msmpetsc.view.composition import Still, Style, composition_of
 from msmpetsc.view.drawable import BodiesAtRest, drawable_of_result
 
-pytestmark = pytest.mark.timeout(60)
-
 
 def test_moments_tell_the_story(falling_ball):
     with Result(falling_ball) as run:

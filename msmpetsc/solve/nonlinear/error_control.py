@@ -20,7 +20,7 @@ Where F was not quite what the linear solve had left of it, more than half of th
 be looked at there (minimum.Minimum). Where H was seen to be less than M in a step, bounds are over the least of it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -30,6 +30,7 @@ from msmpetsc.backend.arrays import Positions
 from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
+from msmpetsc.solve.linear.cg_bound import SolveBound
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
@@ -45,6 +46,8 @@ EARLY = 2.0  # times the error that would do: when a step is first estimated
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabola there
+FINAL = 300.0  # times the error that would do: a linear solve from there on is to be the last
+PARABOLA = 0.2  # of F: what the linear solve has not left of it, where its bound is believed
 STRAIGHT = 0.6  # of that: up to there it is one as far as what no iteration has found yet
 NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
 STAYS = 0.5  # of the bound before: F no longer falls though each correction was known
@@ -263,6 +266,8 @@ class Outcome:
     early: float = EARLY  # how many times the goal an error may be to be estimated
     corrected: bool = False
     left: float = np.inf  # by the linear solve that led here, |r|_(P^-1); infinite where that says nothing
+    solved: float = np.inf  # bound on what it left of |e|_H, with Jacobi's
+    known: bool = False  # the error is known by that
     alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
     at_rounding: bool = False  # F is nothing but rounding
     doubts: int = 0
@@ -283,18 +288,33 @@ class ErrorControl:
     rounding: Rounding
     target: float  # relative error at which a step is done; 0 where a budget of iterations ends it
     tightest: float  # ksp_rtol that no linear solve goes below
+    residual: PETSc.Vec  # F - H e of the last linear solve with Jacobi's, then what F is beside it
     ratio: float = FIRST_RATIO  # of bound to error in the last estimate
+    solve_bound: SolveBound = field(default_factory=SolveBound)
+    least: float = 0.0  # eigenvalue of P^(-1) H that the linear solves have come to, with Jacobi's; 0: none
+    slack: float = 0.0  # bound on |e|_H over |r|_(P^-1) at their ends; 0: none
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """What is known at an iterate: its error, or a bound on it while that is far too large."""
         residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
         at_rounding, alarm = self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(
-            before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm, corrected=False
+            before,
+            residual=residual,
+            distance=distance,
+            at_rounding=at_rounding,
+            alarm=alarm,
+            corrected=False,
+            known=False,
         )
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
             return replace(now, error=0.0 if at_rounding else np.inf)
         now = replace(now, bound=residual / distance)
+        if (error := self._left_by_solve(iterate, now)) <= now.goal:
+            self.ratio = max(now.bound / error, 1.0)
+            return replace(now, error=error, known=True)
+        if now.goal * distance < now.solved < np.inf and not (now.alarm or now.doubts or at_rounding):
+            return replace(now, error=now.bound)  # the next linear solve is no dearer than an estimate
         is_near = at_rounding or now.bound <= self._farthest(now)
         seems_near = is_near
         if self._is_smooth(now):  # whether the linear solve that led here has left so little
@@ -310,6 +330,17 @@ class ErrorControl:
         if is_near or stays or self.estimate.is_trusted:
             return found
         return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here
+
+    def _left_by_solve(self, iterate: Iterate, now: Outcome) -> float:
+        """The relative error by what the linear solve left of e, and by what F is beside that; infinite if not known."""
+        if not now.solved <= now.goal * now.distance or now.alarm:
+            return np.inf
+        self.residual.aypx(-1.0, iterate.f)
+        beside = self.functional.dual_norm(self.residual)
+        if beside > PARABOLA * now.residual:
+            return np.inf
+        lowest = self.curvature.compression(iterate.q).least_curvature or self.estimate.convexity
+        return self.rounding.relative(now.solved / np.sqrt(lowest) + beside / lowest, now.distance)
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
@@ -336,15 +367,34 @@ class ErrorControl:
     def led_by(self, ksp: PETSc.KSP, now: Outcome) -> Outcome:
         """What is known once a linear solve with the true Hessian has led to the next iterate."""
         is_natural = ksp.getType() == PETSc.KSP.Type.CG and ksp.getNormType() == PETSc.KSP.NormType.NATURAL
-        if ksp.reason < 0 or not is_natural or not self.estimate.preconditioner.is_uniform:
-            return replace(now, left=np.inf)
-        self.estimate.learn(ksp)
-        return replace(now, left=ksp.getResidualNorm())
+        now = replace(now, left=np.inf, solved=np.inf)
+        if ksp.reason < 0 or not is_natural:
+            return now
+        if self.estimate.preconditioner.is_uniform:
+            self.estimate.learn(ksp)
+            return replace(now, left=ksp.getResidualNorm())
+        solved = self._solved(ksp)
+        if solved <= now.goal * now.distance:
+            self.residual = ksp.buildResidual(self.residual)
+        return replace(now, solved=solved)
+
+    def _solved(self, ksp: PETSc.KSP) -> float:
+        """Bound on |e|_H that a solve with Jacobi's has left."""
+        if ksp.its < FEW or ksp.getInitialGuessNonzero():
+            return np.inf
+        least = float(ksp.computeExtremeSingularValues()[1])
+        self.least = min(least, RISE * self.least) if self.least else least
+        solved = self.solve_bound.of(LOWER * self.least)
+        if np.isfinite(solved):
+            self.slack = solved / ksp.getResidualNorm()
+        return solved
 
     def tolerances(self, now: Outcome) -> tuple[float, float]:
         """ksp_rtol and ksp_atol of the next linear solve: it need not gain more digits than are missing."""
         if self._is_smooth(now):
             return self.tightest, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
+        if self.slack and now.bound <= FINAL * now.goal:
+            return CLOSEST * self.tightest, SHARE * now.goal * now.distance / self.slack
         missing = now.bound / self.ratio
         return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), 1e-50  # PETSc's: none
 
@@ -357,10 +407,11 @@ class ErrorControl:
         goal = now.goal if has_moved else CLOSER * now.goal
         if not has_moved and goal < CLOSEST * self.target and np.isfinite(now.error):
             return None
-        return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, left=np.inf, corrected=False)
+        return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, left=np.inf, solved=np.inf, corrected=False)
 
     def forget(self, modes: bool) -> None:
         self.ratio = FIRST_RATIO
+        self.least = self.slack = 0.0
         self.estimate.forget(modes)
 
 

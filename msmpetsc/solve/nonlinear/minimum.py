@@ -6,15 +6,15 @@ between x and x - e, or curve so much that e says little; so all is looked at on
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, greatest
-from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import KNOWN, ErrorEstimate
+from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
+from msmpetsc.solve.nonlinear.error_control import KNOWN, ErrorEstimate, Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
@@ -44,14 +44,14 @@ class Minimum:
         self.unknowns, self.memory = functional.unknowns, functional.memory
         self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
 
-    def examine(self, x: PETSc.Vec, corrected: bool, compression: Compression, alarm: Alarm, enough: float) -> Verdict:
+    def examine(self, x: PETSc.Vec, outcome: Outcome, compression: Compression, enough: float) -> Verdict:
         """Examine x, or rather the point that is x less its estimated error.
 
-        corrected : whether estimate.correction is of x
-        alarm     : where something has shown a negative curvature
-        enough    : the length of an error that will do, |e|_M
+        outcome : what is known at x; whether estimate.correction is of x
+        enough  : the length of an error that will do, |e|_M
         """
         functional, estimate = self.functional, self.estimate
+        corrected, alarm = outcome.corrected, outcome.alarm
         x.copy(self.nearer)
         self.first.set(0.0)
         if corrected:
@@ -73,13 +73,15 @@ class Minimum:
             return Verdict(np.inf, direction, value)
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
+        if outcome.known and value > CONVEX and outcome.error * outcome.distance <= value * enough:
+            return Verdict(outcome.error / value)
         first, rest = functional.norm(self.first), functional.dual_norm(self.f) / value
         if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
             return Verdict(self.rounding.relative(first + rest, functional.distance(nearer.q)))
         if corrected and estimate.missing is not None and value <= CONVEX:
             iterate = functional.evaluate(x, self.f)
             closely = bool(np.isfinite(estimate(iterate, functional.dual_norm(self.f), np.inf)))
-            return self.examine(x, closely, compression, alarm, enough)
+            return self.examine(x, replace(outcome, corrected=closely), compression, enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
             return Verdict(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
         return Verdict(self._second_estimate(nearer, first, rest, enough, value))

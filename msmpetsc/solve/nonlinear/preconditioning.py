@@ -283,11 +283,11 @@ class StepPreconditioner:
         """Iterations that a linear solve to a relative tolerance is given; None: what PETSc's options say."""
         return self.multigrid.most_iterations(rtol) if self.multigrid and self.is_chosen else None
 
-    def learn(self, its: int, rtol: float) -> None:
-        """Take note of the iterations that a linear solve took to a relative tolerance."""
+    def learn(self, its: int, rtol: float, reached: float) -> None:
+        """Take note of the iterations that a linear solve took to a relative tolerance, and of what it has reached."""
         if self.multigrid and self.is_chosen:
             self.multigrid.learn(its, rtol)
-        elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / rtol):
+        elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / min(reached, 1.0)):
             self._choose(f"Jacobi's took {its} iterations a solve")
 
     def setFromOptions(self, _: PETSc.PC) -> None:

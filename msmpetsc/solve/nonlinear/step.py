@@ -161,7 +161,11 @@ class Stepper:
         if error is None and not self.budget:
             error = DEFAULT_ERROR
         tightest, _, _, self.most_its = self.ksp.getTolerances()
-        return ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest), minimum
+        residual = self._keep(self.f.duplicate())
+        control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest, residual)
+        if self.preset.true_hessian:
+            self.ksp.setMonitor(control.solve_bound.watch)
+        return control, minimum
 
     def set_up(self) -> None:
         """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.
@@ -295,7 +299,7 @@ class Stepper:
         if compression.least_curvature > 0 and not self.budget:  # a budget may end where g is no parabola yet
             return Verdict(outcome.error, is_minimum=True)
         enough = control.target * functional.distance(q) if control.target else np.inf
-        verdict = self.minimum.examine(self.x, outcome.corrected, compression, outcome.alarm, enough)
+        verdict = self.minimum.examine(self.x, outcome, compression, enough)
         will_do = verdict.error <= control.target or (outcome.at_rounding and not np.isinf(verdict.error))
         return replace(verdict, is_minimum=bool(self.budget) or will_do)
 
@@ -420,9 +424,11 @@ class Stepper:
         """Whether SNES is done (its convergence test), by its iterate's error or by the budget."""
         reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:
-            self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
+            self.jacobian.preconditioner.learn(
+                self.ksp.its, self.ksp.getTolerances()[0], self.control.solve_bound.reduction
+            )
             if self.is_detour:
-                self.outcome = replace(self.outcome, left=np.inf)  # of another x
+                self.outcome = replace(self.outcome, left=np.inf, solved=np.inf)  # of another x
             elif self.preset.true_hessian and not self.projected:
                 self.outcome = self.control.led_by(self.ksp, self.outcome)
         if its > 0 or not self.has_npc:  # else known since _is_solved

@@ -46,7 +46,7 @@ EARLY = 2.0  # times the error that would do: when a step is first estimated
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabola there
-FINAL = 300.0  # times the error that would do: a linear solve from there on is to be the last
+FINAL = 60.0  # times the error that would do: a linear solve from there on is to be the last
 PARABOLA = 0.2  # of F: what the linear solve has not left of it, where its bound is believed
 STRAIGHT = 0.6  # of that: up to there it is one as far as what no iteration has found yet
 NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
@@ -131,7 +131,7 @@ class ErrorEstimate:
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
             self.linearise(iterate.q)
-            if self.preconditioner.is_uniform and np.isinf(self.floor):
+            if self.is_blind:
                 self._probe()
             self.ksp.solve(iterate.f, self.correction)
             self.learn(self.ksp)
@@ -148,6 +148,11 @@ class ErrorEstimate:
         if its >= MOST and left > LEFT * length:
             return length + left
         return length * max(length / half, 1.0) if half > 0 else length
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether P^(-1) H may have an eigenvalue far below all that CG has come to."""
+        return self.preconditioner.is_uniform and np.isinf(self.floor)
 
     def linearise(self, q: Positions) -> None:
         """Take the Hessian at positions q (l, 3) [m]."""
@@ -266,11 +271,18 @@ class Outcome:
     early: float = EARLY  # how many times the goal an error may be to be estimated
     corrected: bool = False
     left: float = np.inf  # by the linear solve that led here, |r|_(P^-1); infinite where that says nothing
-    solved: float = np.inf  # bound on what it left of |e|_H, with Jacobi's
-    known: bool = False  # the error is known by that
+    solved: float = np.inf  # bound on what it left of |e|_H
+    beside: float = np.inf  # |F - r|_(M^-1), r what it left of F; infinite where g is no parabola there
     alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
     at_rounding: bool = False  # F is nothing but rounding
     doubts: int = 0
+
+    def known(self, lowest: float) -> float:
+        """The relative error by what the linear solve left and what F is beside that, where M^(-1) H has no eigenvalue
+        below ``lowest``; infinite where that says nothing."""
+        if not lowest > 0:
+            return np.inf
+        return (self.solved / np.sqrt(lowest) + self.beside / lowest) / self.distance
 
     @property
     def is_enough(self) -> bool:
@@ -288,33 +300,26 @@ class ErrorControl:
     rounding: Rounding
     target: float  # relative error at which a step is done; 0 where a budget of iterations ends it
     tightest: float  # ksp_rtol that no linear solve goes below
-    residual: PETSc.Vec  # F - H e of the last linear solve with Jacobi's, then what F is beside it
+    residual: PETSc.Vec  # F - H e of the last linear solve, then what F is beside it
     ratio: float = FIRST_RATIO  # of bound to error in the last estimate
     solve_bound: SolveBound = field(default_factory=SolveBound)
-    least: float = 0.0  # eigenvalue of P^(-1) H that the linear solves have come to, with Jacobi's; 0: none
-    slack: float = 0.0  # bound on |e|_H over |r|_(P^-1) at their ends; 0: none
+    slack: float = 0.0  # bound on |e|_H over |r|_(P^-1) at the end of the last linear solve; 0: none
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """What is known at an iterate: its error, or a bound on it while that is far too large."""
         residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
         at_rounding, alarm = self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
-        now = replace(
-            before,
-            residual=residual,
-            distance=distance,
-            at_rounding=at_rounding,
-            alarm=alarm,
-            corrected=False,
-            known=False,
-        )
+        now = replace(before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm)
+        now = replace(now, corrected=False, beside=np.inf)
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
             return replace(now, error=0.0 if at_rounding else np.inf)
         now = replace(now, bound=residual / distance)
-        if (error := self._left_by_solve(iterate, now)) <= now.goal:
-            self.ratio = max(now.bound / error, 1.0)
-            return replace(now, error=error, known=True)
-        if now.goal * distance < now.solved < np.inf and not (now.alarm or now.doubts or at_rounding):
-            return replace(now, error=now.bound)  # the next linear solve is no dearer than an estimate
+        if now.solved <= now.goal * now.distance and not now.alarm:
+            now = self._known(iterate, now)
+            if now.error <= now.goal:
+                return now
+        if self._is_next_no_dearer(now):
+            return replace(now, error=now.bound)
         is_near = at_rounding or now.bound <= self._farthest(now)
         seems_near = is_near
         if self._is_smooth(now):  # whether the linear solve that led here has left so little
@@ -331,16 +336,22 @@ class ErrorControl:
             return found
         return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here
 
-    def _left_by_solve(self, iterate: Iterate, now: Outcome) -> float:
-        """The relative error by what the linear solve left of e, and by what F is beside that; infinite if not known."""
-        if not now.solved <= now.goal * now.distance or now.alarm:
-            return np.inf
+    def _is_next_no_dearer(self, now: Outcome) -> bool:
+        """Whether the next linear solve costs no more than an estimate, which with Jacobi's is one itself."""
+        if self.estimate.preconditioner.is_uniform or now.alarm or now.doubts or now.at_rounding:
+            return False
+        return now.goal * now.distance < now.solved < np.inf
+
+    def _known(self, iterate: Iterate, now: Outcome) -> Outcome:
+        """What is known where the last linear solve has left so little that it may be the last of all."""
         self.residual.aypx(-1.0, iterate.f)
         beside = self.functional.dual_norm(self.residual)
         if beside > PARABOLA * now.residual:
-            return np.inf
-        lowest = self.curvature.compression(iterate.q).least_curvature or self.estimate.convexity
-        return self.rounding.relative(now.solved / np.sqrt(lowest) + beside / lowest, now.distance)
+            return replace(now, error=np.inf)
+        now = replace(now, beside=beside)
+        error = now.known(self.curvature.compression(iterate.q).least_curvature or self.estimate.convexity)
+        self.ratio = max(now.bound / error, 1.0)
+        return replace(now, error=error)
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
@@ -370,32 +381,31 @@ class ErrorControl:
         now = replace(now, left=np.inf, solved=np.inf)
         if ksp.reason < 0 or not is_natural:
             return now
-        if self.estimate.preconditioner.is_uniform:
-            self.estimate.learn(ksp)
-            return replace(now, left=ksp.getResidualNorm())
+        self.estimate.learn(ksp)
         solved = self._solved(ksp)
         if solved <= now.goal * now.distance:
             self.residual = ksp.buildResidual(self.residual)
-        return replace(now, solved=solved)
+        left = ksp.getResidualNorm() if self.estimate.preconditioner.is_uniform else np.inf
+        return replace(now, left=left, solved=solved)
 
     def _solved(self, ksp: PETSc.KSP) -> float:
-        """Bound on |e|_H that a solve with Jacobi's has left."""
-        if ksp.its < FEW or ksp.getInitialGuessNonzero():
+        """Bound on |e|_H that a linear solve has left."""
+        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.is_blind:
             return np.inf
-        least = float(ksp.computeExtremeSingularValues()[1])
-        self.least = min(least, RISE * self.least) if self.least else least
-        solved = self.solve_bound.of(LOWER * self.least)
+        solved = self.solve_bound.of(LOWER * self.estimate.least)
         if np.isfinite(solved):
             self.slack = solved / ksp.getResidualNorm()
         return solved
 
     def tolerances(self, now: Outcome) -> tuple[float, float]:
         """ksp_rtol and ksp_atol of the next linear solve: it need not gain more digits than are missing."""
-        if self._is_smooth(now):
-            return self.tightest, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
-        if self.slack and now.bound <= FINAL * now.goal:
-            return CLOSEST * self.tightest, SHARE * now.goal * now.distance / self.slack
         missing = now.bound / self.ratio
+        is_last = missing <= FINAL * now.goal
+        rtol = CLOSEST * self.tightest if is_last else self.tightest
+        if self._is_smooth(now):
+            return rtol, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
+        if is_last and self.slack and not self.estimate.preconditioner.is_uniform:
+            return rtol, SHARE * now.goal * now.distance / self.slack
         return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), 1e-50  # PETSc's: none
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
@@ -411,7 +421,7 @@ class ErrorControl:
 
     def forget(self, modes: bool) -> None:
         self.ratio = FIRST_RATIO
-        self.least = self.slack = 0.0
+        self.slack = 0.0
         self.estimate.forget(modes)
 
 

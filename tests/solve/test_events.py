@@ -44,7 +44,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, dict, dict]:
 def test_events_are_in_their_stages(run: tuple):
     stages, _, _ = run
     assert {"msmpetsc grids", "msmpetsc hierarchy", "msmpetsc hessian"} <= set(stages["set-up"])
-    names = "gradient", "energy", "hessian", "product", "fine", "cycle", "estimate", "local"
+    names = "gradient", "energy", "hessian", "product", "fine", "cycle", "local"
     assert {f"msmpetsc {name}" for name in names} <= set(stages["steps"])
     assert stages["output"]["msmpetsc output"][0] == 1 + FRAMES and "SNESSolve" in stages["reference"]
     assert not any(name.startswith("SNES") for stage in ("Main Stage", "output") for name in stages[stage])

@@ -3,8 +3,9 @@
 For any mu that is no greater than the least eigenvalue of P^(-1) H, the Gauss-Radau rule for b^T H^(-1) b gives
 |x - x_k|_H^2 <= gamma'_k |r_k|_(P^-1)^2 with gamma'_0 = 1 / mu and
 gamma'_(k+1) = (gamma'_k - gamma_k) / (mu (gamma'_k - gamma_k) + delta_(k+1)), where gamma_k is the length of CG's
-step k and delta_k = |r_k|^2 / |r_(k-1)|^2 (Meurant and Tichy 2013, Numerical Algorithms 62, "On computing quadrature-based
-bounds for the A-norm of the error in conjugate gradients"). The bound by the residual alone is |r_k|_(P^-1) / sqrt(mu).
+step k and delta_k = |r_k|^2 / |r_(k-1)|^2 (Meurant and Tichy 2013, Numerical Algorithms 62, 163, "On computing
+quadrature-based bounds for the A-norm of the error in conjugate gradients"). By the residual alone the bound is
+|r_k|_(P^-1) / sqrt(mu), which is gamma'_k at its greatest.
 """
 
 import numpy as np
@@ -28,8 +29,8 @@ class SolveBound:
 
     @property
     def reduction(self) -> float:
-        """Of |r|_(P^-1) in that solve."""
-        return self.norms[-1] / self.norms[0] if self.norms and self.norms[0] > 0 else 1.0
+        """Of |r|_(P^-1) in that solve, at the most to rounding."""
+        return max(self.norms[-1] / self.norms[0], float(np.finfo(float).eps)) if any(self.norms) else 1.0
 
     def of(self, least: float) -> float:
         """|x - x_k|_H at most where no eigenvalue of P^(-1) H is below ``least``; infinite where CG shows nothing."""

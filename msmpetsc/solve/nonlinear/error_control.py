@@ -280,9 +280,9 @@ class Outcome:
     def known(self, lowest: float) -> float:
         """The relative error by what the linear solve left and what F is beside that, where M^(-1) H has no eigenvalue
         below ``lowest``; infinite where that says nothing."""
-        if not lowest > 0:
+        if not min(lowest, self.distance) > 0:
             return np.inf
-        return (self.solved / np.sqrt(lowest) + self.beside / lowest) / self.distance
+        return float((self.solved / np.sqrt(lowest) + self.beside / lowest) / self.distance)
 
     @property
     def is_enough(self) -> bool:
@@ -350,7 +350,8 @@ class ErrorControl:
             return replace(now, error=np.inf)
         now = replace(now, beside=beside)
         error = now.known(self.curvature.compression(iterate.q).least_curvature or self.estimate.convexity)
-        self.ratio = max(now.bound / error, 1.0)
+        if error > 0:
+            self.ratio = max(now.bound / error, 1.0)
         return replace(now, error=error)
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
@@ -392,9 +393,9 @@ class ErrorControl:
         """Bound on |e|_H that a linear solve has left."""
         if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.is_blind:
             return np.inf
-        solved = self.solve_bound.of(LOWER * self.estimate.least)
-        if np.isfinite(solved):
-            self.slack = solved / ksp.getResidualNorm()
+        solved, residual = self.solve_bound.of(LOWER * self.estimate.least), ksp.getResidualNorm()
+        if np.isfinite(solved) and residual > 0:
+            self.slack = solved / residual
         return solved
 
     def tolerances(self, now: Outcome) -> tuple[float, float]:

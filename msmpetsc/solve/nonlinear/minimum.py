@@ -73,7 +73,8 @@ class Minimum:
             return Verdict(np.inf, direction, value)
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
-        if value > CONVEX and (known := outcome.known(value)) * outcome.distance <= enough:
+        known = outcome.known(value)
+        if value > CONVEX and np.isfinite(known) and known * outcome.distance <= enough:
             return Verdict(known)
         first, rest = functional.norm(self.first), functional.dual_norm(self.f) / value
         if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on

@@ -19,7 +19,6 @@ from msmpetsc.errors import InputError
 
 MOST = 1e60  # of any number: its fourth power is still finite
 MOST_COUNT = 2**53  # the whole numbers that a double holds
-AT_REST = "Rest.has_come"  # number of a run that ends at rest (time.until): whether it has
 Range = tuple[float, float]
 COUNT: Range = (0, MOST_COUNT)
 ANY: Range = (-math.inf, math.inf)

@@ -135,10 +135,6 @@ class Environment:
 
         return at(begin) == at(end)
 
-    def last_change(self, until: float) -> float:
-        """Return when anything changes for the last time [s] before ``until``, or 0."""
-        return max((time for time in self.events() if time <= until), default=0.0)
-
     def contact_faces(
         self, q: Positions, end: Positions, time: float, time_step: float, before: Indices | None, held: Mask
     ) -> Indices:

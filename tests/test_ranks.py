@@ -66,10 +66,6 @@ CASES = {
         "sides": np.array([8, 3, 3]) * CELL, "start": {"velocity": [0.5, 0, -1.5]}, "obstacle": [FLOOR],
         "gravity": GRAVITY, "solver": {"preset": "newton-multigrid", "error": 1e-6}, "time": steps(6, 0.01),
     }, ("-pc_mg_levels", "3"), 1e-5),
-    "until rest": Case({
-        "sides": BEAM, "pin": [{"region": LEFT}], "gravity": {"acceleration": [0, 0, -1.0]},
-        "solver": {"error": 1e-4}, "time": steps(200, 0.4, until="rest"),
-    }, accuracy=1e-4),
     "rescued": Case({
         "sides": BEAM, "pin": [{"region": LEFT}], "gravity": GRAVITY, "safety": {"on_failure": "fallback"},
         "time": steps(3, 0.1),

@@ -121,8 +121,8 @@ class Resumed:
 
     @property
     def is_done(self) -> bool:
-        """Return whether the file has all frames already, or those until rest."""
-        return self.earlier.finished >= self.stored or (self.earlier.at_rest and not self.differs)
+        """Return whether the file has all frames already."""
+        return self.earlier.finished >= self.stored
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
         earlier = self.earlier

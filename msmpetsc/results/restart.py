@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array
-from msmpetsc.checkpoint import AT_REST, Checkpoint
+from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.comm import on_root, together
 from msmpetsc.errors import InputError
 from msmpetsc.fields import CHECKPOINT
@@ -31,7 +31,6 @@ class Earlier:
     step       : of the last checkpoint, 0 if it has none
     finished   : frames that it has
     planned    : frames that it has room for
-    at_rest    : whether it ended there (time.until)
     """
 
     path: Path
@@ -40,7 +39,6 @@ class Earlier:
     step: int
     finished: int
     planned: int
-    at_rest: bool
 
     @classmethod
     def read(cls, path: Path) -> "Earlier":
@@ -50,12 +48,9 @@ class Earlier:
             true_error = result.attributes.get("true_error")
             count, planned = len(result.frames.time), result.frames.time.planned[0]
             newest = _newest(result)
-        step, at_rest = 0, False
-        if newest is not None and count:
-            saved = newest[1]
-            step, at_rest = saved.step, saved.numbers.get(AT_REST) == 1
+        step = newest[1].step if newest is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
-        return cls(path, texts, true_error, step, count, planned, at_rest)
+        return cls(path, texts, true_error, step, count, planned)
 
 
 def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:

@@ -4,7 +4,7 @@ In statics, where nothing moves, much has no meaning; exchange and a surface tha
 """
 
 from collections.abc import Iterator
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator
 
@@ -37,10 +37,6 @@ class Time(Table):
     substep: Positive | None = Field(
         None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
     )
-
-    until: Literal["duration", "rest"] = Field(
-        "duration", description="when the run ends: or as soon as all is at rest"
-    )
     error: float | None = Field(
         None, gt=0, lt=1, description="of the motion, relative: steps are as long as it allows, all alike if absent [-]"
     )
@@ -48,13 +44,6 @@ class Time(Table):
     longest: Positive | None = Field(None, description="of them; 64 step if absent [s]")
 
     _has_a_use = field_validator("substep")(only_for("integrator", "verlet"))
-
-    @field_validator("until")
-    @classmethod
-    def _moves(cls, until: str, info: ValidationInfo) -> str:
-        if until == "rest" and info.data.get("integrator") == STATIC:
-            raise rule(f'has no meaning for integrator = "{STATIC}": each state is at rest', "integrator")
-        return until
 
     @field_validator("duration")
     @classmethod
@@ -139,4 +128,4 @@ def _moving(scene: Any) -> Iterator[Broken]:
             yield "obstacle", rule(f'{words}nothing strikes it; response = "penalty" presses', "time")
         if obstacle.friction:
             words = f'may have no friction where time.integrator = "{STATIC}", as obstacle.{number} has: it depends on '
-            yield "obstacle", rule(f'{words}the way there; time.until = "rest" ends a run in motion there', "time")
+            yield "obstacle", rule(f"{words}the way there, which steps in motion with damping take", "time")

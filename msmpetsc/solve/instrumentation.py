@@ -1,8 +1,7 @@
 """What is watched and measured of a run.
 
 Monitors warn once: of cells inside out, steps that ended far from their solution, energy that came from nowhere and
-nodes inside an obstacle that comes to be there. Besides: the body's coming to rest, true errors of steps, and where
-the time went.
+nodes inside an obstacle that comes to be there. Besides: true errors of steps, and where the time went.
 """
 
 from typing import ClassVar
@@ -10,20 +9,17 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows
-from msmpetsc.build import Model
-from msmpetsc.checkpoint import ANY, COUNT, LENGTH, Range
+from msmpetsc.backend.arrays import Floats, Positions
+from msmpetsc.checkpoint import ANY, COUNT, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.moving_solid import describe_overlap
 from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.energy_balance import MUCH
-from msmpetsc.solve.integrators.integrator import EnergyBudget, State
-from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR
-from msmpetsc.solve.nonlinear.functional import Iterate, StepProblem
+from msmpetsc.solve.integrators.integrator import EnergyBudget
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, REFERENCE, begun, seconds
 from msmpetsc.solve.presets import find_preset
@@ -35,9 +31,6 @@ EVENTS = {
     "cycle": [CYCLE.name], "fine": [FINE.name],
 }  # fmt: skip
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
-REST_PRESET, REST_PREFIX = "newton-multigrid", "rest_"
-LONGEST_WAIT = 8  # steps between two looks
-LEAST = 1e-10  # of a cell: what a body moves less than that is rounding
 
 
 class TrueErrors:
@@ -185,75 +178,3 @@ class Monitors:
             log.warning(
                 "in %d frames there was energy from nowhere, up to %.2g%% of all", self.gaining, 100 * self.worst_gain
             )
-
-
-class Rest:
-    """Check after each step whether the body has come to rest. All methods are collective.
-
-    How far it is from the equilibrium near by, and how far its velocity would carry it from there, in all of the run's
-    time T:
-
-        |e|_M,  H e = T^2 (grad E(q) - f_ext),    and    sqrt(v^T M w),  H w = T^2 M v,    H = M + T^2 (Hessian of E)
-
-    They are estimated as errors of steps are, once a step has moved little.
-
-    has_come : whether it has
-    """
-
-    state: ClassVar[dict[str, Range]] = {
-        "farthest": LENGTH,
-        "next": COUNT,
-        "wait": (1, LONGEST_WAIT),
-        "has_come": (0, 1),
-    }
-
-    def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, environment: Environment):
-        self.comm, self.model, self.environment = comm, model, environment
-        self.time_step, self.duration = scene.time.step, scene.time.duration
-        self.error = scene.solver.error or DEFAULT_ERROR
-        self.last_change = environment.last_change(scene.time.duration)
-        self.farthest = 0.0  # from the start [m sqrt(kg)]
-        self.least = LEAST * model.lattice.cell_size * np.sqrt(comm.allreduce(float(model.lattice.mass.sum())))
-        self.next, self.wait = 0, 1  # step to look at next, steps until the one after that
-        self.has_come = False
-
-    def look(self, index: int, time: float, before: State, after: State) -> bool:
-        """Whether the body is at rest after step ``index``, which ended at ``time`` [s]."""
-        self.farthest = max(self.farthest, self._norm(after.q - self.model.start[0]))
-        limit = max(self.error * self.farthest, self.least)
-        moved = max(self._norm(after.q - before.q), self._norm(after.q - after.q_previous))
-        if time < self.last_change or index < self.next or moved > limit:
-            return False
-        self.has_come = self._is_at_rest(after, time, limit)
-        self.next, self.wait = index + self.wait, min(2 * self.wait, LONGEST_WAIT)
-        if self.has_come:
-            log.info(
-                "at rest after step %d (t = %.6g s): nothing would move by more than %.2g of the farthest it was",
-                index, time, self.error,
-            )  # fmt: skip
-        return self.has_come
-
-    def _norm(self, moved: Rows) -> float:
-        """|v|_M of displacements (l, 3) [m]."""
-        own = moved[: self.model.lattice.owned]
-        return float(np.sqrt(self.comm.allreduce(float(self.model.lattice.mass @ (own**2).sum(axis=1)))))
-
-    def _is_at_rest(self, state: State, time: float, limit: float) -> bool:
-        lattice, touches = self.model.lattice.pin(self.environment.fixed_at(time)), self.environment.touches
-        preset = find_preset(REST_PRESET)
-        stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=REST_PREFIX)
-        try:
-            contact = self.environment.contact(state.q, (state.q, None), time, self.time_step, state.sides)
-            stepper.functional.begin(StepProblem(state.q, state.q, self.environment.load(time), contact))
-            functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
-            stepper.unknowns.from_nodes(state.q, stepper.x)
-            iterate = functional.evaluate(stepper.x, f)
-            if not estimate(iterate, functional.dual_norm(f), limit) <= limit:
-                return False
-            stepper.unknowns.from_nodes(state.velocity(self.time_step), f)
-            functional.memory.write(f)[:] *= functional.t2 * functional.mass
-            if not np.isfinite(estimate(Iterate(state.q, f), functional.dual_norm(f), np.inf)):
-                return False
-            return bool(np.sqrt(max(estimate.correction.dot(f), 0.0) / functional.t2) <= limit)
-        finally:
-            stepper.destroy()

@@ -26,7 +26,7 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, Rest, TrueErrors
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, TrueErrors
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
@@ -116,7 +116,6 @@ class TimeLoop:
         self.integrator = self.adaptive or self._make(scene.time, scene.solver)
         self.recovery = Recovery(scene, self._make, self.balance)
         self.monitors, self.true_errors = Monitors(comm, model.lattice), TrueErrors()
-        self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
         self.forces = Forces(model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
@@ -167,7 +166,7 @@ class TimeLoop:
                 result, after = self.balance.step(self.integrator, self.state, time, self.time_step)
         except StepFailed as failure:
             result, after = self._recovered(index, time, failure)
-        before, self.state = self.state, after
+        self.state = after
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
@@ -177,10 +176,8 @@ class TimeLoop:
             self.effort.measure(errors)
         self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
-        if self.rest and self.rest.look(index, time, before, after):
-            self.steps = index
         frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
-        if index % REMEMBERED == 0 or (self.rest and self.rest.has_come and index == self.steps):
+        if index % REMEMBERED == 0:
             self._saved = self._save()
         return frame
 
@@ -197,7 +194,7 @@ class TimeLoop:
         self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)
 
     def saved(self) -> Checkpoint:
-        """The last step that the run may go on from: every ``REMEMBERED``-th, and that of a body at rest."""
+        """The last step that the run may go on from: every ``REMEMBERED``-th."""
         rows = {name: to_host(rows) for name, rows in self._saved.rows.items()}
         return replace(self._saved, rows=rows)
 
@@ -223,7 +220,7 @@ class TimeLoop:
         self._saved = self._save()
 
     def _counting(self) -> list[Counting]:
-        return [self.recovery, self.monitors, self.effort, *([self.rest] if self.rest else [])]
+        return [self.recovery, self.monitors, self.effort]
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""

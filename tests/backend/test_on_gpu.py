@@ -77,7 +77,6 @@ CASES = {
         "time": {**FALL["time"], "integrator": "static"}, "gravity": GRAVITY, **HELD, **LED, **STIFFENING,
         "obstacle": [{**PLATE, "friction": 0.0}],
     },
-    "until rest": {**FALL, **HELD, "time": {"step": 0.3, "duration": 6.0, "until": "rest"}},
     "verlet": {
         **FALL, **LED, "time": {**FALL["time"], "integrator": "verlet"},
         "obstacle": [{**FLOOR, "response": "reflect"}, PLATE],

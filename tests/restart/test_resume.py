@@ -82,7 +82,6 @@ CASES = {
     "loose, pressed": fall(  # the estimate of a start knows what the preconditioner was
         solver={"preset": "newton", "error": 0.3}, obstacle=PRESSING, time={"step": 0.01, "duration": 0.24}
     ),
-    "until rest": swing(solver=LOOSE, time={"step": 0.4, "duration": 80.0, "until": "rest"}),
     "anchor": swing(solver=LOOSE, anchor=LED, output={"surface": False, "every": 3}),
     "bdf2": by("bdf2", swing(solver=LOOSE)),
     "static": by("static", swing(solver=LOOSE, anchor=[LED[0] | {"stop": 0.05}, *PUSHED])),

@@ -27,7 +27,6 @@ from msmpetsc.results.disk import plain_errors, refuse_no_file, write_whole
 from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.instrumentation import times
-from msmpetsc.solve.integrators.verlet import explicit_limit
 from msmpetsc.solve.petsc.events import FILES, OUTPUT
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -154,7 +153,6 @@ class Cost:
             "time": time,
             "products": sum(self.products.values()),
             "memory": comm.allreduce(peak_memory()),
-            "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),
             "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
         }  # fmt: skip
         on_root(comm, lambda: write_whole(path, json.dumps(record, indent=1)))

@@ -93,7 +93,7 @@ class TimeLoop:
 
     state         : that goes with the last frame, or the last step
     step          : steps taken
-    steps         : steps of the whole run; those taken, once that is at rest
+    steps         : steps of the whole run
     stored        : number of frames of the whole run; ``stored_until(step)`` of a part
     """
 

@@ -39,7 +39,7 @@ def plain(value: float | str | None) -> str:
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e15 else f"{value:.4g}"
 
 
-TIMES = ("least", "greatest", "step", "substep", "seconds", "explicit_limit")  # beside the columns time_...
+TIMES = ("least", "greatest", "step", "substep", "seconds")  # beside the columns time_...
 
 
 def worded(column: str, value: Any) -> str:

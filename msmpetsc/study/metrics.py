@@ -51,7 +51,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def costs(record: dict[str, Any]) -> Row:
     """Return counts, times, memory, machine and versions of a measure file."""
-    names = ("cells", "nodes", "unknowns", "springs", "memory", "explicit_limit")
+    names = ("cells", "nodes", "unknowns", "springs", "memory")
     row = {name: record.get(name) for name in names}
     for part in ("setup", "factor", "local", "ksp", "output"):
         row[f"time_{part}"] = record.get("time", {}).get(part)

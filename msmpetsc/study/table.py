@@ -24,7 +24,7 @@ COLUMNS = (
     "time_frame_min", "time_frame_max", "fps", "time_second", "time_setup", "time_factor",
     "time_local", "time_ksp", "time_output", "iterations", "most_iterations", "ksp_its",
     "products", "substeps", "fallbacks", "inverted", "energy_gained", "self_contacts",
-    "self_distance", "energy_left", "shape_error", "explicit_limit", "memory", "estimated_error",
+    "self_distance", "energy_left", "shape_error", "memory", "estimated_error",
     "true_error", "energy_error", "trajectory_error", "surface_error", "machine", "versions",
     "command",
 )  # fmt: skip

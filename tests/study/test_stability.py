@@ -145,12 +145,10 @@ x = { name = "time step", key = "time.step", unit = "s", values = [1e-4, 1e-2, 1
 y = { name = "modulus", key = "m", unit = "Pa", values = [1e3, 1e5] }
 """
 PLACES = [
-    place("newton", x, y, "ok" if x < 1 else "slow", iterations=4.2, explicit_limit=limit)
-    for y, limit in ((1e3, 1e-2), (1e5, 1e-3))
-    for x in (1e-4, 1e-2, 1)
+    place("newton", x, y, "ok" if x < 1 else "slow", iterations=4.2) for y in (1e3, 1e5) for x in (1e-4, 1e-2, 1)
 ] + [
-    place("verlet", x, y, "ok" if x < 1 else "diverged", explicit_limit=limit, reason="" if x < 1 else "ran away")
-    for y, limit in ((1e3, 1e-2), (1e5, 1e-3))
+    place("verlet", x, y, "ok" if x < 1 else "diverged", reason="" if x < 1 else "ran away")
+    for y in (1e3, 1e5)
     for x in (1e-4, 1e-2, 1)
 ]
 

@@ -332,15 +332,6 @@ class HighestMode:
         self.mode.destroy()
 
 
-def explicit_limit(comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity) -> float:
-    """Return the limit 2 / omega [s] of stable explicit steps at rest (collective)."""
-    highest = HighestMode(comm, lattice, elasticity)
-    highest.hold(lattice.pinned[: lattice.owned])
-    squared = highest.squared_at(lattice.nodes)
-    highest.destroy()
-    return 2 / np.sqrt(squared) if squared > 0 else np.inf
-
-
 def crushing_energy(lattice: Lattice) -> float:
     """Return the energy [J] that presses every spring of this rank to a point."""
     springs = slice(lattice.springs_owned)

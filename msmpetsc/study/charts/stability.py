@@ -30,7 +30,7 @@ COLUMNS = 6  # panels side by side
 CELL = 24  # [px]: height
 TIP = (
     "outcome", "steps", "iterations", "most_iterations", "inverted", "shape_error", "energy_gained", "substeps",
-    "fallbacks", "explicit_limit", "reason",
+    "fallbacks", "reason",
 )  # fmt: skip
 
 

@@ -40,8 +40,6 @@ class Time(Table):
     error: float | None = Field(
         None, gt=0, lt=1, description="of the motion, relative: steps are as long as it allows, all alike if absent [-]"
     )
-    shortest: Positive | None = Field(None, description="of the steps that error chooses; step / 1024 if absent [s]")
-    longest: Positive | None = Field(None, description="of them; 64 step if absent [s]")
 
     _has_a_use = field_validator("substep")(only_for("integrator", "verlet"))
 

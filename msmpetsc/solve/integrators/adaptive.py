@@ -42,7 +42,7 @@ from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
-LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
+LOWEST, HIGHEST = -10, 6  # levels
 KEPT = 4  # integrators of as many lengths, those used last
 JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it yet
 SWEEPS = 4
@@ -83,15 +83,9 @@ class NeighbourMean:
 
 
 def refuse_bad_steps(time: Time) -> None:
-    """Raise InputError for bounds and integrators that steps of many lengths cannot have."""
-    if time.error is None:
-        if time.shortest is not None or time.longest is not None:
-            raise InputError("time.shortest and time.longest are for the steps that time.error chooses: give that, too")
-        return
-    if time.integrator not in ORDERS:
+    """Raise InputError for integrators that steps of many lengths cannot have."""
+    if time.error is not None and time.integrator not in ORDERS:
         raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
-    if not (time.shortest or time.step) <= time.step <= (time.longest or time.step):
-        raise InputError(f"time.step = {time.step:g} s must lie between time.shortest and time.longest")
 
 
 def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
@@ -238,13 +232,7 @@ class Adaptive(Integrator):
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
         self.order = ORDERS[scene.time.integrator]
         steps = scene.time.steps
-        lowest = LOWEST
-        if scene.time.shortest is not None:
-            lowest = math.ceil(math.log2(scene.time.shortest / scene.time.step) - 1e-9)
-        highest = HIGHEST
-        if scene.time.longest is not None:
-            highest = math.floor(math.log2(scene.time.longest / scene.time.step) + 1e-9)
-        self.levels = max(lowest, -40), min(highest, 40)  # of its steps
+        self.levels = LOWEST, HIGHEST  # of its steps
         self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.mean = NeighbourMean(self.comm, self.lattice)

@@ -42,6 +42,7 @@ class Time(Table):
     )
 
     _has_a_use = field_validator("substep")(only_for("integrator", "verlet"))
+    _chooses = field_validator("error")(only_for("integrator", *IMPLICIT))
 
     @field_validator("duration")
     @classmethod

@@ -1,5 +1,6 @@
 """Types of the values of a scene's keys, and the table that all tables are."""
 
+import json
 import math
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
@@ -72,12 +73,12 @@ def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | N
     return stop
 
 
-def only_for(key: str, value: str) -> Callable[..., Any]:
-    """Return the validator of what only matters where another key of its table has this value."""
+def only_for(key: str, *values: str) -> Callable[..., Any]:
+    """Return the validator of what only matters where another key of its table has one of these values."""
 
     def check(cls: Any, given: Any, info: ValidationInfo) -> Any:
-        if info.data.get(key, value) != value:
-            raise rule(f'is for {key} = "{value}" only', key)
+        if info.data.get(key, values[0]) not in values:
+            raise rule(f"is for {key} = {' or '.join(map(json.dumps, values))} only", key)
         return given
 
     return check

@@ -27,7 +27,7 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, TrueErrors
-from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
+from msmpetsc.solve.integrators.adaptive import Adaptive
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.static import Static
@@ -62,9 +62,8 @@ def solvers_of(scene: Scene, true_error: int | None = None) -> dict[str, tuple[P
 
 
 def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
-    """Raise InputError for a preset that is unknown or not for this scene, and for steps that cannot be as asked."""
+    """Raise InputError for a preset that is unknown or not for this scene, and for true errors that there are not."""
     solvers = solvers_of(scene, true_error)
-    refuse_bad_steps(scene.time)
     if scene.touching and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(f"contact of surfaces is for newton's presets, not {scene.solver.preset}")
     if scene.time.error and true_error:

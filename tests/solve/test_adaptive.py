@@ -12,7 +12,6 @@ from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators import adaptive
 from msmpetsc.solve.integrators.adaptive import ORDERS, local_error
-from msmpetsc.solve.simulate import refuse_bad_options
 
 STEP, DURATION = 0.01, 0.96
 LOOSE = {"preset": "newton", "error": 1e-4}
@@ -152,12 +151,6 @@ def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monk
     assert sum(frame.steps for frame in frames[10:]) < 31
 
 
-@pytest.mark.parametrize(
-    "more, says",
-    [
-        ({"integrator": "verlet", "error": 0.1}, 'only, not "verlet"'),
-    ],
-)
-def test_what_has_no_meaning_is_refused_in_a_line(tmp_path: Path, more: dict, says: str):
-    scene = load_scene(beam(tmp_path, **more))
-    assert says in input_error(lambda: refuse_bad_options(scene))
+def test_an_integrator_whose_steps_have_one_length_is_refused_in_a_line(tmp_path: Path):
+    scene = beam(tmp_path, integrator="verlet", error=0.1)
+    assert 'time.error: is for integrator = "implicit-euler" or "bdf2" only' in input_error(lambda: load_scene(scene))

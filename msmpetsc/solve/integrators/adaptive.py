@@ -31,7 +31,7 @@ from scipy.sparse import csr_array
 from msmpetsc.backend.arrays import Positions, Rows, like, to_host
 from msmpetsc.checkpoint import COUNT, LENGTH, Checkpoint, Range
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import StepFailed
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
@@ -80,12 +80,6 @@ class NeighbourMean:
         for _ in range(SWEEPS):
             means = self.weights @ with_ghosts(self.comm, self.lattice, means)
         return like(vectors, means)
-
-
-def refuse_bad_steps(time: Time) -> None:
-    """Raise InputError for integrators that steps of many lengths cannot have."""
-    if time.error is not None and time.integrator not in ORDERS:
-        raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
 
 
 def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
@@ -225,7 +219,6 @@ class Adaptive(Integrator):
     looks_back = True
 
     def __init__(self, scene: Scene, make: Callable[[Time, Solver], Integrator], balance: EnergyBalance):
-        refuse_bad_steps(scene.time)
         assert scene.time.error is not None
         self.balance, self.comm = balance, balance.comm
         self.lattice, self.environment = balance.lattice, balance.environment

@@ -63,16 +63,12 @@ class Composition:
         """Corners (2, 3) of the box around all frames [m]."""
         return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
-    def cut(self, cells: bool) -> Cut | None:
-        """Return the cells behind the body's middle, as the camera sees it, if they are shown."""
-        return cut_open(self.subject, self.camera) if cells else None
-
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
         """Return the still of each frame, with its time and `words` in the caption.
 
         Equal stills in a row are one object.
         """
-        cut = self.cut(self.style.cells)
+        cut = cut_open(self.subject, self.camera) if self.style.cells else None
         made: list[Still] = []
         for index in frames:
             if made and made[-1].index == index:

@@ -15,7 +15,7 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result
 from msmpetsc.view.film import playback_of, write_film
-from msmpetsc.view.mesh import drawn
+from msmpetsc.view.mesh import cut_open, drawn
 from msmpetsc.view.page import write_page
 from msmpetsc.view.sheet import contact_sheet, draw_panels
 
@@ -85,7 +85,8 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     (still,) = composition.stills([0])
     stills = [replace(still, caption=(subject.title, about[0]))]
     if not style.cells:
-        stills.append(replace(still, caption=("cut open", about[1]), cut=composition.cut(True)))
+        cut = cut_open(subject, composition.camera)
+        stills.append(replace(still, caption=("cut open", about[1]), cut=cut))
     draw_panels(composition, stills, path)
 
 

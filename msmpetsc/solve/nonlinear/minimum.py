@@ -51,16 +51,7 @@ class Minimum:
         enough  : the length of an error that will do, |e|_M
         """
         functional, estimate = self.functional, self.estimate
-        corrected, alarm = outcome.corrected, outcome.alarm
-        x.copy(self.nearer)
-        self.first.set(0.0)
-        if corrected:
-            estimate.correction.copy(self.first)
-            self.nearer.axpy(-1.0, self.first)
-        if corrected and not self._is_free(x, self.nearer):
-            x.copy(self.nearer)
-            self.first.set(0.0)
-            corrected = False
+        corrected, alarm = self._approach(x, outcome.corrected), outcome.alarm
         nearer = functional.evaluate(self.nearer, self.f)
         estimate.linearise(nearer.q)
         estimate.residual.aypx(-1.0, self.f)
@@ -86,6 +77,19 @@ class Minimum:
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
             return Verdict(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
         return Verdict(self._second_estimate(nearer, first, rest, enough, value))
+
+    def _approach(self, x: PETSc.Vec, corrected: bool) -> bool:
+        """Make the point to look at x less its correction; whether it is, or x itself, for the surface meets itself."""
+        x.copy(self.nearer)
+        self.first.set(0.0)
+        if corrected:
+            self.nearer.axpy(-1.0, self.estimate.correction)
+            corrected = self._is_free(x, self.nearer)
+        if corrected:
+            self.estimate.correction.copy(self.first)
+        else:
+            x.copy(self.nearer)
+        return corrected
 
     def _is_free(self, x: PETSc.Vec, nearer: PETSc.Vec) -> bool:
         """Whether the surface meets itself nowhere on the way from one to the other."""

@@ -40,6 +40,7 @@ from msmpetsc.solve.work import Work
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 SOFTER = 9.0  # how far |F| may rise at first; then lambda, from one solid that leads on to the next
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
+RAISED = 2.0  # times |F| before: friction and contact have kinks within what g has no digits for
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 CLIMBS = (  # PETSc takes it for a minimum where |H F| / |F| < 1e-4, as any is in small units
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH,
@@ -102,6 +103,8 @@ class Stepper:
         self.is_first, self.begun = False, np.inf  # iteration, of which softer solids may follow; |F| before it
         self.slopes: Array | None = None  # V U' of a softer solid, for the next Hessian
         self.iterations = 0  # of all steps so far
+        self.is_forced = False  # the last move was a full one, whatever g said of it
+        self.is_bent = False  # such a move has raised |F|: g is to be asked all the same
         self.base = np.empty_like(self.lattice.nodes)  # positions that g is compared with
         self.kinks, self.owned = FrictionKinks(), ExitStack()
         self.unknowns = Unknowns(self.comm, self.lattice, self.static)
@@ -206,6 +209,7 @@ class Stepper:
         self.base[:] = problem.fixed
         self.kinks.begin(problem.contact)
         self.control.estimate.convexity = 1.0
+        self.is_forced = self.is_bent = False
         self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
         multigrid = self.jacobian.preconditioner.to_balance
         if start is None and multigrid:
@@ -346,7 +350,8 @@ class Stepper:
             change, distance = self.functional.change(q, self.base)
         outcome = self.outcome
         is_flat = outcome.bound < FULL_STEP_ERROR and (outcome.corrected or not outcome.doubts)
-        return -1.0 if is_flat and distance > 0 else change
+        self.is_forced = is_flat and distance > 0 and not self.is_bent
+        return -1.0 if self.is_forced else change
 
     def _change_way(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Change the way from x to x - y, which a line search is to try, where it leads into obstacles or the surface
@@ -431,8 +436,10 @@ class Stepper:
                 self.outcome = replace(self.outcome, left=np.inf, solved=np.inf)  # of another x
             elif self.preset.true_hessian and not self.projected:
                 self.outcome = self.control.led_by(self.ksp, self.outcome)
+        before = self.outcome.residual
         if its > 0 or not self.has_npc:  # else known since _is_solved
             self.outcome = self.control.judge(iterate, self.outcome)
+        self.is_bent |= self.is_forced and self.outcome.residual > RAISED * before
         outcome = self.outcome
         if self.ksp.reason == INDEFINITE:
             self.outcome = outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))

@@ -182,15 +182,18 @@ class Contacts:
         self._moments: list[ContactsAt] = []
         self._points: list[tuple[Positions, float, Positions]] = []  # q, time and points of some positions
 
-    def find(self, q: Positions, time: float | None = None) -> ContactsAt:
-        """Return the contacts at positions q, and a time [s] if not that of the step's end."""
+    def find(self, q: Positions, time: float | None = None, with_points: bool = False) -> ContactsAt:
+        """Return the contacts at positions q, and a time [s] if not that of the step's end.
+
+        with_points : these are there, even if nothing is near
+        """
         q, time = q[: self.owned], self.time if time is None else time
         for moment in self._moments:
             if self._is_at(moment.q, moment.time, q, time):
                 return moment
         pairs = self.near.around(q, time)
         bound = self.near.moved(q, time, pairs)
-        if bound < pairs.clear:
+        if bound < pairs.clear and not with_points:
             return ContactsAt(q, time, 0, np.empty((0, 3)), ())
         points, candidates = self.points_at(q, time), None
         if bound >= pairs.apart:

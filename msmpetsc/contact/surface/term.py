@@ -151,10 +151,8 @@ class SurfaceContact:
 
     def _acting(self, q: Positions) -> ContactsAt | None:
         """Return the contacts at q, with the points for friction; None where nothing acts."""
-        moment = self.contacts.find(q)
-        if moment.count == 0 and not self.rubs:
-            return None
-        return moment if moment.count else replace(moment, points=self.contacts.points_at(moment.q, moment.time))
+        moment = self.contacts.find(q, with_points=self.rubs)
+        return moment if moment.count or self.rubs else None
 
     def presses(self, q: Positions) -> bool:
         """Return whether it acts at q."""

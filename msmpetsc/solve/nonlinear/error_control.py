@@ -228,8 +228,10 @@ class ErrorEstimate:
         self.is_probe = True
         self.ksp.solve(self.residual, self.correction)
         self.is_probe = False
-        self.floor = max(float(self.ksp.computeExtremeSingularValues()[1]), 0.0)
-        self.least = min(self.least, self.floor)
+        least = float(self.ksp.computeExtremeSingularValues()[1])
+        if least > 0:  # else at a fold, and the next estimate tries again
+            self.floor = least
+            self.least = min(self.least, least)
 
     def forget(self, modes: bool) -> None:
         self.least = 0.0

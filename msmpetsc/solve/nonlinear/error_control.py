@@ -3,6 +3,9 @@
 The error of x is |x - x*|_M / |x - y|_M, estimated. |F(x)|_(M^-1) / |x - y|_M bounds it wherever E
 is convex between x and x*. Where that will do, or no estimate can be had, the bound is the error.
 
+No estimate is made where the linear solve that led to x knows that what it left of |e|_H will do (linear.cg_bound), and
+F is little else than r, what it left of F: |F - r|_(M^-1) bounds the rest.
+
 With multigrid |F|_(P^-1), P the preconditioner, tells when an estimate is worth its cost: a linear solve leaves it. It
 is believed where F at the next iterate is about that, so that g is a parabola there (LINEAR).
 
@@ -305,6 +308,7 @@ class ErrorControl:
     residual: PETSc.Vec  # F - H e of the last linear solve, then what F is beside it
     ratio: float = FIRST_RATIO  # of bound to error in the last estimate
     solve_bound: SolveBound = field(default_factory=SolveBound)
+    has_residual: bool = False  # of the last linear solve
     slack: float = 0.0  # bound on |e|_H over |r|_(P^-1) at the end of the last linear solve; 0: none
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
@@ -316,7 +320,7 @@ class ErrorControl:
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
             return replace(now, error=0.0 if at_rounding else np.inf)
         now = replace(now, bound=residual / distance)
-        if now.solved <= now.goal * now.distance and not now.alarm:
+        if self.has_residual and now.solved <= now.goal * now.distance and not now.alarm:
             now = self._known(iterate, now)
             if now.error <= now.goal:
                 return now
@@ -386,7 +390,8 @@ class ErrorControl:
             return now
         self.estimate.learn(ksp)
         solved = self._solved(ksp)
-        if solved <= now.goal * now.distance:
+        self.has_residual = solved <= now.goal * now.distance
+        if self.has_residual:
             self.residual = ksp.buildResidual(self.residual)
         left = ksp.getResidualNorm() if self.estimate.preconditioner.is_uniform else np.inf
         return replace(now, left=left, solved=solved)

@@ -432,9 +432,9 @@ class Stepper:
             self.jacobian.preconditioner.learn(
                 self.ksp.its, self.ksp.getTolerances()[0], self.control.solve_bound.reduction
             )
-            if self.is_detour:
-                self.outcome = replace(self.outcome, left=np.inf, solved=np.inf)  # of another x
-            elif self.preset.true_hessian and not self.projected:
+            if self.is_detour or self.projected:  # of another x, or another Hessian
+                self.outcome = replace(self.outcome, left=np.inf, solved=np.inf)
+            elif self.preset.true_hessian:
                 self.outcome = self.control.led_by(self.ksp, self.outcome)
         before = self.outcome.residual
         if its > 0 or not self.has_npc:  # else known since _is_solved

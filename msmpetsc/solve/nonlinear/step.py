@@ -440,6 +440,7 @@ class Stepper:
         if its > 0 or not self.has_npc:  # else known since _is_solved
             self.outcome = self.control.judge(iterate, self.outcome)
         self.is_bent |= self.is_forced and self.outcome.residual > RAISED * before
+        self.is_forced = False
         outcome = self.outcome
         if self.ksp.reason == INDEFINITE:
             self.outcome = outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))

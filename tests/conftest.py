@@ -63,18 +63,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.smoke)
 
 
-def run(
-    ranks: int, *arguments: object, timeout: float = HANGS, status: int | None = None
-) -> subprocess.CompletedProcess:
+def run(ranks: int, *arguments: object, status: int | None = None) -> subprocess.CompletedProcess:
     """Python with these arguments on so many ranks of a real mpiexec; a hang fails at the time-out.
 
     All are forked from a process that has imported the package. ``status``: that it must end with.
     """
     words = [*map(str, arguments)]
     if ranks == 1 and words[:2] in (["-m", "msmpetsc.cli.main"], ["-m", "msmpetsc"]):
-        done = run_forked(words[2:], ENVIRONMENT | ALONE, timeout)
+        done = run_forked(words[2:], ENVIRONMENT | ALONE, HANGS)
     else:
-        done = run_ranks(ranks, words, ENVIRONMENT, timeout)
+        done = run_ranks(ranks, words, ENVIRONMENT, HANGS)
     assert status in (None, done.returncode), done.stdout + done.stderr
     return done
 
@@ -85,10 +83,10 @@ def python(*words: object, env: Mapping[str, str] = ENVIRONMENT, **options: Any)
     return subprocess.run(command, env=env, capture_output=True, text=True, **options)
 
 
-def result_on(ranks: int, scene: Path, *words: object, timeout: float = HANGS) -> h5py.File:
+def result_on(ranks: int, scene: Path, *words: object) -> h5py.File:
     """The result of a scene on so many ranks, which lies beside it."""
     path = scene.with_name(f"{scene.stem}_{ranks}.h5")
-    run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", path, *words, timeout=timeout, status=0)
+    run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", path, *words, status=0)
     return h5py.File(path)
 
 

@@ -139,7 +139,7 @@ class TimeLoop:
     def advance(self) -> Iterator[Frame | None]:
         """Yield the same, and None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
-            self.monitors.overlaps(0, self.environment, self.state.q, 0.0, self.time_step)
+            self._overlaps(0, 0.0)
             self.balance.show(self.state.q, self.state.velocity(self.time_step), 0.0, self.state.sides)
             yield self._frame(0, self.state.q)
         while self.step < self.steps:
@@ -154,7 +154,7 @@ class TimeLoop:
     def _advance(self, index: int) -> Frame | None:
         """Take the next step (collective); its frame if it is stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
-        self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)
+        self._overlaps(index, time)
         begin = perf_counter()
         try:
             if self.recovery.is_on:
@@ -188,6 +188,9 @@ class TimeLoop:
             return self.recovery.step(self.state, time, failure)
         except StepFailed as last:
             raise StepFailed(f"frame {index} (t = {time:.6g} s) {last}", last.kind, index) from None
+
+    def _overlaps(self, index: int, time: float) -> None:
+        self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)
 
     def saved(self) -> Checkpoint:
         """The last step that the run may go on from: every ``REMEMBERED``-th."""

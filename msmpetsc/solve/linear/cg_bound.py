@@ -29,8 +29,10 @@ class SolveBound:
 
     @property
     def reduction(self) -> float:
-        """Of |r|_(P^-1) in that solve, at the most to rounding."""
-        return max(self.norms[-1] / self.norms[0], float(np.finfo(float).eps)) if any(self.norms) else 1.0
+        """Of |r|_(P^-1) in that solve, to rounding at the most; 1 where it has not fallen."""
+        if not self.norms or self.norms[-1] >= self.norms[0]:
+            return 1.0
+        return max(self.norms[-1] / self.norms[0], float(np.finfo(float).eps))
 
     def of(self, least: float) -> float:
         """|x - x_k|_H at most where no eigenvalue of P^(-1) H is below ``least``; infinite where CG shows nothing."""

@@ -305,10 +305,9 @@ class ErrorControl:
     rounding: Rounding
     target: float  # relative error at which a step is done; 0 where a budget of iterations ends it
     tightest: float  # ksp_rtol that no linear solve goes below
-    residual: PETSc.Vec  # F - H e of the last linear solve, then what F is beside it
     ratio: float = FIRST_RATIO  # of bound to error in the last estimate
     solve_bound: SolveBound = field(default_factory=SolveBound)
-    has_residual: bool = False  # of the last linear solve
+    has_residual: bool = False  # of the last linear solve, in estimate.residual until the iterate is judged
     slack: float = 0.0  # bound on |e|_H over |r|_(P^-1) at the end of the last linear solve; 0: none
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
@@ -350,8 +349,9 @@ class ErrorControl:
 
     def _known(self, iterate: Iterate, now: Outcome) -> Outcome:
         """What is known where the last linear solve has left so little that it may be the last of all."""
-        self.residual.aypx(-1.0, iterate.f)
-        beside = self.functional.dual_norm(self.residual)
+        self.estimate.residual.aypx(-1.0, iterate.f)
+        self.has_residual = False
+        beside = self.functional.dual_norm(self.estimate.residual)
         if beside > PARABOLA * now.residual:
             return replace(now, error=np.inf)
         now = replace(now, beside=beside)
@@ -392,7 +392,7 @@ class ErrorControl:
         solved = self._solved(ksp)
         self.has_residual = solved <= now.goal * now.distance
         if self.has_residual:
-            self.residual = ksp.buildResidual(self.residual)
+            self.estimate.residual = ksp.buildResidual(self.estimate.residual)
         left = ksp.getResidualNorm() if self.estimate.preconditioner.is_uniform else np.inf
         return replace(now, left=left, solved=solved)
 

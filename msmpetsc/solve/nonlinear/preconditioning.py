@@ -287,7 +287,7 @@ class StepPreconditioner:
         """Take note of the iterations that a linear solve took to a relative tolerance, and of what it has reached."""
         if self.multigrid and self.is_chosen:
             self.multigrid.learn(its, rtol)
-        elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / min(reached, 1.0)):
+        elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / reached):
             self._choose(f"Jacobi's took {its} iterations a solve")
 
     def setFromOptions(self, _: PETSc.PC) -> None:

@@ -164,8 +164,7 @@ class Stepper:
         if error is None and not self.budget:
             error = DEFAULT_ERROR
         tightest, _, _, self.most_its = self.ksp.getTolerances()
-        residual = self._keep(self.f.duplicate())
-        control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest, residual)
+        control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest)
         if self.preset.true_hessian:
             self.ksp.setMonitor(control.solve_bound.watch)
         return control, minimum

@@ -14,7 +14,8 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, greatest
 from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import KNOWN, ErrorEstimate, Outcome
+from msmpetsc.solve.nonlinear.error_control import KNOWN, Outcome
+from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much

@@ -21,12 +21,12 @@ from msmpetsc.solve.nonlinear.error_control import (
     FULL_STEP_ERROR,
     NOT_FINITE,
     ErrorControl,
-    ErrorEstimate,
     Outcome,
     no_minimum,
     not_converged,
     where_worst,
 )  # fmt: skip
+from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian

@@ -56,10 +56,7 @@ def ending_together(comm: "MPI.Comm", extra: str = "run") -> Iterator[None]:
             _end_all(comm, f"rank {comm.rank}: {traceback.format_exc()}", STATUS_BUG)
             raise
         if meeting is not None and not error.on_all_ranks:
-            failed = _failing_ranks(meeting)
-            if len(failed) < comm.size:
-                if comm.rank > min(failed):
-                    time.sleep(PATIENCE)  # the lowest of them tells, and ends this one, too
+            if not _all_fail(meeting):
                 _end_all(comm, f"error: {error}", error.exit_status)
             error.on_all_ranks = True
         raise error from raised
@@ -67,22 +64,18 @@ def ending_together(comm: "MPI.Comm", extra: str = "run") -> Iterator[None]:
         meeting.Free()
 
 
-def _failing_ranks(meeting: "MPI.Comm") -> set[int]:
-    """Return the ranks that fail, this one among them: as soon as all do, or when patience ends."""
-    from mpi4py import MPI
+def _all_fail(meeting: "MPI.Comm") -> bool:
+    """Return whether all ranks fail, as soon as they do or when patience ends.
 
-    failed, until = {meeting.rank}, time.monotonic() + PATIENCE
-    sent = [meeting.isend(None, rank) for rank in range(meeting.size) if rank != meeting.rank]
-    while len(failed) < meeting.size and time.monotonic() < until:
-        status = MPI.Status()
-        if meeting.iprobe(status=status):
-            meeting.recv(source=status.source)
-            failed.add(status.source)
-        else:
-            time.sleep(0.01)
-    if len(failed) == meeting.size:
-        MPI.Request.waitall(sent)
-    return failed
+    That of a low rank ends first: it tells, and ends the others.
+    """
+    barrier = meeting.Ibarrier()
+    until = time.monotonic() + PATIENCE * (1 + meeting.rank / meeting.size)
+    while time.monotonic() < until:
+        if barrier.Test():
+            return True
+        time.sleep(0.01)
+    return False
 
 
 def _end_all(comm: "MPI.Comm", line: str, status: int) -> None:

@@ -113,7 +113,7 @@ sys.meta_path.insert(0, Missing())
     done = python("-m", "msmpetsc", "doctor", env=environment)
     lines = {line[9:26].strip(): line for line in done.stdout.splitlines()}
     assert lines["PETSc"].startswith("missing") and "msmpetsc[run]" in lines["PETSc"], lines["PETSc"]
-    assert lines["extra render"].startswith("BROKEN") and "tqdm: libold.so" in lines["extra render"]
+    assert lines["extra render"].startswith("BROKEN") and "tqdm: ImportError: libold.so" in lines["extra render"]
     assert lines["extra mesh"].startswith("ok") and done.returncode == 1
 
 

@@ -4,18 +4,18 @@ What could end the process, libraries that do not fit together above all, is loa
 """
 
 import argparse
-import json
 import platform
 import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 
 import msmpetsc
 from msmpetsc.app.ranks import environment
-from msmpetsc.errors import EXTRAS, extra_of
+from msmpetsc.errors import EXTRAS
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
 PATIENCE = 60  # [s] that a library may take to load
@@ -47,23 +47,13 @@ NOTHING = {  # what it means if they say nothing
     "MPI": (BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI"),
     "GPU": (MISSING, "no CUDA device on this machine"),
 }
-IMPORTS = """
-import importlib, json
-reasons = {{}}
-for name in {names}:
-    try:
-        importlib.import_module(name)
-    except Exception as error:
-        reasons[name] = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
-print(json.dumps(reasons))
-"""
-BRINGS = {  # where an extra alone does not
+BRINGS = {  # of packages whose names alone do not say how to get them
     "petsc4py": "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'",
     "mpi4py": "apt install python3-mpi4py openmpi-bin, or pip install 'msmpetsc[run]'",
-    "h5py": "pip install h5py",
+    "cupy": "pip install 'msmpetsc[cuda]'",
 }
 NO_INSTALL = {"cuda", "peers"}  # extras for few machines: what lacks them lacks nothing
-NEEDED = {"PETSc", "MPI", "HDF5", "packages", "extra run"}  # by every run
+NEEDED = {"PETSc", "MPI", "HDF5", "extra run"}  # by every run
 
 Finding = tuple[str, str, str]  # what, its state, and in words
 
@@ -80,7 +70,7 @@ def run(_: argparse.Namespace) -> int:
 def findings() -> Iterator[Finding]:
     """Yield the findings of all probes, then those of the packages of each extra."""
     for name, code in PROBES.items():
-        has_ranks = name == "MPI" and installed("mpi4py")  # or mpiexec would say something else
+        has_ranks = name == "MPI" and find_spec("mpi4py")  # or mpiexec would say something else
         state, words = probed(code, *(("mpiexec", "-n", "2") if has_ranks else ()))
         if not words:
             state, words = NOTHING[name]
@@ -88,14 +78,6 @@ def findings() -> Iterator[Finding]:
     folder = Path(msmpetsc.__file__).parent
     yield "msmpetsc", OK, f"{msmpetsc.__version__} in {folder}, Python {platform.python_version()}"
     yield from packages()
-
-
-def installed(package: str) -> bool:
-    """Return whether Python finds a package, without importing it."""
-    try:
-        return find_spec(package) is not None
-    except (ImportError, ValueError):
-        return False
 
 
 def probed(code: str, *launcher: str) -> tuple[str, str]:
@@ -114,24 +96,20 @@ def probed(code: str, *launcher: str) -> tuple[str, str]:
         return OK, done.stdout.strip()
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     last = [f"ends with status {done.returncode}", *lines][-1][:160]
-    gone = re.search(r"^ModuleNotFoundError: No module named '(\w+)[\w.]*'$", done.stderr, re.M)
-    if gone and not installed(gone[1]):
-        remedy = BRINGS.get(gone[1], f"pip install 'msmpetsc[{extra_of(gone[1])}]'")
-        return MISSING, f"{gone[1]}: {remedy}"
+    if gone := re.search(r"^ModuleNotFoundError: No module named '(\w+)'$", done.stderr, re.M):
+        return MISSING, f"{gone[1]}: {BRINGS.get(gone[1], f'pip install {gone[1]}')}"
     return BROKEN, last
 
 
 def packages() -> Iterator[Finding]:
     """Yield whether the packages of each extra are installed and can be imported."""
-    found = sorted({name for names in EXTRAS.values() for name in names if installed(name)})
-    state, words = probed(IMPORTS.format(names=found))
-    if state != OK:
-        yield "packages", state, words
-        return
-    reasons = json.loads(words.splitlines()[-1])
+    all_names = sorted({name for names in EXTRAS.values() for name in names})
+    with ThreadPoolExecutor() as pool:
+        states = pool.map(probed, (f"import {name}" for name in all_names))
+    found = dict(zip(all_names, states, strict=True))
     for extra, names in EXTRAS.items():
-        gone = [name for name in names if name not in found]
-        if broken := [f"{name}: {reasons[name]}" for name in names if name in reasons]:
+        gone = [name for name in names if found[name][0] == MISSING]
+        if broken := [f"{name}: {found[name][1]}" for name in names if found[name][0] == BROKEN]:
             yield f"extra {extra}", BROKEN, "; ".join(broken)
         elif gone and not (extra in NO_INSTALL and len(gone) == len(names)):
             yield f"extra {extra}", MISSING, f"{', '.join(gone)}: pip install 'msmpetsc[{extra}]'"

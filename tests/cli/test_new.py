@@ -17,6 +17,7 @@ from surfaces import surface_of
 import msmpetsc
 from msmpetsc.cli.commands.new import SURER, measured, unit_of, uprightness
 from msmpetsc.cli.main import main
+from msmpetsc.geometry.surface import examine
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import load_scene
 
@@ -65,12 +66,11 @@ def test_the_unit_is_the_one_in_which_the_body_has_a_usual_size(side: float, uni
 
 
 def test_parts_are_measured_by_their_area_and_thickness_by_volume_and_area():
-    two = trimesh.util.concatenate(
-        [trimesh.creation.box([1, 1, 1]), trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0])]
-    )
-    assert measured(surface_of(two)).parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
+    boxes = [trimesh.creation.box([1, 1, 1]), trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0])]
+    two = surface_of(trimesh.util.concatenate(boxes))
+    assert measured(two, examine(two), "z").parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
     cube = surface_of(trimesh.creation.box([6, 6, 6]))
-    assert measured(cube).thickness == pytest.approx(2)  # 2 V / A: a third
+    assert measured(cube, examine(cube), "z").thickness == pytest.approx(2)  # 2 V / A: a third
 
 
 BODIES = {

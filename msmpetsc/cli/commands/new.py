@@ -25,7 +25,7 @@ from msmpetsc.geometry.prepare import part_labels
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import Surface, SurfaceReport, check_encloses, examine
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
-from msmpetsc.results.disk import whole_file, write_whole
+from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
@@ -68,7 +68,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         text = drafted(args.mesh, args.scene, args.up)
     scene_of(args.scene, text, to_read=False)  # so that nothing is written that run would refuse
-    write(args.scene, text)
+    write_whole(args.scene.with_name(SCHEMA_FILE), json.dumps(json_schema(), indent=1) + "\n")
+    write_whole(args.scene, text)
     print(f"{args.scene}\nto run it: msmpetsc run {args.scene} --picture")
     return 0
 
@@ -80,16 +81,17 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     """
     source = str(mesh) if str(mesh) in MODELS else path_from(scene, mesh)
     surface = load(source, scene.parent)
-    measures = measured(surface)
-    warnings = check_encloses(surface, measures.report)
-    log.info("%s: %s", mesh, measures.words)
-    for warning in warnings:
-        log.warning("%s: %s", mesh, warning)
+    report = examine(surface)
+    warnings = check_encloses(surface, report)
     if up is None:
         is_y = mesh.suffix.lower() in Y_BY_DEFINITION or uprightness(surface, 1) > uprightness(surface, 2) + SURER
         up = "y" if is_y else "z"
+    measures = measured(surface, report, up)
+    log.info("%s: %s", mesh, measures.words)
+    for warning in warnings:
+        log.warning("%s: %s", mesh, warning)
     log.info("%s is taken for upwards: --up says another axis", up)
-    return draft(source, scene.stem, measures, up)
+    return draft(source, scene.stem, measures)
 
 
 def path_from(scene: Path, mesh: Path) -> str:
@@ -103,13 +105,6 @@ def path_from(scene: Path, mesh: Path) -> str:
             "write the scene beside its mesh"
         )
     return str(mesh.resolve().relative_to(folder.resolve()))
-
-
-def write(path: Path, text: str) -> None:
-    """Write the scene, and beside it the schema that its first line names. Raises InputError."""
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-        write_whole(path.with_name(SCHEMA_FILE), json.dumps(json_schema(), indent=1) + "\n")
 
 
 def shipped_titles() -> dict[str, str]:
@@ -133,18 +128,22 @@ def shipped_text(name: str) -> str:
 
 @dataclass(frozen=True)
 class MeshMeasures:
-    """Measures of a mesh for its first scene, with lengths in the unit of the file."""
+    """Measures of a mesh for its first scene, in metres and with z upwards."""
 
+    up: str  # the upward axis of the file
+    unit: float | None  # of that [m]; None where neither metres nor millimetres give a usual body
     sides: Floats  # (3,) of the bounding box
+    thickness: float  # mean: twice the volume over the area
+    volume: float
     triangles: int
-    report: SurfaceReport
+    report: SurfaceReport  # in the unit of the file
     parts: Floats  # (p,) share of the area that each connected part has, the largest first
-    unit: float | None  # [m]; None where neither metres nor millimetres give a usual body
 
     @property
-    def thickness(self) -> float:
-        """Mean thickness, twice the volume over the area; in the file's unit."""
-        return 2 * abs(self.report.volume) / self.report.area
+    def beam_axis(self) -> int | None:
+        """The horizontal axis along which the body is a beam; None for any other."""
+        along = int(np.argmax(self.sides))
+        return along if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max() else None
 
     @property
     def words(self) -> str:
@@ -157,17 +156,22 @@ class MeshMeasures:
         return f"{self.triangles} triangles, {boundary}, {parts}"
 
 
-def measured(surface: Surface) -> MeshMeasures:
-    """Measure a surface as its file has it."""
+def measured(surface: Surface, report: SurfaceReport, up: str) -> MeshMeasures:
+    """Measure a surface of a file with the axis ``up`` upwards."""
     sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
+    unit = unit_of(float(sides.max()))
+    metres = unit or USUAL_SIZE / sides.max()
     faces = trimesh.Trimesh(surface.points, surface.triangles, process=False)
     areas = np.bincount(part_labels(surface), faces.area_faces)
     return MeshMeasures(
-        sides=sides,
+        up=up,
+        unit=unit,
+        sides=metres * (sides[[0, 2, 1]] if up == "y" else sides),
+        thickness=metres * (2 * abs(report.volume) / report.area),
+        volume=metres**3 * abs(report.volume),
         triangles=len(surface.triangles),
-        report=examine(surface),
+        report=report,
         parts=np.sort(areas / areas.sum())[::-1],
-        unit=unit_of(float(sides.max())),
     )
 
 
@@ -211,46 +215,28 @@ def stands(surface: Surface, axis: int, way: int) -> float:
 # ---- the scene
 
 
-@dataclass(frozen=True)
-class Dimensions:
-    """The dimensions of a body with z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
-
-    sides: Floats
-    thickness: float
-    volume: float
-
-    @property
-    def axis(self) -> int | None:
-        """The horizontal axis along which the body is a beam; None for any other."""
-        along = int(np.argmax(self.sides))
-        return along if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max() else None
-
-
-def draft(source: str, title: str, mesh: MeshMeasures, up: str) -> str:
-    """Return the text of a scene for a mesh with the axis ``up`` upwards, ``source`` as the scene will name it."""
-    unit = mesh.unit or USUAL_SIZE / mesh.sides.max()
-    sides = unit * (mesh.sides[[0, 2, 1]] if up == "y" else mesh.sides)
-    body = Dimensions(sides, unit * mesh.thickness, unit**3 * abs(mesh.report.volume))
+def draft(source: str, title: str, mesh: MeshMeasures) -> str:
+    """Return the text of a scene for a mesh, ``source`` as the scene will name it."""
     head = [
         f"#:schema {SCHEMA_FILE}",
         "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
         f"title = {json.dumps(title, ensure_ascii=False)}",
     ]
-    moved = _clamped(body, body.axis) if body.axis is not None else _falling(body)
-    return "\n".join([*head, "", *_mesh(source, mesh, body, up), "", *_cages(body), "", *moved]) + "\n"
+    moved = _falling(mesh) if mesh.beam_axis is None else _clamped(mesh, mesh.beam_axis)
+    return "\n".join([*head, "", *_mesh(source, mesh), "", *_cages(mesh), "", *moved]) + "\n"
 
 
-def _mesh(source: str, mesh: MeshMeasures, body: Dimensions, up: str) -> list[str]:
+def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
     """Return the table of the mesh, with comments on its defects."""
     report = mesh.report
     lines = ["[mesh]", line(f"source = {json.dumps(source, ensure_ascii=False)}", mesh.words)]
-    lines.append(f"# {up} is taken for upwards: msmpetsc new --up says another axis")
+    lines.append(f"# {mesh.up} is taken for upwards: msmpetsc new --up says another axis")
     steps = {}  # with the reason
     if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
         steps['"largest_part"'] = f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area"
     if report.inconsistent_edges or report.volume < 0:
         steps['"orient"'] = "faces are wound inwards, or against each other"
-    if up == "y":
+    if mesh.up == "y":
         steps[TURN] = "scenes have z upwards"
     if steps:
         lines += [f"# {reason}" for reason in steps.values()]
@@ -261,24 +247,24 @@ def _mesh(source: str, mesh: MeshMeasures, body: Dimensions, up: str) -> list[st
         lines.append('# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap')
     guess = {1.0: "as in the file, taken as metres", None: "unit of the file unknown: what is it?"}
     lines.append(
-        line(f"size = {plain(body.sides.max(), 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}")
+        line(f"size = {plain(mesh.sides.max(), 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}")
     )
-    if body.axis is None:
-        drop = plain(DROP * body.sides[2], 2)
+    if mesh.beam_axis is None:
+        drop = plain(DROP * mesh.sides[2], 2)
         lines.append(
             line(f"base = [0, 0, {drop}]", "middle of the bottom at the start [m]: it falls a fifth of its height")
         )
     return lines
 
 
-def _cages(body: Dimensions) -> list[str]:
+def _cages(body: MeshMeasures) -> list[str]:
     aim = body.volume * (ACROSS / body.thickness) ** 3
     count = int(float(plain(min(max(aim, CELLS[0]), CELLS[1]), 1)))
     across = body.thickness * (count / body.volume) ** (1 / 3)
     return ["[cages]", line(f"count = {count}", f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}")]
 
 
-def _falling(body: Dimensions) -> list[str]:
+def _falling(body: MeshMeasures) -> list[str]:
     """Return the tables of a body that falls on the ground."""
     height = float(body.sides[2])
     young = SINKING * DENSITY * G * height
@@ -296,7 +282,7 @@ def _falling(body: Dimensions) -> list[str]:
     return [*material, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
 
 
-def _clamped(body: Dimensions, axis: int) -> list[str]:
+def _clamped(body: MeshMeasures, axis: int) -> list[str]:
     """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
     length, thick = float(body.sides[axis]), float(body.sides[2])
     young = 1.5 * DENSITY * G * length**3 / (thick**2 * SAG)  # q l^4 / 8 E I = SAG l under its weight

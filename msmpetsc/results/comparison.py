@@ -1,15 +1,9 @@
 """Compare two results frame by frame, without MPI and without PETSc.
 
-Of one lattice all fields are. An error is the greatest difference at a frame over the scale of its field, which is
-the same for all frames:
-
-    position, surface                       the largest displacement from rest, at least 1e-6 of a body's longest side
-    kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
-                                            at least that of the stiffest spring strained by 1e-6
-    momentum                                sqrt(2 m K), m the whole mass, K the largest kinetic energy or that least
-
-each over both runs and all frames compared. What the digits of the coarser of the two stored types
-cannot tell apart is equal, and so are two NaN, or two infinities of one sign.
+Of one lattice all fields are. An error is the greatest difference at a frame over the scale of its
+field (msmpetsc/results/README.md), which is that of both runs and all frames compared. What the
+digits of the coarser of the two stored types cannot tell apart is equal, and so are two NaN, or two
+infinities of one sign.
 
 Of different lattices of one mesh their surfaces are, point by point: both carry the same points of the same mesh, so
 that nothing is projected or interpolated. A point counts by the area around it, a third of its triangles'.
@@ -229,12 +223,10 @@ def point_text(point: Floats) -> str:
 
 def common_times(a: Floats, b: Floats) -> Indices:
     """Return the indices (p, 2) of equal times in two ascending series [s], equal to rounding."""
-    if not len(a) or not len(b):
+    if not len(b):
         return np.empty((0, 2), int)
-    slack = SAME_TIME * min((np.diff(b).min() if len(b) > 1 else 1.0), 1.0)
-    right = np.searchsorted(b, a).clip(1, max(1, len(b) - 1))
-    near = np.where(np.abs(b[right - 1] - a) <= np.abs(b[right % len(b)] - a), right - 1, right)
-    near = near.clip(0, len(b) - 1)
+    slack = SAME_TIME * np.diff(b).min(initial=1.0)
+    near = np.searchsorted(b, a - slack).clip(max=len(b) - 1)
     same = np.abs(b[near] - a) <= slack
     return np.column_stack([np.nonzero(same)[0], near[same]])
 

@@ -8,7 +8,7 @@ import math
 import os
 import resource
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -96,31 +96,23 @@ class LazyArray:
         return values
 
 
-class Arrays(Mapping[str, LazyArray]):
+class Arrays(dict[str, LazyArray]):
     """The arrays of one group by their names: ``frames["time"]`` or ``frames.time``."""
 
     def __init__(self, group: str, arrays: dict[str, LazyArray]):
-        self._group, self._arrays = group, arrays
-
-    def __getitem__(self, name: str) -> LazyArray:
-        return self._arrays[name]
+        super().__init__(arrays)
+        self._group = group
 
     def __getattr__(self, name: str) -> LazyArray:
-        if name.startswith("_") or name not in self._arrays:
-            raise AttributeError(f"no {self._group}/{name} in this file, but {', '.join(self._arrays) or 'nothing'}")
-        return self._arrays[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._arrays)
-
-    def __len__(self) -> int:
-        return len(self._arrays)
+        if name not in self:
+            raise AttributeError(f"no {self._group}/{name} in this file, but {', '.join(self) or 'nothing'}")
+        return self[name]
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *self._arrays]
+        return [*super().__dir__(), *self]
 
     def __repr__(self) -> str:
-        return "\n".join([self._group, *map("  {!r}".format, self._arrays.values())])
+        return "\n".join([self._group, *map("  {!r}".format, self.values())])
 
 
 class Result:

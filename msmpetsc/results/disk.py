@@ -123,16 +123,12 @@ class Lock:
         os.close(self._file)
 
 
-def bytes_taken(path: Path) -> int:
-    """Return the disk space of a file [byte]; 0 if there is none."""
-    return path.stat().st_blocks * 512 if path.exists() else 0
-
-
 def refuse_small_disk(path: Path, planned: int) -> None:
-    """Raise InputError where `planned` bytes are not free on the disk."""
+    """Raise InputError where the disk has no room for `planned` bytes, less what the file takes."""
     free = shutil.disk_usage(path.parent).free
-    if planned > free:
-        raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
+    needed = planned - (path.stat().st_blocks * 512 if path.exists() else 0)
+    if needed > free:
+        raise InputError(f"{path} will need {needed / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
 
 
 @contextmanager

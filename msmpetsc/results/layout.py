@@ -12,7 +12,7 @@ That needs nothing of h5py, and as nothing is collective no rank waits for one t
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,25 +63,23 @@ class Layout:
     numbers : names of the checkpoint's numbers
     """
 
-    frames: int = 0
-    nodes: int = 0
-    also: dict[str, int] = field(default_factory=dict)
-    rows: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    numbers: tuple[str, ...] = ()
+    frames: int
+    nodes: int
+    also: dict[str, int]
+    rows: dict[str, tuple[int, ...]]
+    numbers: tuple[str, ...]
 
     def plans(self) -> Iterator[Plan]:
         """Yield the datasets in the order in which they are laid out."""
         counts = {"position": self.nodes, **self.also}
-        for last in (False, True):
-            for name, about in FRAME_FIELDS.items():
-                is_left_out = name not in counts and any(isinstance(size, str) for size in about.shape[1:])
-                if is_left_out or of_ranks(name) != last:
-                    continue
-                shape = tuple(size if isinstance(size, int) else counts[name] for size in about.shape[1:])
-                if last:
-                    yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
-                else:
-                    yield Plan(f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype)
+        for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: of_ranks(item[0])):
+            if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
+                continue
+            shape = tuple(size if isinstance(size, int) else counts[name] for size in about.shape[1:])
+            if of_ranks(name):
+                yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
+            else:
+                yield Plan(f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype)
         # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
         # file before noting its new length; killed in between, it could not be opened.)
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)

@@ -1,8 +1,5 @@
 """Writing of the result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
 
-Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank
-writes its own where it can reach the file (results.layout). The file is the same.
-
 All metadata is on disk before the first frame and does not change while frames are written (results.layout). A frame is
 its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
 (`finished`). Of the checkpoint's two slots the older is written, with its step at -1 meanwhile, so a whole checkpoint
@@ -33,7 +30,6 @@ from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.results.disk import (
     Lock,
     Storage,
-    bytes_taken,
     plain_errors,
     refuse_no_file,
     refuse_small_disk,
@@ -94,7 +90,6 @@ class ResultFile:
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
         self._lock: Lock | None = None  # held on rank 0 only
         self._copied: int | None = None  # most frames to take over, all if None
-        self._layout = Layout()
         self._rows: dict[str, list[int]] = {}  # fields that ranks have rows of: how many each has
         self._failed = False  # to write
         with self._together():
@@ -151,10 +146,10 @@ class ResultFile:
         if saved:
             rows |= {name: values.shape[1:] for name, values in saved.rows.items()}
         numbers = tuple(saved.numbers) if saved else ()
-        self._layout = Layout(count, sizes.pop("position"), sizes, rows, numbers)
+        layout = Layout(count, sizes.pop("position"), sizes, rows, numbers)
         with self._together():
             if self._file is not None:
-                self._lay_out(self._file)
+                self._lay_out(self._file, layout)
         self.finished, self._planned = self._comm.bcast(self.finished), count
         if self._begin is Begin.COPY and saved is not None:
             self.write_checkpoint(saved)
@@ -247,16 +242,15 @@ class ResultFile:
         if self.path.exists() and self._begin is Begin.NEW:
             raise InputError(f"{self.path} exists: --overwrite replaces it")
 
-    def _lay_out(self, file: h5py.File) -> None:
+    def _lay_out(self, file: h5py.File, layout: Layout) -> None:
         if self._begin is Begin.IN_PLACE:
-            if name := self._layout.first_misfit(file):
+            if name := layout.first_misfit(file):
                 raise InputError(f"{self.path} has no room for {name} as it is now: --force writes the file anew")
-            # what has no room on the disk yet
-            refuse_small_disk(self.path, self.path.stat().st_size - bytes_taken(self.path))
+            refuse_small_disk(self.path, self.path.stat().st_size)
             self.finished = finished(file)
             return
-        refuse_small_disk(self.path, self._layout.nbytes - bytes_taken(self.path))
-        self._layout.create(file)
+        refuse_small_disk(self.path, layout.nbytes)
+        layout.create(file)
         if self._begin is Begin.COPY:
             self._copy_frames(file)
 

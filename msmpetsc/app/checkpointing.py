@@ -30,8 +30,8 @@ class Checkpoints:
     signal : the one that ended the run before its last step; 0 for none
     """
 
-    def __init__(self, file: ResultFile, simulation: "TimeLoop", every: int | None, signals: "Signals"):
-        self.file, self.simulation, self.every, self.signals = file, simulation, every, signals
+    def __init__(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop", every: int | None):
+        self.comm, self.file, self.simulation, self.every = comm, file, simulation, every
         self.signal = 0
         self._written = -1  # step of the last checkpoint
         self._frames = 0
@@ -55,9 +55,9 @@ class Checkpoints:
         due = perf_counter() - self._ended >= self._seconds
         if self.every is not None:
             due = self._frames >= self.every
-        due = (due and self.signals.comm.rank == 0) or simulation.step in (0, simulation.steps)
-        due, number = self.signals.agree(due)
-        if due:
+        due = self.comm.bcast(due) or simulation.step in (0, simulation.steps)
+        number = Stop.agreed(self.comm)
+        if due or number:
             began = perf_counter()
             saved = simulation.saved()
             if saved.step != self._written:
@@ -96,12 +96,6 @@ class Signals:
     def begin(self) -> None:
         """Mark that steps are taken from now on: before, a SIGINT has nothing to keep."""
         self._stepping = True
-
-    def agree(self, due: bool) -> tuple[bool, int]:
-        """Return whether a checkpoint is due, and the greatest signal of any rank, or 0 (collective)."""
-        own = 2 * Stop.signal + due
-        greatest = self.comm.allreduce(own, MPI.MAX) if self.comm.size > 1 else own
-        return bool(greatest), greatest // 2
 
     def _note(self, number: int, _: FrameType | None) -> None:
         if number == signal.SIGINT and not self._stepping:

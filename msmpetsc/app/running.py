@@ -98,7 +98,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
                 numbers = count(start_output(comm, plan, file, model, simulation))
-                checkpoints = Checkpoints(file, simulation, plan.request.checkpoint_every, signals)
+                checkpoints = Checkpoints(comm, file, simulation, plan.request.checkpoint_every)
                 is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:

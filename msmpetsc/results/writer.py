@@ -11,7 +11,7 @@ then either. Else it writes a new one, takes the frames over, and renames it whe
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ class ResultFile:
         self._storage: Storage | None = None  # that it is written to
         self._numbers: dict[str, h5py.Dataset] = {}  # datasets of one number a frame, once it has frames
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
-        self._lock: Lock | None = None  # held on rank 0 only
+        self._opened = ExitStack()  # on rank 0 the lock, the temporary name and the storage, until they are given up
         self._copied: int | None = None  # most frames to take over, all if None
         self._rows: dict[str, list[int]] = {}  # fields that ranks have rows of: how many each has
         self._failed = False  # to write
@@ -215,8 +215,9 @@ class ResultFile:
         if self._begin is not Begin.IN_PLACE:
             self._refuse_to_replace()
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        lock = Lock(self.path)
-        try:
+        with ExitStack() as opened:
+            opened.callback(Lock(self.path).free)
+            opened.callback(self._part.unlink, missing_ok=True)
             if self._begin is Begin.IN_PLACE:
                 open_result(self.path).close()
                 self._storage = Storage(self.path, "r+")
@@ -225,11 +226,8 @@ class ResultFile:
                 self._storage = Storage(self._part, "w+")
                 self._file = open_to_write(self._storage, "w")
                 self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
-        except Exception:
-            self._part.unlink(missing_ok=True)
-            lock.free()
-            raise
-        self._lock = lock
+            opened.callback(self._storage.close)
+            self._opened = opened.pop_all()
 
     def _flush(self, file: h5py.File) -> None:
         """Flush the file. Raises OSError for an earlier write error."""
@@ -276,17 +274,10 @@ class ResultFile:
         file, self._file, self._numbers = self._file, None, {}
         if file is None:
             return
-        self._part.unlink(missing_ok=True)  # still there only if no frames were started
-        try:
-            with file:
-                if trim and self.finished < self._planned:
-                    for dataset in file["frames"].values():
-                        dataset.resize(self.finished, axis=0)
-        finally:
-            if self._storage is not None:
-                self._storage.close()
-            if self._lock is not None:
-                self._lock.free()
+        with self._opened, file:
+            if trim and self.finished < self._planned:
+                for dataset in file["frames"].values():
+                    dataset.resize(self.finished, axis=0)
 
     # What the ranks do together
 

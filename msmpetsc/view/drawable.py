@@ -90,8 +90,7 @@ class Drawable:
     triangles : (f, 3) of the surface points
     times     : (T,) of its frames [s]
     nodes     : number of a frame -> node positions (n, 3) [m]
-    surface   : number of a frame -> surface points (v, 3) [m]
-    embedding : W (v, n)
+    embedding : W (v, n): surface points = W @ node positions
     array     : name of a dataset of a result, "lattice/springs" -> its numbers
     solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
     von_mises : number of a frame -> stress at the nodes (n,) [Pa]; None where none was stored
@@ -104,7 +103,6 @@ class Drawable:
     triangles: Indices
     times: Floats
     nodes: Callable[[int], Positions]
-    surface: Callable[[int], Positions]
     embedding: csr_array
     array: Callable[[str], Array]
     solids: Mapping[int, Surface]
@@ -114,6 +112,10 @@ class Drawable:
     def title(self) -> str:
         """Title of the scene, or the file's name."""
         return self.scene.title or Path(self.name).stem
+
+    def surface(self, index: int) -> Positions:
+        """Return the surface points (v, 3) [m] at a frame."""
+        return np.asarray(self.embedding @ self.nodes(index))
 
     def fixed(self, index: int) -> Floats:
         """Return the pinned or led share (v,) in [0, 1] of each surface point at a frame."""
@@ -125,8 +127,6 @@ class Drawable:
 
     def on_surface(self, numbers: Floats, most: float = np.inf) -> Floats:
         """Return numbers (n,) of nodes interpolated to the surface points, (v,) in [0, most]."""
-        if not numbers.any():
-            return np.zeros(len(self.rest.points))
         return np.asarray(np.clip(self.embedding @ numbers, 0, most))
 
 
@@ -151,7 +151,6 @@ def drawable_of_result(run: Result) -> Drawable:
         triangles=run.indices("surface/triangles"),
         times=run.frames.time[:],
         nodes=lambda index: run.frames.position[index],
-        surface=lambda index: run.surface_at(index).astype(float),
         embedding=run.embedding,
         array=lambda name: run.indices(name) if name == "lattice/springs" else run[name][:],
         solids=solids_of(run),
@@ -179,7 +178,6 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
         triangles=surface.triangles,
         times=np.zeros(1),
         nodes=lambda _: start,
-        surface=lambda _: embedding @ start,
         embedding=embedding,
         array=arrays.__getitem__,
         solids=model.solids,

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
-from scipy.sparse import csr_array, eye_array, vstack
-from trimesh.triangles import points_to_barycentric
+from scipy.sparse import csr_array, vstack
 
 from msmpetsc.backend.arrays import Array, Indices, Positions
+from msmpetsc.geometry.surface import first_of_equal
 from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
@@ -30,23 +30,21 @@ def drawn(subject: Drawable) -> Drawable:
 
 def _refined(subject: Drawable) -> Drawable:
     """Return bodies with no edge of the surface longer than a cell; cells carry the new points."""
-    rest, W = subject.rest, subject.embedding
+    rest = subject.rest
     cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
     if cell == 0:
         return subject
     a, b, c = rest.points[subject.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-    points, triangles, carry = subdivided(rest.points, subject.triangles, max(cell, float(np.sqrt(2 * area / MOST))))
-    if len(points) == len(rest.points):
-        return subject
-    body = rest.body_of_point[carry.indices[carry.indptr[:-1]]]
+    points, triangles, part_of = subdivided(rest.points, subject.triangles, max(cell, np.sqrt(2 * area / MOST)))
+    body = np.append(rest.body_of_point, np.empty(len(points) - len(rest.points), int))
+    body[triangles] = body[subject.triangles[part_of, :1]]
     T = trilinear(rest, points[len(rest.points) :], body[len(rest.points) :])
     return replace(
         subject,
         rest=replace(rest, points=points, body_of_point=body),
         triangles=triangles,
-        surface=lambda index: np.concatenate([subject.surface(index), T @ subject.nodes(index)]),
-        embedding=csr_array(vstack([W, T])),
+        embedding=csr_array(vstack([subject.embedding, T])),
     )
 
 
@@ -56,25 +54,16 @@ def surface_of(points: Array, triangles: Array) -> pv.PolyData:
     return surface
 
 
-def subdivided(points: Positions, triangles: Indices, longest: float) -> tuple[Positions, Indices, csr_array]:
+def subdivided(points: Positions, triangles: Indices, longest: float) -> tuple[Positions, Indices, Indices]:
     """Return a surface whose edges longer than `longest` [m] are divided.
 
-    It is points (p, 3), the first of which are those given, triangles (f, 3), and the matrix (p, v)
-    that carries numbers at the given points to these.
+    It is points (p, 3), the first of which are those given, triangles (f, 3), and of each the number
+    of the given triangle (f,) that it is part of.
     """
     surface = surface_of(points, triangles)
-    surface.cell_data["triangle"] = np.arange(len(triangles))
+    surface.cell_data["part of"] = np.arange(len(triangles))
     fine = surface.subdivide_adaptive(max_edge_len=longest)
-    around = np.zeros(fine.n_points, int)
-    largest_last = np.argsort(fine.compute_cell_sizes()["Area"])
-    around[fine.regular_faces[largest_last]] = fine.cell_data["triangle"][largest_last, None]
-    corners = triangles[around[len(points) :]]
-    with np.errstate(all="ignore"):  # a triangle without an area has no such weights
-        weights = points_to_barycentric(points[corners], fine.points[len(points) :])  # type: ignore[no-untyped-call]
-    weights[~np.isfinite(weights).all(axis=1)] = 1 / 3
-    shape = (len(corners), len(points))
-    new = csr_array((weights.ravel(), corners.ravel(), 3 * np.arange(len(corners) + 1)), shape)
-    return fine.points, fine.regular_faces, csr_array(vstack([eye_array(len(points)), new]))
+    return fine.points, fine.regular_faces, fine.cell_data["part of"]
 
 
 def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array:
@@ -89,19 +78,11 @@ def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array
 
 def _split(subject: Drawable) -> Drawable:
     """Return bodies with a copy of each surface point for every smooth part of the surface around it."""
-    rest, W = subject.rest, subject.embedding
-    _, first, equal = np.unique(
-        np.column_stack([rest.body_of_point, rest.points]), axis=0, return_index=True, return_inverse=True
-    )
-    origin, triangles = split_at_edges(rest.points, first[equal.ravel()][subject.triangles])
+    rest = subject.rest
+    first = first_of_equal(np.column_stack([rest.body_of_point, rest.points]))
+    origin, triangles = split_at_edges(rest.points, first[subject.triangles])
     rest = replace(rest, points=rest.points[origin], body_of_point=rest.body_of_point[origin])
-    return replace(
-        subject,
-        rest=rest,
-        triangles=triangles,
-        surface=lambda index: subject.surface(index)[origin],
-        embedding=W[origin],
-    )
+    return replace(subject, rest=rest, triangles=triangles, embedding=subject.embedding[origin])
 
 
 def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indices]:

@@ -21,7 +21,6 @@ def drawable_of(points: np.ndarray, triangles: np.ndarray) -> Drawable:
         triangles=triangles,
         times=np.zeros(1),
         nodes=lambda _: points,
-        surface=lambda _: points,
         embedding=csr_array(eye_array(len(points))),
         array={}.__getitem__,
         solids={},

@@ -37,7 +37,6 @@ def block() -> Drawable:
         rest=BodiesAtRest(nodes, cells, points, np.zeros(len(nodes), int), zeros),
         times=np.arange(2.0),
         nodes=lambda index: bent(nodes) if index else nodes,
-        surface=lambda index: bent(points) if index else points,
         embedding=W,
     )
 
@@ -55,10 +54,11 @@ def test_a_block_of_twelve_triangles_is_drawn_as_its_cells_bend():
 
 def test_long_edges_are_divided_without_holes():
     box = trimesh.creation.box([1, 0.3, 0.1])
-    points, triangles, _ = subdivided(np.array(box.vertices), np.array(box.faces), 0.07)
+    points, triangles, part_of = subdivided(np.array(box.vertices), np.array(box.faces), 0.07)
     mesh = trimesh.Trimesh(points, triangles, process=False)
     assert mesh.is_watertight and mesh.volume == pytest.approx(0.03)
     assert mesh.edges_unique_length.max() <= 0.07 and (points[:8] == box.vertices).all()
+    assert mesh.face_normals == pytest.approx(box.face_normals[part_of])
 
 
 def test_normals_are_split_at_sharp_edges_alone():
@@ -95,8 +95,11 @@ def test_pins_are_coloured_by_face():
     points = np.array([(a, b, 0) for a in x for b in (0, 1)])
     triangles = np.array([t for k in range(0, 10, 2) for t in ((k, k + 2, k + 1), (k + 1, k + 2, k + 3))])
     share = np.where(points[:, 0] < 1.5, 1.0, 0.3)
+    subject = drawable_of(points, triangles)
+    rest = replace(subject.rest, nodes=np.tile(points, (2, 1)), body_of_node=np.zeros(24, int))
     subject = replace(
-        drawable_of(points, triangles), pinned=np.ones(12, bool), embedding=csr_array(np.diag(share)),
+        subject, rest=rest, pinned=np.repeat([True, False], 12), nodes=lambda _: rest.nodes,
+        embedding=csr_array(np.hstack([np.diag(share), np.diag(1 - share)])),
     )  # fmt: skip
     composition = composition_of(subject, [0], Style(eye=(0, 0, 1)))
     stills = composition.stills([0])

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from msmpetsc.backend.arrays import Array
-from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, on_scale
+from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SCALE_TABLE
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
 
@@ -32,7 +32,8 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
     return np.array(picture)
 
 
-LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
+LINE, GAP, LETTERS = 34, 36, 15  # [px]: a line's height, between entries, of type
+WIDTHS = {"bar": 150, "swatch": 22, "glass": 22, "arrow": 30}  # [px]: of what stands in front of a text
 FINE = 3  # a legend is drawn so many times larger, and shrunk
 
 
@@ -41,14 +42,12 @@ class Entry:
     """A legend entry: a bar of colours, a swatch, or an arrow in front of a text.
 
     kind  : "bar", "swatch", "glass" or "arrow"
-    width : of what stands in front of the text [px]
     low, high : numbers at the ends of a bar
     """
 
     kind: str
     text: str
     colour: str = INK
-    width: float = SWATCH
     low: str = ""
     high: str = ""
 
@@ -57,19 +56,19 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     """Return the legend's entries for some stills."""
     scene, colouring = composition.subject.scene, composition.colouring
     entries: list[Entry] = []
-    if colouring is not None and colouring.classes:
+    if colouring.classes:
         pairs = enumerate(colouring.classes)
         entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
-    elif colouring is not None:
+    else:
         low, title, high = colouring.ends
-        entries.append(Entry("bar", title, width=BAR, low=low, high=high))
+        entries.append(Entry("bar", title, low=low, high=high))
     kinds = {kind for still in stills if still.cut for kind in still.cut}
     entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
     if any(composition.subject.fixed(still.index).any() for still in (stills[0], stills[-1])):
         held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
     if any(still.overlays.arrows for still in stills):
-        entries.append(Entry("arrow", "force", ARROW, 30))
+        entries.append(Entry("arrow", "force", ARROW))
     if entries and any(len(still.overlays.obstacles) for still in stills):
         entries.append(Entry("glass", "obstacle", GLASS))
     return entries
@@ -80,42 +79,39 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
     letters : their size, 1 in a sheet
     """
-    room = round(width / letters)
-    font = typeface(FINE * LETTERS)
-    lines: list[list[Entry]] = []
-    for entry in entries:
-        if not lines or _length([*lines[-1], entry], font) > room - GAP:
+    room = FINE * round(width / letters)
+    lines: list[list[Image.Image]] = []
+    for entry in map(_entry_picture, entries):
+        if not lines or sum(each.width for each in (*lines[-1], entry)) > room:
             lines.append([])
         lines[-1].append(entry)
     if not lines:
         return np.empty((0, width, 3), np.uint8)
-    picture = Image.new("RGB", (FINE * room, FINE * LINE * len(lines)), "white")
+    picture = Image.new("RGB", (room, FINE * LINE * len(lines)), "white")
     for number, line in enumerate(lines):
-        left = (room - _length(line, font)) / 2
+        left = (room - sum(each.width for each in line)) // 2
         for entry in line:
-            _draw(ImageDraw.Draw(picture), entry, FINE * left, FINE * LINE * (number + 0.5), font)
-            left += _length([entry], font) + GAP
+            picture.paste(entry, (left, FINE * LINE * number))
+            left += entry.width
     return np.array(picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS))
 
 
-def _length(entries: Sequence[Entry], font: ImageFont.FreeTypeFont) -> float:
-    """Return the width of legend entries side by side [px]."""
-    texts = [text for entry in entries for text in (entry.text, entry.low, entry.high) if text]
-    marks = sum(entry.width for entry in entries) + GAP * (len(entries) - 1)
-    return marks + sum(font.getlength(text) / FINE + 8 for text in texts)
-
-
-def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, font: ImageFont.FreeTypeFont) -> None:
-    """Draw a legend entry from `left` on, vertically centred at `middle`, in fine pixels."""
+def _entry_picture(entry: Entry) -> Image.Image:
+    """Return the picture of a legend entry in fine pixels, with half a gap on either side."""
+    font, middle, left = typeface(FINE * LETTERS), FINE * LINE / 2, FINE * GAP / 2
     gap = half = 8 * FINE
+    width = FINE * WIDTHS[entry.kind]
+    texts = sum(font.getlength(text) + gap for text in (entry.low, entry.high, entry.text) if text)
+    picture = Image.new("RGB", (round(2 * left + width + texts), FINE * LINE), "white")
+    draw = ImageDraw.Draw(picture)
     if entry.low:
         draw.text((left, middle), entry.low, INK, font, anchor="lm")
         left += font.getlength(entry.low) + gap
-    right = left + FINE * entry.width
+    right = left + width
     box = (left, middle - half, right, middle + half)
     if entry.kind == "bar":
         for pixel in range(round(left), round(right)):
-            colour = tuple(on_scale(np.array([(pixel - left) / (right - left)]))[0].astype(int))
+            colour = tuple(SCALE_TABLE[int(255 * (pixel - left) / width)].tolist())
             draw.line((pixel, middle - half, pixel, middle + half), colour)
     elif entry.kind == "swatch":
         draw.rectangle(box, entry.colour)
@@ -130,3 +126,4 @@ def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, f
         right += gap
         draw.text((right, middle), text, INK, font, anchor="lm")
         right += font.getlength(text)
+    return picture

@@ -4,19 +4,20 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
 
-from msmpetsc.backend.arrays import Array, Floats, Rows
+from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.view.drawable import Drawable
 
-BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
+FIXED, ARROW, INK = "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"
 GLASS, GLASS_EDGE = "#a3b6c4", "#667e90"
 BOUNDARY_CELL, INTERIOR_CELL = "#c8372d", "#2f5fb3"  # Figure 2 of the paper: red and blue
 # ColorBrewer's YlGnBu without its palest: the least is light, for dark is what is pinned
 SCALE = ("#edf8b1", "#c7e9b4", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
 CLASSES = (
-    BODY,
+    "#8fabc6",
     "#e0a13a",
     "#5aa469",
     "#b56aa8",
@@ -26,24 +27,11 @@ CLASSES = (
     "#4fa3a5",
     "#d98cb3",
     "#7d6b5d",
-)  # a body's parts, over and over
-
-
-def rgb(colour: str) -> Floats:
-    """Return red, green and blue (3,) of "#8fabc6", 0 to 255."""
-    return np.array([int(colour[digit : digit + 2], 16) for digit in (1, 3, 5)], float)
-
-
-def on_scale(shares: Floats) -> Rows:
-    """Return the colours (n, 3), 0 to 255, of shares (n,) of the scale; shares beyond an end get its colour."""
-    stops = np.array([rgb(colour) for colour in SCALE])
-    at = np.linspace(0, 1, len(stops))
-    return np.stack([np.interp(np.nan_to_num(shares), at, channel) for channel in stops.T], axis=1)
-
-
-def of_classes(numbers: Array) -> Rows:
-    """Return the colours (n, 3), 0 to 255, of class numbers (n,)."""
-    return np.take([rgb(colour) for colour in CLASSES], numbers.astype(int) % len(CLASSES), axis=0)
+)  # of bodies and of a body's parts
+# red, green and blue (256, 3), 0 to 255: along the scale, and of classes over and over
+ALONG_SCALE = LinearSegmentedColormap.from_list("", SCALE)(np.arange(256))[:, :3]
+SCALE_TABLE: Array = np.rint(255 * ALONG_SCALE).astype(np.uint8)
+CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256, 3))).astype(np.uint8)
 
 
 # Fields on the surface
@@ -69,13 +57,15 @@ class Colouring:
     high: float = 1.0
     classes: tuple[str, ...] = ()
 
-    def shares(self, index: int) -> Floats:
-        """Return the values (v,) of a frame as shares of the scale's end."""
-        return self.values(index) / (self.high or 1.0)
+    @property
+    def table(self) -> Array:
+        """Red, green and blue (256, 3) of the colours by their numbers, 0 to 255."""
+        return CLASS_TABLE if self.classes else SCALE_TABLE
 
-    def rgb(self, index: int) -> Rows:
-        """Return the colours (v, 3) of a frame, 0 to 255."""
-        return of_classes(self.values(index)) if self.classes else on_scale(self.shares(index))
+    def numbers(self, index: int) -> Array:
+        """Return the numbers (v,) of a frame's colours; beyond an end of the scale it is that end's."""
+        step = 1.0 if self.classes else (self.high or 1.0) / 255
+        return np.clip(np.rint(np.nan_to_num(self.values(index) / step)), 0, 255).astype(np.uint8)
 
     @property
     def ends(self) -> tuple[str, str, str]:
@@ -86,8 +76,11 @@ class Colouring:
         return "0", f"{self.title} [{PREFIXES[size]}{self.unit}]", f"{self.high / size:.3g}"
 
 
-def colouring_of(subject: Drawable, name: str) -> Colouring:
-    """Return a field by name. Raises InputError."""
+def colouring_of(subject: Drawable, name: str | None) -> Colouring:
+    """Return a field by name; that of the bodies' numbers for None. Raises InputError."""
+    if name is None:
+        number = subject.rest.body_of_point.astype(float)
+        return Colouring("body", "", lambda _: number, classes=("",) * len(CLASSES))
     if name not in COLOURINGS:
         near = did_you_mean(name, COLOURINGS)
         raise InputError(f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}")
@@ -148,12 +141,6 @@ def _part(subject: Drawable) -> Colouring:
         number[rest.find_cells(part)] = index + 1
     of_points = number[rest.cells_around(rest.points, rest.body_of_point)]
     return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts)))
-
-
-def plain_colouring(subject: Drawable) -> Colouring | None:
-    """Return a colour for each body, or None for a single body."""
-    number = (subject.rest.body_of_point % len(CLASSES)).astype(float)
-    return Colouring("body", "", lambda _: number, 1.0, ("",) * len(CLASSES)) if number.any() else None
 
 
 COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {

@@ -9,7 +9,7 @@ from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.errors import InputError
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.view.camera import Camera, camera_facing
-from msmpetsc.view.colours import Colouring, colouring_of, plain_colouring, scaled
+from msmpetsc.view.colours import Colouring, colouring_of, scaled
 from msmpetsc.view.drawable import FARTHEST, Drawable
 from msmpetsc.view.mesh import Cut, cut_open
 from msmpetsc.view.overlays import MARGIN, Overlays, overlays_at
@@ -49,14 +49,14 @@ class Composition:
 
     extremes  : (e, 3) points that reach farthest in some direction at some frame [m]
     camera    : of all stills
-    colouring : with its scale; None for a plain body
+    colouring : with its scale
     """
 
     subject: Drawable
     style: Style
     extremes: Positions
     camera: Camera
-    colouring: Colouring | None
+    colouring: Colouring
 
     @property
     def box(self) -> Positions:
@@ -97,7 +97,7 @@ class Composition:
 
 def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Composition:
     """Return the composition of frames, which are read one at a time. Raises InputError."""
-    colouring = colouring_of(subject, style.colour) if style.colour else plain_colouring(subject)
+    colouring = colouring_of(subject, style.colour)
     number = np.arange(DIRECTIONS) + 0.5  # spread over the sphere, those of the axes first (Fibonacci's spiral)
     height, angle = 1 - 2 * number / DIRECTIONS, np.pi * (1 + 5**0.5) * number
     flat = np.sqrt(1 - height**2)
@@ -113,9 +113,7 @@ def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Co
     everywhere = np.concatenate(extremes)
     if np.ptp(everywhere, axis=0).max() == 0:
         raise InputError(f"{subject.name}: the surface at these frames has no extent")
-    if colouring is not None and style.colour:
-        colouring = scaled(colouring, distinct)
     gravity = subject.scene.gravity
     pull = gravity.acceleration if gravity else None
     camera = camera_facing(everywhere, pull, style.eye or subject.scene.picture.eye)
-    return Composition(subject, style, everywhere, camera, colouring)
+    return Composition(subject, style, everywhere, camera, scaled(colouring, distinct))

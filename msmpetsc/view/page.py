@@ -17,14 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Indices, Positions
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions
 from msmpetsc.comm import log
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.progress_bar import counted
-from msmpetsc.view import colours
 from msmpetsc.view.annotations import entries_of
-from msmpetsc.view.colours import Colouring
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.film import usual_speed
@@ -65,13 +63,11 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
     """Return positions, colours and triangles as deflated bytes for the script."""
     subject = composition.subject
     bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
-    streams = {
+    return {
         "positions": deflated(residuals(quantised(subject.surface, frames, composition.box))),
+        "colours": deflated(changes(map(composition.colouring.numbers, frames))),
         "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
     }
-    if composition.colouring is not None:
-        streams["colours"] = deflated(changes(levels(composition.colouring, frames)))
-    return streams
 
 
 def quantised(points: Callable[[int], Positions], frames: Iterable[int], box: Positions) -> Iterator[Indices]:
@@ -95,13 +91,6 @@ def residuals(frames: Iterable[Indices]) -> Iterator[bytes]:
         p, q = frame, p
 
 
-def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[Array]:
-    """Yield the colours (v,) of each frame as whole numbers of 8 bits: shares of the scale, or classes."""
-    for index in frames:
-        shown = colouring.values(index) if colouring.classes else 255 * colouring.shares(index)
-        yield np.clip(np.round(np.nan_to_num(shown)), 0, 255).astype(np.uint8)
-
-
 def changes(frames: Iterable[Array]) -> Iterator[bytes]:
     """Yield the differences (v,) of 8 bits between each frame and the one before it."""
     before = None
@@ -117,47 +106,35 @@ def deflated(parts: Iterable[bytes]) -> bytes:
 
 
 def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, Any]:
-    """Return the script's data but the streams, in types of JSON."""
+    """Return the script's data but the streams."""
     subject, frames = composition.subject, [still.index for still in stills]
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
-        "box": composition.box.tolist(),
-        "times": subject.times[frames].tolist(),
-        "frames": frames,
+        "box": composition.box,
+        "times": subject.times[frames],
         "speed": usual_speed(float(np.ptp(subject.times[[frames[0], frames[-1]]]))),
-        "camera": plain(composition.camera),
-        "scale": scale_colours(composition.colouring),
+        "camera": asdict(composition.camera),
+        "scale": composition.colouring.table,
         "legend": [vars(entry) for entry in entries_of(composition, stills)],
         "overlays": distinct([still.overlays for still in stills]),
         "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
     }
 
 
-def plain(facts: Any) -> Any:
-    """Return a dataclass in types of JSON."""
-    return json.loads(json.dumps(asdict(facts), default=np.ndarray.tolist))
-
-
-def scale_colours(colouring: Colouring | None) -> list[list[int]]:
-    """Return the 256 colours that numbers of 8 bits stand for."""
-    numbers = np.arange(256)
-    if colouring is None:
-        table = np.tile(colours.rgb(colours.BODY), (256, 1))
-    else:
-        table = colours.of_classes(numbers) if colouring.classes else colours.on_scale(numbers / 255)
-    rounded: list[list[int]] = np.round(table).astype(int).tolist()
-    return rounded
+def json_text(facts: Any) -> str:
+    """Return facts, arrays among them, as JSON."""
+    return json.dumps(facts, separators=(",", ":"), default=np.ndarray.tolist)
 
 
 def distinct(overlays: Sequence[Overlays]) -> dict[str, list[Any]]:
     """Return each distinct state of obstacles and arrows once, and the state's number of each frame."""
     states: dict[str, int] = {}
-    numbers = [states.setdefault(json.dumps(plain(shown)), len(states)) for shown in overlays]
+    numbers = [states.setdefault(json_text(asdict(shown)), len(states)) for shown in overlays]
     return {"states": [json.loads(state) for state in states], "numbers": numbers}
 
 
-def solid_facts(surface: Surface) -> dict[str, list[float]]:
+def solid_facts(surface: Surface) -> dict[str, Floats]:
     """Return an obstacle's surface for the script: corners of each triangle, with a normal at each."""
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -165,8 +142,8 @@ def solid_facts(surface: Surface) -> dict[str, list[float]]:
     normals /= np.maximum(np.linalg.norm(normals, axis=1), tiny)[:, None]
     digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=tiny))))
     return {
-        "corners": np.round(corners, digits).ravel().tolist(),
-        "normals": np.round(np.repeat(normals, 3, axis=0), 3).ravel().tolist(),
+        "corners": np.round(corners, digits).ravel(),
+        "normals": np.round(np.repeat(normals, 3, axis=0), 3).ravel(),
     }
 
 
@@ -177,7 +154,7 @@ def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> s
         "title": html.escape(title),
         "css": (PARTS / "page.css").read_text(encoding="utf-8"),
         "script": "\n".join((PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS),
-        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # which could end the script
+        "data": json_text(data).replace("<", "\\u003c"),  # which could end the script
     }
     text = (PARTS / "page.html").read_text(encoding="utf-8")
     for name, part in parts.items():

@@ -79,7 +79,6 @@ function start() {
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, texels);
   for (const what of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, what, gl.NEAREST);
   filled("triangles", triangles, gl.ELEMENT_ARRAY_BUFFER);
-  filled("numbers", new Uint8Array(points));
 }
 
 function normals(at) { // of the points, from the triangles around each, weighed by their areas
@@ -105,7 +104,7 @@ function loadFrame() {
   filled("positions", at);
   filled("normals", normals(at));
   filled("fixing", fixing.subarray(points * data.fixed[counted], points * (data.fixed[counted] + 1)));
-  if (numbers) filled("numbers", numbers.subarray(points * counted, points * (counted + 1)));
+  filled("numbers", numbers.subarray(points * counted, points * (counted + 1)));
 }
 
 function axesOfEye() {

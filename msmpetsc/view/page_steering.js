@@ -176,7 +176,7 @@ async function begin() {
   triangles = new (points > 65535 ? Uint32Array : Uint16Array)(packed);
   fixing = await inflated("fixed");
   all = predicted(await inflated("positions"));
-  numbers = data.streams.colours ? summed(await inflated("colours")) : null;
+  numbers = summed(await inflated("colours"));
   extent = firstExtent();
   start();
   makeLegend();

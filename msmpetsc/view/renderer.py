@@ -9,9 +9,9 @@ import numpy as np
 import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
-from msmpetsc.backend.arrays import Array, Floats, Mask
+from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError
-from msmpetsc.view.colours import ARROW, BODY, FIXED, GLASS, GLASS_EDGE, GROUND, SHADOW, rgb
+from msmpetsc.view.colours import ARROW, FIXED, GLASS, GLASS_EDGE, GROUND, SHADOW
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, surface_of
 from msmpetsc.view.overlays import Ground, Overlays
@@ -75,18 +75,16 @@ class Renderer:
     def _draw(self, still: Still) -> None:
         subject, colouring = self._composition.subject, self._composition.colouring
         surface = surface_of(subject.surface(still.index), subject.triangles)
+        surface["colours"] = colouring.table[colouring.numbers(still.index)]
         for ground in still.overlays.grounds:
             _draw_ground(self._plotter, ground, surface)
         shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
         shading["opacity"] = THROUGH if still.cut else 1.0
         fixed = (subject.fixed(still.index) > HELD)[subject.triangles].all(axis=1)
         if fixed.any():
-            self._plotter.add_mesh(_faces(surface, fixed), color=FIXED, **shading)
-        if colouring is not None:
-            surface["colours"] = colouring.rgb(still.index).astype(np.uint8)
-            shading |= dict(scalars="colours", rgb=True)
+            self._plotter.add_mesh(surface.extract_cells(fixed), color=FIXED, **shading)
         if not fixed.all():
-            self._plotter.add_mesh(_faces(surface, ~fixed), color=BODY, **shading)
+            self._plotter.add_mesh(surface.extract_cells(~fixed), scalars="colours", rgb=True, **shading)
         for kind, cells in (still.cut or {}).items():
             grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, subject.nodes(still.index)).shrink(SHRUNK)
             self._plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
@@ -112,13 +110,6 @@ class Renderer:
             self._plotter.add_mesh(mesh, color=GLASS, **look)
 
 
-def _faces(surface: pv.PolyData, chosen: Mask) -> pv.PolyData:
-    """Return a part of a surface, with its points' colours."""
-    part = surface_of(surface.points, surface.regular_faces[chosen])
-    part.point_data.update(surface.point_data)
-    return part
-
-
 def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None:
     """Draw a disk that fades towards its rim, and the body's shadow on it."""
     middle = ground.corners.mean(axis=0)
@@ -127,7 +118,7 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     share = np.linalg.norm(disk.points - middle, axis=1) / radius
     share = np.clip((1 - share) / (1 - FADING), 0, 1)
     opacity = 255 * share**2 * (3 - 2 * share)
-    disk["look"] = np.column_stack([np.tile(rgb(GROUND), (disk.n_points, 1)), opacity]).astype(np.uint8)
+    disk["look"] = np.column_stack([np.tile(pv.Color(GROUND).int_rgb, (disk.n_points, 1)), opacity]).astype(np.uint8)
     plotter.add_mesh(disk, scalars="look", rgb=True, lighting=False)
     shadow = body.copy()
     lift = 2e-3 * np.ptp(body.points, axis=0).max()  # or the two surfaces would flicker into each other

@@ -13,15 +13,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import toml_of
-from msmpetsc.view.colours import (
-    COLOURINGS,
-    SCALE,
-    Colouring,
-    colouring_of,
-    on_scale,
-    rgb,
-    scaled,
-)
+from msmpetsc.view.colours import COLOURINGS, SCALE, Colouring, colouring_of, scaled
 from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_result
 
 
@@ -92,4 +84,6 @@ def test_ends_of_the_scale_have_a_fitting_unit(high, end):
 
 
 def test_the_scale_ends_where_its_colours_do():
-    assert on_scale(np.array([-1.0, 0, 1, 7])) == pytest.approx(np.array([rgb(SCALE[k]) for k in (0, 0, -1, -1)]))
+    colouring = Colouring("way", "m", lambda _: np.array([-1.0, 0, 2, 7]), 2.0)
+    shown = [f"#{bytes(colour).hex()}" for colour in colouring.table[colouring.numbers(0)]]
+    assert shown == [SCALE[k] for k in (0, 0, -1, -1)]

@@ -89,8 +89,8 @@ def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, ca
     monkeypatch.setattr(page, "MOST", 0.9 * whole)
     with caplog.at_level(logging.INFO, logger="msmpetsc"):
         data = data_of(written_page(tmp_path))
-    assert data["frames"][0] == 0 and data["frames"][-1] == 10 and 2 < len(data["frames"]) < 11
-    assert f"has {len(data['frames'])} of the 11 frames" in caplog.text
+    assert data["times"][0] == 0 and data["times"][-1] == 1 and 2 < len(data["times"]) < 11
+    assert f"has {len(data['times'])} of the 11 frames" in caplog.text
 
 
 def test_anchored_points_are_free_after_their_stop(tmp_path):

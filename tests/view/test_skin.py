@@ -8,7 +8,7 @@ import trimesh
 from scipy.sparse import csr_array
 from surface_alone import drawable_of
 
-from msmpetsc.view.colours import plain_colouring
+from msmpetsc.view.colours import colouring_of
 from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
 from msmpetsc.view.mesh import CORNERS, drawn, split_at_edges, subdivided
@@ -113,7 +113,7 @@ def test_pins_are_coloured_by_face():
 
 def test_bodies_have_a_colour_each():
     subject = block()
-    assert plain_colouring(subject) is None
     halves = replace(subject.rest, body_of_point=np.repeat([0, 1], 4))
-    colouring = plain_colouring(replace(subject, rest=halves))
-    assert len(np.unique(colouring.rgb(0), axis=0)) == 2
+    for bodies, one in enumerate((subject, replace(subject, rest=halves)), 1):
+        colouring = colouring_of(one, None)
+        assert len(np.unique(colouring.table[colouring.numbers(0)], axis=0)) == bodies

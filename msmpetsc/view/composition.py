@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyvista as pv
 
 from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.errors import InputError
@@ -13,8 +14,6 @@ from msmpetsc.view.colours import Colouring, colouring_of, scaled
 from msmpetsc.view.drawable import FARTHEST, Drawable
 from msmpetsc.view.mesh import Cut, cut_open
 from msmpetsc.view.overlays import MARGIN, Overlays, overlays_at
-
-DIRECTIONS = 40  # in which the points farthest out of a frame stand for all of it
 
 
 @dataclass(frozen=True)
@@ -64,19 +63,13 @@ class Composition:
         return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
-        """Return the still of each frame, with its time and `words` in the caption.
-
-        Equal stills in a row are one object.
-        """
+        """Return the still of each frame, with its time and `words` in the caption."""
         cut = cut_open(self.subject, self.camera) if self.style.cells else None
-        made: list[Still] = []
+        stills = []
         for index in frames:
-            if made and made[-1].index == index:
-                made.append(made[-1])
-                continue
             overlays = overlays_at(self.subject, index, self.extremes, self.camera)
-            made.append(Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
-        return made
+            stills.append(Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
+        return stills
 
     def room(self, stills: Sequence[Still]) -> tuple[Floats, Floats, float]:
         """Return lower left (2,) and upper right (2,) of all stills in the picture's plane, and their depth [m].
@@ -98,11 +91,8 @@ class Composition:
 def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Composition:
     """Return the composition of frames, which are read one at a time. Raises InputError."""
     colouring = colouring_of(subject, style.colour)
-    number = np.arange(DIRECTIONS) + 0.5  # spread over the sphere, those of the axes first (Fibonacci's spiral)
-    height, angle = 1 - 2 * number / DIRECTIONS, np.pi * (1 + 5**0.5) * number
-    flat = np.sqrt(1 - height**2)
-    spiral = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
-    directions = np.concatenate([np.eye(3), -np.eye(3), spiral])
+    # the points farthest out in these directions stand for all of a frame
+    directions = np.concatenate([np.eye(3), -np.eye(3), pv.Icosphere(nsub=1).points])
     extremes = []
     distinct = sorted(set(frames))
     for index in counted(distinct, "frames read"):

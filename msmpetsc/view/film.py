@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def write_film(
 
 
 def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[Array]:
-    """Yield the picture (height, width, 3) of each still; equal ones in a row are drawn once."""
+    """Yield the picture (height, width, 3) of each still; a frame that stays is drawn once."""
     width, height = size
     letters = min(1.0, max(height / USUAL, SMALLEST))
     entries = entries_of(composition, stills)
@@ -108,14 +109,12 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
     room = height - round(letters * CAPTION) - len(legend)
     if room < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
-    before, picture = None, np.empty(0)
     with Renderer(composition, stills, (width, room)) as renderer:
-        for still in counted(stills, "pictures"):
-            if still is not before:
-                caption = caption_picture(still.caption, width, letters)
-                picture = np.concatenate([renderer.picture(still), caption, legend])
-            before = still
-            yield picture
+        for _, alike in groupby(counted(stills, "pictures"), key=lambda still: still.index):
+            still, *others = alike
+            caption = caption_picture(still.caption, width, letters)
+            picture = np.concatenate([renderer.picture(still), caption, legend])
+            yield from [picture] * (1 + len(others))
 
 
 def write_pictures(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
@@ -152,8 +151,5 @@ def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], f
 def _write_images(path: Path, pictures: Iterable[Array], fps: float) -> None:
     """Write an endless GIF or animated WebP by Pillow, which takes all pictures at once."""
     images = [Image.fromarray(picture) for picture in pictures]
-    options: dict[str, Any] = dict(quality=80, method=4)
-    if path.suffix.lower() == ".gif":
-        images = [image.quantize(256, dither=Image.Dither.NONE) for image in images]
-        options = {}
-    images[0].save(path, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0, **options)
+    options: dict[str, Any] = dict(duration=1000 / fps, loop=0, quality=80, method=4)  # these two of WebP
+    images[0].save(path, save_all=True, append_images=images[1:], **options)

@@ -71,11 +71,14 @@ def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplo
     assert np.ptp(rows) > 0.75 * pictures.shape[1]
 
 
-def test_slow_motion_shows_all_frames_for_longer():
+def test_slow_motion_shows_all_frames_for_longer(falling_ball, tmp_path):
     slow = playback_of(TIMES, speed=0.1)
     assert slow.fps == pytest.approx(1) and len(slow.numbers) == 11
     slower = playback_of(TIMES, speed=0.02)  # a picture a second at the least, so five pictures a frame
     assert len(slower.numbers) == 51 and (abs(np.bincount(slower.numbers)[1:-1] - 5) <= 1).all()
+    render(falling_ball, "-o", tmp_path / "x.gif", "--frames", "0:3", "--speed", 0.05)
+    with Image.open(tmp_path / "x.gif") as film:
+        assert sum(picture.info["duration"] for picture in ImageSequence.Iterator(film)) == 5000
 
 
 def test_frames_out_of_order_have_no_speed():

@@ -46,24 +46,18 @@ def camera_facing(points: Positions, gravity: Sequence[float] | None, eye: Seque
     Without eye, or with one straight above or below, the longer horizontal extent lies across the picture.
     """
     up = unit(-np.array(gravity)) if gravity and any(gravity) else np.array([0.0, 0.0, 1.0])
-    if eye is None:
-        right, away = _across(points, up)
-        cosine, sine = np.cos(YAW), np.sin(YAW)
-        return Camera(cosine * right + sine * away, cosine * away - sine * right, up, ELEVATION)
-    height = float(unit(eye) @ up)
-    level = unit(eye) - height * up
-    if np.linalg.norm(level) < 1e-6:
-        return Camera(*_across(points, up), up, math.copysign(math.pi / 2, height))
-    away = -unit(level)
-    return Camera(np.cross(away, up), away, up, math.asin(height))
-
-
-def _across(points: Positions, up: Floats) -> tuple[Floats, Floats]:
-    """Return the axes right and away; right is the horizontal axis of the larger extent."""
     axes = np.delete(np.eye(3), np.argmax(abs(up)), axis=0)
     axes = np.array([unit(axis - (axis @ up) * up) for axis in axes])
     right = axes[np.argmax(np.ptp(points @ axes.T, axis=0))]
-    return right, np.cross(up, right)
+    away = np.cross(up, right)
+    if eye is None:
+        away = math.cos(YAW) * away - math.sin(YAW) * right
+        return Camera(np.cross(away, up), away, up, ELEVATION)
+    height = float(unit(eye) @ up)
+    level = unit(eye) - height * up
+    if np.linalg.norm(level) > 1e-6:
+        away = -unit(level)
+    return Camera(np.cross(away, up), away, up, math.atan2(height, np.linalg.norm(level)))
 
 
 def unit(vector: ArrayLike) -> Floats:

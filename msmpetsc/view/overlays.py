@@ -1,15 +1,15 @@
 """Obstacles and force arrows around the bodies at a time, in the scene's axes [m]."""
 
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.constraints.loads import Motion, total_of, within
 from msmpetsc.geometry.surface import bounds_of
-from msmpetsc.scene.schema import SceneFile
 from msmpetsc.view.camera import Camera, unit
-from msmpetsc.view.drawable import BodiesAtRest, Drawable
+from msmpetsc.view.drawable import Drawable
 
 ARROW = 0.2  # length of an arrow, of the body's longest side
 NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
@@ -86,25 +86,24 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
 
     bodies : (b, 3) surface points of all pictures [m], which say how much of an obstacle is worth showing
     """
-    scene, time, solids = subject.scene, float(subject.times[index]), subject.solids
-    shown = Overlays(arrows=_arrows(scene, time, subject.rest, subject.nodes(index)))
-    for number, obstacle in enumerate(scene.obstacle):
+    time, solids = float(subject.times[index]), subject.solids
+    shown = Overlays(arrows=_arrows(subject, index))
+    for number, obstacle in enumerate(subject.scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):
             continue
         path = Motion.through(obstacle.path, obstacle.center)
         pose = path.value_at(time)
-        by = pose[:3]
         seen_from_it = path.unmoved(bodies, pose)
         if obstacle.shape == "box":
             shown.glass.extend(path.moved(corners, pose) for corners in _box(np.array(obstacle.box), seen_from_it))
         elif obstacle.shape == "sphere":
-            center, radius = np.array(obstacle.center) + by, obstacle.radius or 0.0
+            center, radius = np.array(obstacle.center) + pose[:3], obstacle.radius or 0.0
             seen = _box(np.array([center - radius, center + radius]), bodies)
             gap = np.linalg.norm(center - np.clip(center, bodies.min(axis=0), bodies.max(axis=0))) - radius
             if gap <= NEAR * _reach(bodies):
                 shown.balls.extend(Ball(center, radius, corners) for corners in seen)
         elif obstacle.shape == "plane":
-            _add_plane(shown, np.array(obstacle.point) + by, np.array(obstacle.normal), bodies, camera)
+            _add_plane(shown, np.array(obstacle.point) + pose[:3], np.array(obstacle.normal), bodies, camera)
         elif number in solids and len(solids[number].points):
             origin, *axes = path.moved(np.concatenate([np.zeros((1, 3)), np.eye(3)]), pose)
             corners = (path.moved(box, pose) for box in _box(bounds_of(solids[number]), seen_from_it))
@@ -124,8 +123,8 @@ def _add_plane(shown: Overlays, point: Floats, normal: Floats, bodies: Positions
         shown.grounds.append(Ground(middle + GROUND * _reach(bodies) * corners, normal))
     else:  # a plate where the bodies stand before the plane, with a margin
         reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
-        front = corners_of(np.array([reached.min(axis=0) - margin, reached.max(axis=0) + margin])) @ sides
-        front = front + (point @ normal) * normal
+        plate = np.array([reached.min(axis=0) - margin, reached.max(axis=0) + margin])
+        front = np.array([*product(*plate.T)]) @ sides + (point @ normal) * normal
         shown.glass.append(np.concatenate([front, front - THICKNESS * _reach(bodies) * normal]))
 
 
@@ -140,11 +139,6 @@ def _sides(normal: Floats) -> Rows:
     return np.array([first, np.cross(normal, first)])
 
 
-def corners_of(box: Positions) -> Positions:
-    """Return the corners (2^d, d) of a box (2, d), the last axis first: number 4i + 2j + k in space."""
-    return np.array([[box[end, axis] for axis, end in enumerate(ends)] for ends in np.ndindex((2,) * box.shape[1])])
-
-
 def _box(box: Positions, bodies: Positions) -> list[Positions]:
     """Return corners (8, 3) of a box (2, 3), clipped near the bodies; none for a distant box."""
     low, high = bodies.min(axis=0), bodies.max(axis=0)
@@ -155,16 +149,17 @@ def _box(box: Positions, bodies: Positions) -> list[Positions]:
     gap = np.maximum(box[0] - high, low - box[1]).max()
     if gap > NEAR * _reach(bodies) or (box[0] >= box[1]).any():
         return []
-    return [corners_of(box)]
+    return [np.array([*product(*box.T)])]
 
 
-def _arrows(scene: SceneFile, time: float, rest: BodiesAtRest, position: Positions) -> list[Positions]:
+def _arrows(subject: Drawable, index: int) -> list[Positions]:
+    time, rest = float(subject.times[index]), subject.rest
     length = ARROW * np.ptp(rest.bounds, axis=1).max()
     arrows = []
-    for table in scene.tables("force"):
+    for table in subject.scene.tables("force"):
         force = table.table
         total = total_of(force.total or (0.0, 0.0, 0.0)).value_at(time)  # a function has no one direction
         if within(time, force.start, force.stop) and any(total) and (where := rest.find(table)).any():
-            tail = position[where].mean(axis=0)
+            tail = subject.nodes(index)[where].mean(axis=0)
             arrows.append(np.array([tail, tail + length * unit(total)]))
     return arrows

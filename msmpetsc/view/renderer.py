@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import numpy as np
@@ -20,28 +20,21 @@ GLASS_OPACITY = 0.22
 FADING, AROUND = 0.55, 72  # share of a ground's radius from which on it fades; corners of its rim
 
 
-class Renderer:
-    """An off-screen window in which stills are drawn; a context, which closes it.
-
-    scale : [px/m]
-    """
+class Renderer(AbstractContextManager["Renderer"]):
+    """An off-screen window in which stills are drawn; a context, which closes it."""
 
     def __init__(self, composition: Composition, stills: Sequence[Still], size: tuple[int, int]):
         """Open a window of width and height [px] that has room for all stills."""
-        self._composition, self._size = composition, np.array(size)
+        self._composition = composition
         low, high, self._depth = composition.room(stills)  # nothing reaches farther towards the eye
-        self._centre = (low + high) / 2  # across the picture and upward [m]
-        self.scale = float((self._size / (high - low)).min())
+        height = size[1] * ((high - low) / size).max()  # of what is seen [m]
         with quiet_opengl():
             self._plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
             self._plotter.background_color = pv.Color("white")
             for position, intensity in (((-0.5, 1.1, 1.3), 0.85), ((1, 0.15, 0.65), 0.35)):
                 self._plotter.add_light(pv.Light(position=position, intensity=intensity, light_type="camera light"))
             self._plotter.enable_anti_aliasing("ssaa")
-            self._face()
-
-    def __enter__(self) -> "Renderer":
-        return self
+            self._face((low + high) / 2, height)
 
     def __exit__(self, *_: object) -> None:
         with quiet_opengl():
@@ -60,16 +53,16 @@ class Renderer:
             raise InputError("nothing can be drawn: the graphics library gives a black picture")
         return np.asarray(picture)
 
-    def _face(self) -> None:
-        """Set the orthographic camera."""
+    def _face(self, centre: Floats, height: float) -> None:
+        """Set the orthographic camera on a point (2,) of the picture's plane; height: of what it shows [m]."""
         camera = self._composition.camera
         view, far = self._plotter.camera, 4 * self._depth
-        across, upward = self._centre
+        across, upward = centre
         behind = self._composition.box.mean(axis=0) @ camera.to_eye
         middle = across * camera.right + upward * camera.upward + behind * camera.to_eye
         view.focal_point, view.position, view.up = middle, middle + far * camera.to_eye, camera.upward
         view.parallel_projection = True
-        view.parallel_scale = self._size[1] / self.scale / 2
+        view.parallel_scale = height / 2
         view.clipping_range = (far / 100, 2 * far)
 
     def _draw(self, still: Still) -> None:

@@ -99,9 +99,7 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
         elif obstacle.shape == "sphere":
             center, radius = np.array(obstacle.center) + pose[:3], obstacle.radius or 0.0
             seen = _box(np.array([center - radius, center + radius]), bodies)
-            gap = np.linalg.norm(center - np.clip(center, bodies.min(axis=0), bodies.max(axis=0))) - radius
-            if gap <= NEAR * _reach(bodies):
-                shown.balls.extend(Ball(center, radius, corners) for corners in seen)
+            shown.balls.extend(Ball(center, radius, corners) for corners in seen)
         elif obstacle.shape == "plane":
             _add_plane(shown, np.array(obstacle.point) + pose[:3], np.array(obstacle.normal), bodies, camera)
         elif number in solids and len(solids[number].points):

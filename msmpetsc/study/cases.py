@@ -136,19 +136,12 @@ def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return tables
 
 
-def with_solver(case: Case, scene: Scene) -> Case:
-    """Return a case with the overrides of its solver table; none for verlet."""
-    solver = scene_tables(vars(case)).get("solver")
-    if solver is None:
-        return case
-    return case.changed(f"solver={toml_value(scene.solver.model_dump(exclude_unset=True) | solver)}")
-
-
-def with_time(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
-    """Return a case with the overrides of its time and output tables, which store the surface if asked to."""
-    time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
-    time |= scene_tables(vars(case))["time"]
-    case = case.changed(f"time={toml_value(time)}", SURFACE if surface else "output.surface=false")
+def with_tables(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
+    """Return a case with the overrides of its solver, time and output tables."""
+    tables = scene_tables(vars(case))
+    time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration} | tables["time"]
+    solver = [f"solver={toml_value(tables['solver'])}"] if "solver" in tables else []
+    case = case.changed(*solver, f"time={toml_value(time)}", SURFACE if surface else "output.surface=false")
     return case.changed(f"output.every={every}") if every > 1 else case
 
 
@@ -201,28 +194,25 @@ def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> 
 
 def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Iterator[Case]:
     """Yield the cases of one lattice and integrator."""
-    steps = {"time_step": sweep.time_steps or (as_given.time.step,)}
+    steps = sweep.time_steps or (as_given.time.step,)
     if base.integrator == "verlet":
-        for values in combinations(steps | {"substep": sweep.substeps or (None,), "ranks": sweep.ranks}):
-            case = replace(base, **values, label=_label(sweep, "verlet", "", values["ranks"]))
-            yield _timed(case, scene, sweep, as_given)
-        return
-    goals: list[dict[str, Any]] = [{"error": error} for error in sweep.errors]
-    goals += [{"max_iterations": budget} for budget in sweep.max_iterations]
-    goals = goals or [{"error": as_given.solver.error, "max_iterations": as_given.solver.max_iterations}]
-    lists = {"preset": sweep.presets or (as_given.solver.preset,), "options": sweep.options, **steps}
-    for values in combinations(lists | {"goal": goals, "ranks": sweep.ranks}):
-        method = values["preset"] if base.integrator == "implicit-euler" else f"{base.integrator} {values['preset']}"
-        case = replace(
-            base, **values.pop("goal"), **values, label=_label(sweep, method, values["options"], values["ranks"]),
-            true_error=scene.true_error,
-        )  # fmt: skip
-        yield _timed(with_solver(case, as_given), scene, sweep, as_given)
+        lists: dict[str, Sequence[Any]] = {"time_step": steps, "substep": sweep.substeps or (None,)}
+    else:
+        base = replace(base, true_error=scene.true_error)
+        goals: list[dict[str, Any]] = [{"error": error} for error in sweep.errors]
+        goals += [{"max_iterations": budget} for budget in sweep.max_iterations]
+        goals = goals or [{"error": as_given.solver.error, "max_iterations": as_given.solver.max_iterations}]
+        presets = sweep.presets or (as_given.solver.preset,)
+        lists = {"preset": presets, "options": sweep.options, "time_step": steps, "goal": goals}
+    for values in combinations(lists | {"ranks": sweep.ranks}):
+        case = replace(base, **values.pop("goal", {}), **values)
+        yield _timed(replace(case, label=_label(sweep, case)), scene, sweep, as_given)
 
 
-def _label(sweep: Sweep, method: str, options: str, ranks: int) -> str:
-    name = sweep.label or f"{method} {options}".strip()
-    return name if ranks == 1 or sweep.ranks == (ranks,) else f"{name}, {ranks} ranks"
+def _label(sweep: Sweep, case: Case) -> str:
+    integrator = case.integrator.removeprefix("implicit-euler")  # the usual one
+    name = sweep.label or " ".join(filter(None, (integrator, case.preset, case.options)))
+    return name if case.ranks == 1 or sweep.ranks == (case.ranks,) else f"{name}, {case.ranks} ranks"
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
@@ -238,7 +228,7 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
     if case.reference is not None:
         every = max(1, round((scene.frame or as_given.time.step) / case.time_step))
     surface = case.reference is not None and case.reference.stores_surface
-    return with_time(case, duration, every, as_given, surface)
+    return with_tables(case, duration, every, as_given, surface)
 
 
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
@@ -261,14 +251,13 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     )
     surface = reference.cells is not None
     if reference.integrator == "verlet":
-        return with_time(replace(case, substep=reference.substep), duration, 1, as_given, surface)
+        return with_tables(replace(case, substep=reference.substep), duration, 1, as_given, surface)
     step = reference.step or frame  # the schema asks for it
     every = round(frame / step)
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
         raise InputError(f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s")
     case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
-    solver = toml_value({"preset": reference.preset, "error": reference.error})
-    return with_time(case.changed(f"solver={solver}"), duration, every, as_given, surface)
+    return with_tables(case, duration, every, as_given, surface)
 
 
 def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
@@ -292,7 +281,7 @@ def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
                 error=method.error, max_iterations=method.max_iterations, label=method.label, timeout=study.timeout,
                 point=MapPoint(map.name, method.label if x is None else x, y, run.recovers),
             )  # fmt: skip
-            yield with_time(with_solver(case, scene), max(duration, step), 1, scene)
+            yield with_tables(case, max(duration, step), 1, scene)
 
 
 def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:

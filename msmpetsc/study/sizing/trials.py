@@ -12,7 +12,7 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.time import STATIC
 from msmpetsc.scene.toml import toml_value
 from msmpetsc.scene.values import IntegratorName
-from msmpetsc.study.cases import Case, with_solver, with_time
+from msmpetsc.study.cases import Case, with_tables
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.sizing.choice import (
@@ -349,7 +349,7 @@ class Sizer:
             timeout=timeout,
         )  # fmt: skip
         every = max(1, round(self.step / method.time_step))
-        case = with_time(with_solver(case, self.as_given), self.duration, 1, self.as_given, surface=True)
+        case = with_tables(case, self.duration, 1, self.as_given, surface=True)
         return case.changed(f"output.every={every}")
 
 

@@ -32,8 +32,7 @@ class Bench:
     processes: Processes
     study: str = ""
     warm: bool = False  # spare each the start of the program; so it is of points of maps, of which no time is asked
-    _locks: dict[str, Lock] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)
+    _locks: dict[str, Lock] = field(default_factory=dict)  # by reference
 
     def result_of(self, case: Case) -> Path:
         """Return the path of the result of a case."""
@@ -79,9 +78,7 @@ class Bench:
         if case.reference is None:
             return None, ""
         path = self.folder / "references" / f"{case.reference.id}.h5"
-        with self._lock:
-            lock = self._locks.setdefault(case.reference.id, Lock())
-        with lock:
+        with self._locks.setdefault(case.reference.id, Lock()):
             failed = path.with_suffix(".failed")
             if not path.is_file() and not failed.is_file():
                 part = path.with_suffix(".part.h5")

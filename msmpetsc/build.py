@@ -28,7 +28,7 @@ from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.lattice.initial_state import InitialState, initial_state
-from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice, topology_of
+from msmpetsc.lattice.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
 from msmpetsc.scene.motion import ForceTable, Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
@@ -161,7 +161,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     shape = shape or Geometry(comm, scene)
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
-    lattice = build_lattice(cages, _material(scene, finder), shape.topology)
+    lattice = build_lattice(cages, scene.material, cell_materials(scene, finder), shape.topology)
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
     points = shape.nearest(lattice) if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
@@ -279,13 +279,6 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
         cell_size = choose_cell_size(bodies, cages.count, cages.max_cells, cages.boundary)
     assert cell_size is not None  # the schema has one of the two
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
-
-
-def _material(scene: Scene, finder: Finder) -> LatticeMaterial:
-    own = scene.material
-    b = own.stiffening * (own.law == "stiffening")  # of the springs' law, 0 for Hooke's
-    of_cells = cell_materials(scene, finder)
-    return LatticeMaterial(own.density, own.young_modulus, own.stiffness, b, own.poisson, of_cells)
 
 
 def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders) -> list[Anchor]:

@@ -27,7 +27,8 @@ from scipy.special import spherical_jn
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.surface import Surface, examine
-from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.scene.body import Material
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
@@ -59,13 +60,13 @@ def lattice_of(
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
     bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
     cages = fill([BodySurface(COMM, surface, examine(surface), bounds)], h, boundary=boundary)
-    return build_lattice(cages, LatticeMaterial(DENSITY, young_modulus=E, poisson=poisson))
+    law = {} if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
+    return build_lattice(cages, Material.model_validate({"density": DENSITY, "young_modulus": E} | law))
 
 
 def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS) -> Lattice:
     """The lattice of a box filled with exactly these cells, its low corner at the origin."""
-    mesh = trimesh.creation.box(np.ones(3))
-    mesh.vertices = (mesh.vertices + 0.5) * [*cells] * cell_size
+    mesh = trimesh.creation.box(bounds=[np.zeros(3), np.array([*cells]) * cell_size])
     return lattice_of(mesh, cell_size, poisson=poisson)
 
 

@@ -4,7 +4,6 @@ Each rank holds the nodes it owns, the ghost nodes that its springs reach, and e
 end that it owns. Global node numbers follow Morton order, so they do not depend on the number of ranks.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -19,7 +18,14 @@ from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
 from msmpetsc.lattice.cut_cells import CORNERS as CORNERS
 from msmpetsc.lattice.cut_cells import shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.material import CellMaterial, calibrated_stiffness, edge_stiffness, lame_constants
+from msmpetsc.lattice.material import (
+    CellMaterial,
+    MaterialOfCells,
+    calibrated_stiffness,
+    edge_stiffness,
+    lame_constants,
+)
+from msmpetsc.scene.body import Material
 
 # the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
@@ -116,43 +122,21 @@ class Lattice:
         return replace(self, pinned=self.pinned | where)
 
 
-class LatticeMaterial(NamedTuple):
-    """What a lattice is made of.
+def build_lattice(
+    cages: Cages, material: Material, of_cells: MaterialOfCells | None = None, topology: "Topology | None" = None
+) -> Lattice:
+    """Build masses and springs of the valid cells, of a boundary cell what is inside (cut_cells) (collective).
 
-    density       : [kg/m^3]; a whole cell gives an eighth of its mass to each corner
-    young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
-    stiffness     : [N/m] for every spring, as in the paper
-    stiffening    : of the springs' law (elasticity.springs) [-]
-    poisson       : Poisson's ratio of a neo-Hookean solid [-]; None for springs
-    of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (lattice.region)
-    """
-
-    density: float
-    young_modulus: float | None = None
-    stiffness: float | None = None
-    stiffening: float = 0.0
-    poisson: float | None = None
-    of_cells: Callable[[Indices], CellMaterial] | None = None
-
-    @property
-    def spring(self) -> float:
-        """Young's modulus [Pa], or the stiffness [N/m] that is given in its place."""
-        given = self.young_modulus if self.stiffness is None else self.stiffness
-        assert given is not None
-        return given
-
-
-def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology | None" = None) -> Lattice:
-    """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
-
+    of_cells : what each cell is made of, where that is not ``material`` for all (lattice.region)
     topology : that of the cages, where it is known already
     """
     h, net = cages.grids.cell_size, topology or topology_of(cages)
     is_solid = material.poisson is not None
+    stiffening = material.stiffening * (material.law == "stiffening")  # b of the springs' law, 0 for Hooke's
     first_owned = net.cells[:, 0] < len(net.octants)
-    others = ~first_owned & (material.stiffening > 0 or is_solid)  # they matter only where the law is of cells too
+    others = ~first_owned & (stiffening > 0 or is_solid)  # they matter only where the law is of cells too
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])
-    law = _solid(net, h, material, kept) if is_solid else _of_springs(net, h, material)
+    law = (_of_solid if is_solid else _of_springs)(net, h, material, of_cells)
     grids = cages.grids
     nodes_of_bodies = np.bincount(grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids))
     return Lattice(
@@ -169,12 +153,12 @@ def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology |
         rest_length=h * np.sqrt(net.kind),
         stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
         pinned=np.zeros(len(net.ijk), bool),
-        stiffening=material.stiffening,
+        stiffening=stiffening,
         local_cells=net.cells[kept],
         cells_owned=int(first_owned.sum()),
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
-        solid=law.solid,
+        solid=law.solid and SolidCells(*(rows[kept] for rows in law.solid)),
     )
 
 
@@ -226,7 +210,7 @@ class LawConstants(NamedTuple):
     mass    : (owned,) [kg]
     springs : (s,) stiffness [N/m], or one for all; of a solid that of the constant L
     cells   : (c,) stiffness [N/m] of an edge among cells like each, or one for all
-    solid   : of the cells that are kept; None of springs
+    solid   : None of springs
     """
 
     mass: Floats
@@ -235,13 +219,13 @@ class LawConstants(NamedTuple):
     solid: SolidCells | None = None
 
 
-def _of_springs(net: Topology, h: float, material: LatticeMaterial) -> LawConstants:
+def _of_springs(net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None) -> LawConstants:
     """Return the constants of springs: of each the mean over the cells that share it."""
-    if material.of_cells is None and net.share is None:
+    if of_cells is None and net.share is None:
         mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
         law = LawConstants(mass, material.spring, material.spring)
     else:
-        owned, cells, made_of = len(net.octants), len(net.cells), _made_of(net, material)
+        owned, cells, made_of = len(net.octants), len(net.cells), _made_of(net, material, of_cells)
         share = np.ones((cells, 8)) if net.share is None else net.share
         of_pairs = shares_of_pairs(share)
         of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
@@ -254,17 +238,17 @@ def _of_springs(net: Topology, h: float, material: LatticeMaterial) -> LawConsta
     return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
 
 
-def _made_of(net: Topology, material: LatticeMaterial) -> CellMaterial:
+def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None) -> CellMaterial:
     """Return what the cells around a rank's nodes are made of, all alike where no function tells."""
-    if material.of_cells:
-        return material.of_cells(net.ijk[net.cells[:, 0]])
-    of_all = material.density, material.spring, material.poisson or 0.0
+    if of_cells:
+        return of_cells(net.ijk[net.cells[:, 0]])
+    of_all = material.density, material.spring, material.poisson_ratio
     return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
 
 
-def _solid(net: Topology, h: float, material: LatticeMaterial, kept: Indices) -> LawConstants:
+def _of_solid(net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None) -> LawConstants:
     """Return the constants of a solid: as with springs each corner's mass goes as the diagonal of L."""
-    owned, count, made_of = len(net.octants), len(net.cells), _made_of(net, material)
+    owned, count, made_of = len(net.octants), len(net.cells), _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
     if net.share is None or net.squares is None:
         forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
@@ -277,7 +261,7 @@ def _solid(net: Topology, h: float, material: LatticeMaterial, kept: Indices) ->
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
     most = 2 * shear + 3 * lame  # of |grad u|^2 in the second variation at rest
     of_spring = _sums_of_springs(net.cells, -h * most, pairs, net.ijk, net.springs, owned)
-    cells = SolidCells(*(rows[kept] for rows in (forms, h**3 * volume, shear, lame)))
+    cells = SolidCells(forms, h**3 * volume, shear, lame)
     return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
 
 

@@ -4,6 +4,7 @@ Central forces between the corners of cubes give Poisson's ratio 1/4 whatever th
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,9 @@ class CellMaterial:
     density: Floats
     spring: Floats
     poisson: Floats
+
+
+MaterialOfCells = Callable[[Indices], CellMaterial]  # by the grid index (c, 3) of cells
 
 
 def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: Indices, cells: Indices) -> Floats:

@@ -4,7 +4,7 @@ A region means material: a node is where its body is nearest to it, a cell where
 nodes that lie in the region themselves those count, too, that have it half a cell away (README: regions and clamps).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
 from msmpetsc.geometry.surface import is_inside
 from msmpetsc.lattice.lattice import CORNERS, Lattice
-from msmpetsc.lattice.material import CellMaterial
+from msmpetsc.lattice.material import CellMaterial, MaterialOfCells
 from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import OfBody
@@ -184,7 +184,7 @@ def _extent(region: Region, bounds: Rows) -> str:
     return f"beyond ({at}) m towards ({along})"
 
 
-def cell_materials(scene: Scene, finder: Finder) -> Callable[[Indices], CellMaterial] | None:
+def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
     """Return what makes of cells' grid index (c, 3) their materials (collective).
 
     It is None where all cells are of the same material.

@@ -126,6 +126,13 @@ class Material(Table):
         """Return Poisson's ratio of a solid; None of springs."""
         return self.poisson_ratio if self.law == SOLID else None
 
+    @property
+    def spring(self) -> float:
+        """Return Young's modulus [Pa], or the stiffness [N/m] that is given in its place."""
+        given = self.young_modulus or self.stiffness
+        assert given is not None  # the schema has one of the two
+        return given
+
 
 class Sphere(Table):
     """A ball."""

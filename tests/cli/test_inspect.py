@@ -11,7 +11,7 @@ from block_scene import block_scene
 from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
 
-from msmpetsc.build import build_model, fill_cages, read_bodies
+from msmpetsc.build import Geometry, build_model, fill_cages, read_bodies
 from msmpetsc.cli.commands.inspect import BYTES, Partition, count_partition
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
@@ -41,7 +41,7 @@ def scene(ball: Path, tmp_path: Path) -> Path:
 
 def counted(scene: Path, cells: int, ranks: int) -> Partition:
     """What count_partition says."""
-    return count_partition(build_model(SELF, load_scene(scene, [f"cages.count={cells}"])).lattice, ranks)
+    return count_partition(Geometry(SELF, load_scene(scene, [f"cages.count={cells}"])).topology, ranks)
 
 
 def assert_counts_are_near_those_of_real_ranks(scene: Path, cells: int, rel: float) -> None:

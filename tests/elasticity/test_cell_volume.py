@@ -11,8 +11,9 @@ from mpi4py import MPI
 from msmpetsc.elasticity.cell_volume import Cells, least_volumes
 from msmpetsc.elasticity.energy import ONSET, RESISTANCE, Elasticity
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.material import edge_stiffness
+from msmpetsc.scene.body import Material
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
@@ -23,9 +24,8 @@ STIFFENING = 10.0
 
 
 def lattice_of(*sides: int, stiffening: float = STIFFENING) -> Lattice:
-    return build_lattice(
-        cages_of(block(*sides), H), LatticeMaterial(DENSITY, young_modulus=YOUNG, stiffening=stiffening)
-    )
+    law = {"law": "stiffening", "stiffening": stiffening} if stiffening else {}
+    return build_lattice(cages_of(block(*sides), H), Material(density=DENSITY, young_modulus=YOUNG, **law))
 
 
 SMALL = lattice_of(2, 2, 1)

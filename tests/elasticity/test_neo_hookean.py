@@ -12,8 +12,9 @@ from msmpetsc.elasticity.neo_hookean import ONSET
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes
-from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, SolidCells, build_lattice
+from msmpetsc.lattice.lattice import Lattice, SolidCells, build_lattice
 from msmpetsc.lattice.material import lame_constants
+from msmpetsc.scene.body import Material
 
 RNG = np.random.default_rng(30)
 YOUNG, H = 3e4, 0.1
@@ -33,7 +34,8 @@ def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 def solid(*sides: int, poisson: float, cut: bool = False) -> Lattice:
     """A block of whole or of randomly cut cells."""
-    lattice = build_lattice(cages_of(block(*sides), H), LatticeMaterial(1000.0, young_modulus=YOUNG, poisson=poisson))
+    material = Material(density=1000, young_modulus=YOUNG, law="neo-hookean", poisson_ratio=poisson)
+    lattice = build_lattice(cages_of(block(*sides), H), material)
     if not cut:
         return lattice
     share, squares = map(
@@ -172,7 +174,7 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
 
 def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
     """As K of a trilinear cell has them, times 2 mu + 3 lambda, which bounds the Hessian: both are 1."""
-    lattice = build_lattice(cages_of(block(1, 1, 1), H), LatticeMaterial(1000.0, young_modulus=2.5, poisson=0.25))
+    lattice = build_lattice(cages_of(block(1, 1, 1), H), Material(density=1000, young_modulus=2.5, law="neo-hookean"))
     kind = np.rint((lattice.rest_length / H) ** 2).astype(int)
     np.testing.assert_allclose(lattice.stiffness, np.array([0, 0, 5, 5])[kind] * H / 12, atol=1e-17)
 

@@ -15,8 +15,9 @@ from msmpetsc.comm import SortedKeys
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
-from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.material import CellMaterial
+from msmpetsc.scene.body import Material
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid import cycle
@@ -102,10 +103,10 @@ def build(
         uniform = CellMaterial(*(np.full(len(ijk), value) for value in (density, YOUNG, poisson or 0.25)))
         return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * YOUNG)
 
-    more = {"stiffening": stiffening, "poisson": poisson}
-    lattice = build_lattice(
-        cages, LatticeMaterial(density, YOUNG, of_cells=of_cells if contrast != 1 else None, **more)
-    )
+    stiff = {"law": "stiffening", "stiffening": stiffening} if stiffening else {}
+    law = {"law": "neo-hookean", "poisson_ratio": poisson} if poisson else stiff
+    material = Material(density=density, young_modulus=YOUNG, **law)
+    lattice = build_lattice(cages, material, of_cells if contrast != 1 else None)
     low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
     return lattice.pin(lattice.nodes[:, 0] < low + 0.01 * CELL) if pins else lattice
 

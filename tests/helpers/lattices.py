@@ -9,7 +9,8 @@ from msmpetsc.comm import SortedKeys
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
-from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.scene.body import Material
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
@@ -33,7 +34,7 @@ def block(*sides: int) -> np.ndarray:
 
 def beam() -> Lattice:
     """8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
-    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), LatticeMaterial(1000.0, young_modulus=2e5))
+    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), Material(density=1000, young_modulus=2e5))
     return lattice.pin(lattice.nodes[:, 0] < 1.01)
 
 

@@ -14,7 +14,8 @@ from surfaces import body_of
 from msmpetsc.build import nearest_of_body
 from msmpetsc.geometry.cages import fill
 from msmpetsc.lattice.cut_cells import CORNERS, shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.lattice import LatticeMaterial, build_lattice
+from msmpetsc.lattice.lattice import build_lattice
+from msmpetsc.scene.body import Material
 
 E, DENSITY = study.E, study.DENSITY
 bar_errors = cache(lambda name, size: study.bar_errors(*BARS[name], size * study.RADIUS, "fill")[1])
@@ -87,7 +88,7 @@ def test_a_ball_rings_as_lambs():
 def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_does():
     body = body_of(BALL)
     cages = fill([body], 0.2)
-    lattice = build_lattice(cages, LatticeMaterial(DENSITY, E))
+    lattice = build_lattice(cages, Material(density=DENSITY, young_modulus=E))
     outside = np.linalg.norm(lattice.nodes - nearest_of_body([body], cages, lattice), axis=1)
     np.testing.assert_allclose(outside, np.maximum(np.linalg.norm(lattice.nodes, axis=1) - 1, 0), atol=2e-3)
     for normal in np.random.default_rng(0).standard_normal((50, 3)):

@@ -22,7 +22,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, choose_cell_size, fill
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
+from msmpetsc.lattice.lattice import Topology, topology_of
 from msmpetsc.scene.body import CagesTable
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.petsc.initialise import initialise
@@ -98,14 +98,14 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int) 
     if h is None or cells > MOST_BUILT:
         h = choose_cell_size(bodies, int(min(cells, MOST_BUILT)), NO_LIMIT, wanted.boundary)
     cages = fill(bodies, h, NO_LIMIT, wanted.boundary)
-    partition = count_partition(build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
+    partition = count_partition(topology_of(cages), ranks)
     counted = int(partition.cells.sum())
     return partition.scaled(round(cells)) if cells > MOST_BUILT else partition, counted
 
 
-def count_partition(lattice: Lattice, ranks: int) -> Partition:
+def count_partition(lattice: Topology, ranks: int) -> Partition:
     """Return the partition among ``ranks`` ranks of a lattice that is whole, built on one rank."""
-    cell_rank, rank = (np.arange(n) * ranks // n for n in (len(lattice.cells), lattice.owned))
+    cell_rank, rank = (np.arange(n) * ranks // n for n in (len(lattice.corners), len(lattice.octants)))
     of_end = rank[lattice.springs]
     across = of_end[:, 0] != of_end[:, 1]
     to, node = of_end[across].ravel(), lattice.springs[across][:, ::-1].ravel()

@@ -28,7 +28,7 @@ from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.lattice.initial_state import InitialState, initial_state
-from msmpetsc.lattice.lattice import Lattice, build_lattice, topology_of
+from msmpetsc.lattice.lattice import Lattice, Topology, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
 from msmpetsc.scene.motion import ForceTable, Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
@@ -38,7 +38,6 @@ from msmpetsc.scene.schema import OfBody, held_by
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
-INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold only
 USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 
 
@@ -108,7 +107,6 @@ class Geometry:
         self.bodies = read_bodies(comm, scene)
         self.cages = fill_cages(self.bodies, scene)
         self.topology = topology_of(self.cages)
-        self._nearest: Positions | None = None
 
     def fits(self, scene: Scene) -> bool:
         """Return whether a scene has these meshes and these cages."""
@@ -121,21 +119,17 @@ class Geometry:
         _, _, cages = self.source
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
 
-    def nearest(self, lattice: Lattice) -> Positions:
-        """Return the points (l, 3) [m] of the bodies that nodes are nearest to (collective).
+    @cached_property
+    def nearest(self) -> Positions:
+        """Return the points (l, 3) [m] of the bodies that nodes are nearest to (collective)."""
+        return nearest_of_body(self.bodies, self.cages, self.topology)
 
-        lattice : of this shape, of any material
-        """
-        if self._nearest is None:
-            self._nearest = nearest_of_body(self.bodies, self.cages, lattice)
-        return self._nearest
-
-    def outside(self, lattice: Lattice) -> Floats | None:
-        """Return how far nodes (l,) stick out of the surfaces [m]; None where cells count whole (collective)."""
-        return None if self.cages.share is None else np.linalg.norm(lattice.nodes - self.nearest(lattice), axis=1)
+    def outside(self, nodes: Positions) -> Floats | None:
+        """Return how far nodes (l, 3) [m] stick out of the surfaces [m]; None where cells count whole (collective)."""
+        return None if self.cages.share is None else np.linalg.norm(nodes - self.nearest, axis=1)
 
 
-def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice) -> Positions:
+def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topology) -> Positions:
     """Return the point (l, 3) [m] of its body that each node is nearest to at rest (collective).
 
     It is the node itself but where that sticks out of the surface: corners of boundary cells, by up to a diagonal. An
@@ -143,14 +137,13 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattic
     it is d deep: there the surface is. Where the surface is flat as far as a cell that is exact, however the body has
     turned. Where cells count whole there is nothing to correct: the lattice is the body.
     """
-    owned = lattice.owned
-    springs = np.bincount(lattice.springs.ravel(), minlength=len(lattice.nodes))[:owned]
-    body = lattice.body
-    rows = np.flatnonzero((springs < INNER_SPRINGS) & np.array(cages.fills)[body[:owned]])
-    nearest = lattice.nodes[:owned].copy()
+    owned, ghosts = np.split(topology.ijk, [len(topology.octants)])
+    body = cages.grids.body_of(owned)
+    # a node within eight cells may stick out into a fold only
+    rows = np.flatnonzero(~topology.octants.all(axis=1) & np.array(cages.fills)[body])
+    nearest = cages.grids.node_positions(owned)
     nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
-    ghosts = encode_morton(cages.grids.nearest_nodes(lattice.nodes[owned:], body[owned:]))
-    return np.concatenate([nearest, lattice.table.rows_of(ghosts, nearest)])
+    return np.concatenate([nearest, topology.table.rows_of(encode_morton(ghosts), nearest)])
 
 
 def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> Model:
@@ -163,13 +156,13 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     finder = Finder(bodies, cages, scene.folder)
     lattice = build_lattice(cages, scene.material, cell_materials(scene, finder), shape.topology)
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
-    points = shape.nearest(lattice) if tables else lattice.nodes
+    points = shape.nearest if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
-    outside = shape.outside(lattice) if scene.obstacle else None
+    outside = shape.outside(lattice.nodes) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.holders import Holders, Regions, clamped, taken
-from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
+from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, shares_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.friction import STICK, smallest
 from msmpetsc.contact.obstacles.moving_solid import Obstacle, build_obstacles
@@ -30,7 +30,7 @@ from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_e
 from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, Topology, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
-from msmpetsc.scene.motion import ForceTable, Gravity
+from msmpetsc.scene.motion import Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import OfBody, held_by
@@ -203,7 +203,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
             local_cells=send(lattice.local_cells),
             solid=solid and solid._replace(forms=send(solid.forms)),
         ),
-        loads=[replace(load, force=send(load.force)) for load in model.loads],
+        loads=[replace(load, share=send(load.share)) for load in model.loads],
         anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],
         holders=replace(model.holders, number=send(model.holders.number)),
         exchanges=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.exchanges],
@@ -302,15 +302,13 @@ def _loads(
     """
     loads, own_forces = [], []
     if gravity is not None:
-        loads.append(Load(lattice.mass[:, None] * np.array(gravity.acceleration), 0.0, None))
+        loads.append(Load(lattice.mass[:, None], total_of(gravity.acceleration)))
     for table in forces:
         force = table.table
         where = masks[table.key][: lattice.owned]
-        if isinstance(force.total, ForceTable):
-            share = spread_by_mass(comm, (1.0,), where, lattice.mass)
-            loads.append(Load(share, force.start, force.stop, total_of(force.total)))
-        elif force.total is not None:
-            loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
+        if force.total is not None:
+            share = shares_by_mass(comm, where, lattice.mass)
+            loads.append(Load(share, total_of(force.total), force.start, force.stop))
         else:
             rows, function = np.flatnonzero(where), FORCES.find(force.function)
             own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))

@@ -97,7 +97,7 @@ class Environment:
         """
         beyond = None
         for load in self.loads:
-            if load.table is not None:
+            if len(load.total.times) > 1:
                 beyond = np.zeros_like(self._load) if beyond is None else beyond
                 if load.acts_at(time) and load.acts_at(end):
                     beyond += load.force_at(time) - load.force_at(end)

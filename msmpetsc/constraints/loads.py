@@ -128,27 +128,27 @@ class Timed:
 class Load(Timed):
     """A force of nodes.
 
-    force : (owned, 3) [N]; with a table each node's share (owned, 1) [-] of its total
+    share : (owned, 1) of each node in the total [-]; of gravity its mass [kg]
+    total : what they share [N]; of gravity the acceleration [m/s^2]
     """
 
-    force: Rows
-    start: float
-    stop: float | None
-    table: Lines | None = None
+    share: Rows
+    total: Lines
+    start: float = 0.0
+    stop: float | None = None
 
     def force_at(self, time: float) -> Rows:
         """Return the force (owned, 3) [N] that acts at a time [s]."""
-        return self.force if self.table is None else self.force * like(self.force, self.table.value_at(time))
+        return self.share * like(self.share, self.total.value_at(time))
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
-        """Return whether it acts, and of a table the total."""
-        acts = self.acts_at(time)
-        return tuple(self.table.value_at(time).tolist()) if acts and self.table is not None else acts
+        """Return the total, or False where it does not act."""
+        return self.acts_at(time) and tuple(self.total.value_at(time).tolist())
 
     @property
     def events(self) -> list[float]:
         """Return the times [s] at which the force begins, ends or turns."""
-        return [*super().events, *([] if self.table is None else self.table.times.tolist())]
+        return [*super().events, *self.total.times.tolist()]
 
 
 @dataclass(frozen=True)
@@ -185,12 +185,8 @@ class OwnForce(Timed):
         return force
 
 
-def spread_by_mass(comm: "MPI.Comm", total: Iterable[float], where: Mask, mass: Floats) -> Rows:
-    """Spread a total force [N] over nodes in proportion to their mass, (owned, 3) [N] (collective).
-
-    where, mass : (owned,) bool, the nodes; (owned,) [kg]
-    """
+def shares_by_mass(comm: "MPI.Comm", where: Mask, mass: Floats) -> Rows:
+    """Return the shares (owned, 1) of nodes (owned,) bool in a force, as their mass (owned,) [kg] (collective)."""
     loaded = np.where(where, mass, 0.0)
-    whole = comm.allreduce(loaded.sum())
-    force: Rows = loaded[:, None] / whole * np.array([*total])
-    return force
+    share: Rows = loaded[:, None] / comm.allreduce(loaded.sum())
+    return share

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from msmpetsc.constraints.loads import Load, spread_by_mass
+from msmpetsc.constraints.loads import Load, shares_by_mass, total_of
 from msmpetsc.geometry.inside import inside
 from msmpetsc.scene.body import Region
 
@@ -42,10 +42,11 @@ def test_half_space_absolute_and_relative():
 def test_force_is_shared_out_by_mass():
     mass = np.array([1.0, 2.0, 5.0, 4.0])
     where = np.array([True, True, False, True])
-    force = spread_by_mass(MPI.COMM_SELF, (7.0, 0.0, -14.0), where, mass)
-    assert force == pytest.approx(np.array([[1, 0, -2], [2, 0, -4], [0, 0, 0], [4, 0, -8]]))
+    load = Load(shares_by_mass(MPI.COMM_SELF, where, mass), total_of((7.0, 0.0, -14.0)))
+    assert load.force_at(1.0) == pytest.approx(np.array([[1, 0, -2], [2, 0, -4], [0, 0, 0], [4, 0, -8]]))
 
 
 def test_a_time_that_is_rounded_beside_start_or_stop_counts_as_it():
     late = np.nextafter(1.8, 0)
-    assert not Load(np.zeros((1, 3)), 0.0, 1.8).acts_at(late) and Load(np.zeros((1, 3)), 1.8, 2.0).acts_at(late)
+    ends, begins = (Load(np.ones((1, 1)), total_of((0, 0, 1)), *times) for times in ((0.0, 1.8), (1.8, 2.0)))
+    assert not ends.acts_at(late) and begins.acts_at(late)

@@ -171,8 +171,8 @@ def refine(surface: Surface, share: float) -> Surface:
 def orient(surface: Surface) -> Surface:
     """Wind the triangles consistently, and each connected patch outwards (a cavity's too).
 
-    A patch is what hangs together by edges of exactly two triangles. An open one is turned by
-    the volume of the cone from its own middle.
+    A patch is what hangs together by edges of exactly two triangles. An open one is turned so
+    that most of it looks away from its own middle.
     """
     import igl
 
@@ -181,13 +181,8 @@ def orient(surface: Surface) -> Surface:
     used, forward = edge_use(turned)
     if ((used == 2) & (forward != 1)).any():
         raise InputError("it has one side only, as a Möbius band: no winding is consistent")
-    flipped = (turned != merged).any(axis=1)
-    corners = surface.points[surface.triangles]
-    count = np.bincount(patch)
-    middle = [np.bincount(patch, x) / count for x in corners.mean(axis=1).T]
-    a, b, c = (corners - np.stack(middle, axis=1)[patch][:, None]).swapaxes(0, 1)
-    cones = np.einsum("ij,ij->i", a, np.cross(b, c)) * np.where(flipped, -1, 1)
-    flipped ^= (np.bincount(patch, cones) < 0)[patch]
+    outward, _ = igl.orient_outward(surface.points, turned, patch[:, None])
+    flipped = (outward != merged).any(axis=1)
     triangles = np.where(flipped[:, None], surface.triangles[:, [0, 2, 1]], surface.triangles)
     return Surface(surface.points, triangles)
 

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import BytesIO, StringIO
-from logging import CRITICAL, getLogger
 from pathlib import Path
 
 import numpy as np
@@ -88,17 +87,11 @@ def _content(path: Path) -> bytes:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Suppress what readers print, log or warn; half-read numbers are errors."""
-    log = getLogger("trimesh")
-    level = log.level
-    log.setLevel(CRITICAL)
-    try:
-        with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-            warnings.simplefilter("ignore")
-            warnings.filterwarnings("error", message="string or file could not be read")
-            yield
-    finally:
-        log.setLevel(level)
+    """Suppress what readers print or warn; half-read numbers are errors."""
+    with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message="string or file could not be read")
+        yield
 
 
 @contextmanager

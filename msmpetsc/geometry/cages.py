@@ -18,7 +18,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
-from msmpetsc.geometry.valid_cells import Slab, cells_of_gaps, enclosed_gaps, touched_cells
+from msmpetsc.geometry.valid_cells import Slab, cells_of_gaps, enclosed_gaps, slab_edges, touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
@@ -167,8 +167,9 @@ def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int
 def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
     """Return the valid cells of a body in this rank's slab (collective)."""
     axes = _axes(body)
-    slab = Slab.of_rank(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
-    corners = _slab_triangles(body, grid, axes)
+    edges = slab_edges(body.comm.size, grid.shape[axes[0]])
+    slab = Slab(*edges[body.comm.rank : body.comm.rank + 2])
+    corners = _slab_triangles(body, grid, axes, edges)
     touched = _mark(corners, grid.shape[axes], slab)
     if not body.report.closed:
         return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
@@ -212,14 +213,14 @@ def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
         )
 
 
-def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices) -> Rows:
+def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices) -> Rows:
     """Return the triangles (f, 3, 3), in cell units, that reach this rank's slab (collective)."""
     corners = np.empty((0, 3, 3))
     if body.surface is not None:
         corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
     planes = np.floor(corners[:, :, 0]).astype(np.int64)
     first, last = (
-        Slab.owner(edge, body.comm.size, int(grid.shape[axes[0]])) for edge in (planes.min(axis=1), planes.max(axis=1))
+        np.searchsorted(edges[1:], plane, side="right") for plane in (planes.min(axis=1), planes.max(axis=1))
     )
     copies = last - first + 1
     rank = np.repeat(first, copies) + np.arange(copies.sum()) - np.repeat(np.cumsum(copies) - copies, copies)

@@ -9,7 +9,7 @@ bounding box. Each rank floods a slab of planes i; components that meet at a sla
 through one small graph of labels.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -126,26 +126,17 @@ def touched_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
     return cells[:used]
 
 
-@dataclass(frozen=True)
-class Slab:
-    """The planes first <= i < last that a rank fills, of ``planes`` in all; none on spare ranks."""
+class Slab(NamedTuple):
+    """The planes first <= i < last that a rank fills."""
 
     first: int
     last: int
-    planes: int
 
-    @classmethod
-    def of_rank(cls, rank: int, size: int, planes: int) -> "Slab":
-        """Return the slab of a rank among ``size`` of them."""
-        used = min(size, planes)
-        return cls(planes * min(rank, used) // used, planes * min(rank + 1, used) // used, planes)
 
-    @staticmethod
-    def owner(plane: Indices, size: int, planes: int) -> Indices:
-        """Return the rank whose slab holds each plane."""
-        used = min(size, planes)
-        edges = planes * np.arange(1, used, dtype=np.int64) // used
-        return np.searchsorted(edges, plane, side="right")
+def slab_edges(ranks: int, planes: int) -> Indices:
+    """Return where each rank's slab begins, and the last ends, (ranks + 1,); spare ranks have no planes."""
+    used = min(ranks, planes)
+    return planes * np.minimum(np.arange(ranks + 1), used) // used
 
 
 def enclosed_gaps(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:

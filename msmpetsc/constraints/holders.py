@@ -152,35 +152,24 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
         return int(comm.allreduce(int(where[: lattice.owned].sum())))
 
     words = []
-    pinned = lattice.pinned
     for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
-        where = masks[table.key]
-        _warn_of_overruled(table.key, count(where), count(where & pinned), count(where & ~anchor.where & ~pinned))
-        words.append(f"{table.key} leads {count(anchor.where)} nodes")
+        where, led = masks[table.key], count(anchor.where)
+        nodes, pinned = count(where), count(where & lattice.pinned)
+        if led < nodes:
+            text = f"{table.key}: of {nodes} nodes in its region pins hold {pinned}, "
+            text += f"and anchors before it lead {nodes - pinned - led}"
+            if not led:
+                raise InputError(f"{text}: it leads none")
+            log.warning("%s, which it does not lead", text)
+        words.append(f"{table.key} leads {led} nodes")
     for table in scene.tables("force"):
         where, force = masks[table.key], table.table
         until = math.inf if force.stop is None else force.stop
         lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]  # hold all the while
         nodes = count(where)
-        held = count(where & reduce(np.logical_or, lasting, pinned))
+        held = count(where & reduce(np.logical_or, lasting, lattice.pinned))
         if held == nodes and force.pulls:
-            raise InputError(
-                f"{table.key} moves nothing: of the {_nodes(nodes)} in its region none is free while it "
-                "acts, pins and anchors hold all"
-            )
+            free = f"of {nodes} nodes in its region none is free while it acts, pins and anchors hold all"
+            raise InputError(f"{table.key} moves nothing: {free}")
         words.append(f"{table.key} pulls {nodes} nodes" + f" ({held} of them held)" * bool(held))
     return tuple(words)
-
-
-def _warn_of_overruled(key: str, nodes: int, pinned: int, prescribed: int) -> None:
-    """Warn of an anchor's nodes that are pinned, or led by earlier anchors; raise if all are."""
-    if not pinned + prescribed:
-        return
-    text = f"{key}: of the {_nodes(nodes)} in its region pins hold {pinned}, and anchors before it lead {prescribed}"
-    if pinned + prescribed == nodes:
-        raise InputError(f"{text}: it leads none")
-    log.warning("%s, which it does not lead", text)
-
-
-def _nodes(count: int) -> str:
-    return f"{count} node{'s' * (count != 1)}"

@@ -285,7 +285,7 @@ def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders
         where = masks[anchor.key] & ~taken
         middle = holders.centers[holders.keys.index(anchor.key)]
         center = middle if anchor.table.center is None else np.array(anchor.table.center)
-        anchors.append(Anchor(where, Motion.through(anchor.table.path, center), anchor.table.stop))
+        anchors.append(Anchor(where, Motion.through(anchor.table.path, center), stop=anchor.table.stop))
         taken = taken | where
     if lattice.table.comm.allreduce(int((~taken[: lattice.owned]).sum())) == 0:
         what = "pin or anchor" if anchors else "pin"
@@ -304,14 +304,13 @@ def _loads(
     if gravity is not None:
         loads.append(Load(lattice.mass[:, None], total_of(gravity.acceleration)))
     for table in forces:
-        force = table.table
-        where = masks[table.key][: lattice.owned]
+        force, where = table.table, masks[table.key][: lattice.owned]
+        acts = {"start": force.start, "stop": force.stop}
         if force.total is not None:
-            share = shares_by_mass(comm, where, lattice.mass)
-            loads.append(Load(share, total_of(force.total), force.start, force.stop))
+            loads.append(Load(shares_by_mass(comm, where, lattice.mass), total_of(force.total), **acts))
         else:
             rows, function = np.flatnonzero(where), FORCES.find(force.function)
-            own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))
+            own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], **acts))
     return loads, tuple(own_forces)
 
 

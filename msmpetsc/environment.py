@@ -45,7 +45,7 @@ class Environment:
         )
         self._ended: tuple[Positions, Contact] | None = None  # the last step, if it had contact, and what there was
         self.touches = bool(self.penalties or self.self_contact)
-        self.standing = model.obstacles
+        self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
         self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
         self.has_sides = any(obstacle.solid.has_sides for obstacle in self.obstacles)
         self.pressing, self.exchanging = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
@@ -57,11 +57,8 @@ class Environment:
 
     def events(self) -> list[float]:
         """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
-        paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.standing)]
-        times = [time for path in paths for time in path.times.tolist()]
-        times += [time for load in self.pulling for time in load.events]
-        times += [time for obstacle in self.standing for time in (obstacle.start, obstacle.stop) if time is not None]
-        return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
+        turns = [time for moving in self.moving for time in moving.path.times.tolist()]
+        return turns + [time for timed in (*self.pulling, *self.moving) for time in timed.events]
 
     def begin_step(self, q: Positions, v: Rows, time: float) -> None:
         """Evaluate the forces that are functions, at the state (l, 3) [m], [m/s] that starts a step; they then stay.
@@ -105,7 +102,7 @@ class Environment:
 
     def anchors_at(self, time: float) -> list[Anchor]:
         """Return the anchors that have not let go."""
-        return [anchor for anchor in self.anchors if anchor.holds_at(time)]
+        return [anchor for anchor in self.anchors if anchor.acts_at(time)]
 
     def fixed_at(self, time: float) -> Mask:
         """Return the nodes (l,) bool that are no unknowns, pinned or held by an anchor."""
@@ -128,10 +125,8 @@ class Environment:
         """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
 
         def at(time: float) -> list[Any]:
-            loads = [load.state_at(time) for load in self.pulling]
-            anchors = [anchor.holds_at(time) and tuple(anchor.path.value_at(time)) for anchor in self.anchors]
-            obstacles = [o.acts_at(time) and tuple(o.path.value_at(time)) for o in self.standing]
-            return [*loads, *anchors, *obstacles]
+            loads: list[Any] = [load.state_at(time) for load in self.pulling]
+            return loads + [moving.acts_at(time) and tuple(moving.path.value_at(time)) for moving in self.moving]
 
         return at(begin) == at(end)
 

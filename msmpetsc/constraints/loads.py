@@ -87,28 +87,12 @@ def total_of(total: Vector | ForceTable) -> Lines:
     return Lines(np.zeros(1), np.array([total]))
 
 
-@dataclass(frozen=True)
-class Anchor:
-    """Nodes that a scene leads along a path, and lets go.
-
-    where : (l,) bool, the nodes, ghosts included
-    path  : how they move while time < stop [s]; a stop of None never comes
-    """
-
-    where: Mask
-    path: Motion
-    stop: float | None
-
-    def holds_at(self, time: float) -> bool:
-        """Return whether the anchor has not let go at a time [s]."""
-        return within(time, 0.0, self.stop)
-
-
+@dataclass(frozen=True, kw_only=True)
 class Timed:
     """What acts while start <= time < stop [s]; a stop of None never comes."""
 
-    start: float
-    stop: float | None
+    start: float = 0.0
+    stop: float | None = None
 
     def acts_at(self, time: float) -> bool:
         """Return whether it acts at a time [s]."""
@@ -125,6 +109,17 @@ class Timed:
 
 
 @dataclass(frozen=True)
+class Anchor(Timed):
+    """Nodes that a scene leads along a path, and lets go.
+
+    where : (l,) bool, the nodes, ghosts included
+    """
+
+    where: Mask
+    path: Motion
+
+
+@dataclass(frozen=True)
 class Load(Timed):
     """A force of nodes.
 
@@ -134,8 +129,6 @@ class Load(Timed):
 
     share: Rows
     total: Lines
-    start: float = 0.0
-    stop: float | None = None
 
     def force_at(self, time: float) -> Rows:
         """Return the force (owned, 3) [N] that acts at a time [s]."""
@@ -165,8 +158,6 @@ class OwnForce(Timed):
     function: ForceFunction
     rows: Indices
     mass: Floats
-    start: float
-    stop: float | None
 
     def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
         """Return the force (owned, 3) [N] at positions and velocities (owned, 3). Raises InputError for no numbers."""

@@ -32,7 +32,6 @@ class Obstacle(Timed):
 
     solid       : at its place at time 0
     path        : how it moves
-    start, stop : it is there while start <= time < stop [s]; None: to the end
     key         : of its table in the scene, for messages
     outside     : (l,) how far nodes stick out of the surface at rest [m] (build.nearest_of_body): they go so much
         deeper before the surface meets the obstacle. None: they are the surface
@@ -40,8 +39,6 @@ class Obstacle(Timed):
 
     solid: Solid
     path: Motion
-    start: float = 0.0
-    stop: float | None = None
     key: str = "obstacle"
     outside: Floats | None = None
 
@@ -101,7 +98,7 @@ def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Flo
                     wrong = f"its gradient is {length:.3g} long at most nodes, not 1"
                     raise InputError(f"{key}.function: no signed distance: {wrong}")
         path = Motion.through(table.path, table.center)
-        obstacles.append(Obstacle(solid, path, table.start, table.stop, key, outside))
+        obstacles.append(Obstacle(solid, path, key, outside, start=table.start, stop=table.stop))
     return obstacles
 
 

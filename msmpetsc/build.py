@@ -214,16 +214,10 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
     """Return the prepared surfaces, on rank 0, and what all ranks must know (collective)."""
-
-    def read() -> tuple[list[Surface], list[tuple[SurfaceReport, Rows]]]:
-        surfaces, reports = zip(*_prepared(scene), strict=True)
-        return list(surfaces), list(zip(reports, map(bounds_of, surfaces), strict=True))
-
-    surfaces, facts = on_root(comm, read) or (None, None)
-    of_bodies: Sequence[Surface | None] = surfaces or [None] * len(scene.meshes)
-    return tuple(
-        BodySurface(comm, surface, *known) for surface, known in zip(of_bodies, comm.bcast(facts), strict=True)
-    )
+    found = on_root(comm, lambda: [*_prepared(scene)]) or []
+    facts = comm.bcast([(report, bounds_of(surface)) for surface, report in found])
+    surfaces: list[Surface | None] = [surface for surface, _ in found] or [None] * len(facts)
+    return tuple(BodySurface(comm, surface, *known) for surface, known in zip(surfaces, facts, strict=True))
 
 
 def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
@@ -266,11 +260,8 @@ def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
 
 def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     """Return the scene's valid cells (collective)."""
-    cages = scene.cages
-    cell_size = cages.cell_size
-    if cages.count is not None:
-        cell_size = choose_cell_size(bodies, cages.count, cages.max_cells, cages.boundary)
-    assert cell_size is not None  # the schema has one of the two
+    cages = scene.cages  # which have a cell size or a count
+    cell_size = cages.cell_size or choose_cell_size(bodies, cages.count or 0, cages.max_cells, cages.boundary)
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 
@@ -304,7 +295,8 @@ def _loads(
     if gravity is not None:
         loads.append(Load(lattice.mass[:, None], total_of(gravity.acceleration)))
     for table in forces:
-        force, where = table.table, masks[table.key][: lattice.owned]
+        force = table.table
+        where = masks[table.key][: lattice.owned]
         acts = {"start": force.start, "stop": force.stop}
         if force.total is not None:
             loads.append(Load(shares_by_mass(comm, where, lattice.mass), total_of(force.total), **acts))
@@ -322,16 +314,12 @@ def _contacts(
     bounds : (b, 2, 3) of the bodies at rest [m]
     """
     exchanges, penalties = [], []
-    if tables:
-        usual, stick = PENALTY * lattice.stiffest(comm), STICK * smallest(bounds)
+    usual, stick = PENALTY * lattice.stiffest(comm), STICK * smallest(bounds)
     for obstacle, table in zip(obstacles, tables, strict=True):
-        restitution = 1.0 if table.restitution is None else table.restitution
-        if table.response == BARRIER:
-            continue
         if table.response == "exchange":
-            exchanges.append(Exchange(obstacle, restitution))
-            continue
-        stiffness, friction = table.stiffness or usual, table.friction or 0.0
-        slows = None if restitution == 1 else restitution
-        penalties.append(Penalty(obstacle, stiffness, friction, table.friction_speed or stick, slows))
+            exchanges.append(Exchange(obstacle, 1.0 if table.restitution is None else table.restitution))
+        elif table.response != BARRIER:
+            given = table.stiffness or usual, table.friction or 0.0, table.friction_speed or stick
+            slows = None if table.restitution == 1 else table.restitution
+            penalties.append(Penalty(obstacle, *given, slows))
     return exchanges, penalties

@@ -153,8 +153,8 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
 
     words = []
     for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
-        where, led = masks[table.key], count(anchor.where)
-        nodes, pinned = count(where), count(where & lattice.pinned)
+        where = masks[table.key]
+        nodes, pinned, led = map(count, (where, where & lattice.pinned, anchor.where))
         if led < nodes:
             text = f"{table.key}: of {nodes} nodes in its region pins hold {pinned}, "
             text += f"and anchors before it lead {nodes - pinned - led}"

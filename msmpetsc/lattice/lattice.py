@@ -150,7 +150,7 @@ def build_lattice(
         cell_share=np.ones(len(cages.kind)) if cages.share is None else cages.share.mean(axis=(1, 2, 3)),
         springs=net.springs,
         springs_owned=net.springs_owned,
-        rest_length=h * np.sqrt(net.kind),
+        rest_length=h * np.sqrt(KIND[net.direction]),
         stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
         pinned=np.zeros(len(net.ijk), bool),
         stiffening=stiffening,
@@ -171,7 +171,7 @@ class Topology(NamedTuple):
     cells   : (c, 8) local corner nodes of all cells around the owned nodes
     share   : (c, 8) of the corners of these cells; None where all are whole
     squares : (c, 3) of what is inside of them (geometry.fill_fractions); None where all are whole
-    kind    : (s,) of the springs, their squared lengths in cells
+    direction : (s,) of the springs from their first ends, as DIRECTION has it
     sharing : (s,) number of cells that share each spring
     """
 
@@ -185,7 +185,7 @@ class Topology(NamedTuple):
     squares: Rows | None
     springs: Indices
     springs_owned: int
-    kind: Indices
+    direction: Indices
     sharing: Indices
 
 
@@ -230,11 +230,11 @@ def _of_springs(net: Topology, h: float, material: Material, of_cells: MaterialO
         of_pairs = shares_of_pairs(share)
         of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
         mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-        of_spring = _sums_of_springs(net.cells, made_of.spring, of_pairs, net.ijk, net.springs, owned) / net.sharing
+        of_spring = _sums_of_springs(net, made_of.spring, of_pairs) / net.sharing
         law = LawConstants(mass, of_spring, share.mean(axis=1) * made_of.spring)
     if material.stiffness is not None:
         return law
-    springs = calibrated_stiffness(law.springs, h, net.kind, net.sharing)
+    springs = calibrated_stiffness(law.springs, h, KIND[net.direction], net.sharing)
     return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
 
 
@@ -260,7 +260,7 @@ def _of_solid(net: Topology, h: float, material: Material, of_cells: MaterialOfC
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
     most = 2 * shear + 3 * lame  # of |grad u|^2 in the second variation at rest
-    of_spring = _sums_of_springs(net.cells, -h * most, pairs, net.ijk, net.springs, owned)
+    of_spring = _sums_of_springs(net, -h * most, pairs)
     cells = SolidCells(forms, h**3 * volume, shear, lame)
     return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
 
@@ -283,14 +283,12 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mas
     return decode_morton(keys), local, octants
 
 
-def _sums_of_springs(cells: Indices, values: Floats, share: Rows, ijk: Indices, springs: Indices, owned: int) -> Floats:
-    """Return the sum (s,) of the ``values`` (c,) of the cells (c, 8) that share each spring (s, 2).
+def _sums_of_springs(net: Topology, values: Floats, share: Rows) -> Floats:
+    """Return the sum (s,) of the ``values`` (c,) of the cells that share each spring, on all its ranks in one order.
 
     share : (c, 8, 8) of its value that a cell gives to the spring between two of its corners
-    ijk   : (l, 3) grid index of the nodes. Ranks that have the same spring add in the same order, that of the cells.
     """
-    direction = (ijk[springs[:, 1]] - ijk[springs[:, 0]] + 1) @ np.array([9, 3, 1])
-    sums: Floats = _sums_by_direction(cells, values, share, owned)[springs[:, 0], direction]
+    sums: Floats = _sums_by_direction(net.cells, values, share, len(net.octants))[net.springs[:, 0], net.direction]
     return sums
 
 
@@ -310,7 +308,7 @@ def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int
     """Return the springs between the corners of cells, each once.
 
     cells   : (c, 8) local nodes; numbers (l,) global; nodes below ``owned`` are owned
-    returns : (s, 2) local ends, how many this rank owns, kind (s,), cells sharing each (s,)
+    returns : (s, 2) local ends, how many this rank owns, direction (s,), cells sharing each (s,)
     """
     neighbour = np.full((owned, 27), -1, np.int32)
     sharing = np.zeros((owned, 27), np.uint8)
@@ -326,7 +324,7 @@ def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int
             far = neighbour[node, direction]
             count += far >= 0 and direction != 13 and (numbers[far] > numbers[node] or far >= owned)
     springs = np.empty((count, 2), np.int32)
-    kind = np.empty(count, np.int64)
+    directions = np.empty(count, np.int64)
     shared = np.empty(count, np.int64)
     low, high = 0, count  # springs of this rank fill the front, the others the back
     for node in range(owned):
@@ -344,5 +342,5 @@ def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int
             else:
                 continue
             springs[s, 0], springs[s, 1] = node, far
-            kind[s], shared[s] = KIND[direction], sharing[node, direction]
-    return springs, low, kind, shared
+            directions[s], shared[s] = direction, sharing[node, direction]
+    return springs, low, directions, shared

@@ -125,7 +125,7 @@ class Geometry:
         return nearest_of_body(self.bodies, self.cages, self.topology)
 
     def outside(self, nodes: Positions) -> Floats | None:
-        """Return how far nodes (l, 3) [m] stick out of the surfaces [m]; None where cells count whole (collective)."""
+        """Return how far nodes (l, 3) stick out of the surfaces [m]; None where cells are whole (collective)."""
         return None if self.cages.share is None else np.linalg.norm(nodes - self.nearest, axis=1)
 
 
@@ -276,7 +276,8 @@ def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders
         where = masks[anchor.key] & ~taken
         middle = holders.centers[holders.keys.index(anchor.key)]
         center = middle if anchor.table.center is None else np.array(anchor.table.center)
-        anchors.append(Anchor(where, Motion.through(anchor.table.path, center), stop=anchor.table.stop))
+        path = Motion.through(anchor.table.path, center)
+        anchors.append(Anchor(where, path, stop=anchor.table.stop))
         taken = taken | where
     if lattice.table.comm.allreduce(int((~taken[: lattice.owned]).sum())) == 0:
         what = "pin or anchor" if anchors else "pin"
@@ -299,7 +300,8 @@ def _loads(
         where = masks[table.key][: lattice.owned]
         acts = {"start": force.start, "stop": force.stop}
         if force.total is not None:
-            loads.append(Load(shares_by_mass(comm, where, lattice.mass), total_of(force.total), **acts))
+            share = shares_by_mass(comm, where, lattice.mass)
+            loads.append(Load(share, total_of(force.total), **acts))
         else:
             rows, function = np.flatnonzero(where), FORCES.find(force.function)
             own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], **acts))

@@ -219,9 +219,8 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     if body.surface is not None:
         corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
     planes = np.floor(corners[:, :, 0]).astype(np.int64)
-    first, last = (
-        np.searchsorted(edges[1:], plane, side="right") for plane in (planes.min(axis=1), planes.max(axis=1))
-    )
+    reached = [planes.min(axis=1), planes.max(axis=1)]
+    first, last = np.searchsorted(edges[1:], reached, side="right")
     copies = last - first + 1
     rank = np.repeat(first, copies) + np.arange(copies.sum()) - np.repeat(np.cumsum(copies) - copies, copies)
     return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))

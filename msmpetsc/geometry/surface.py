@@ -85,7 +85,7 @@ def examine(surface: Surface) -> SurfaceReport:
 
 
 def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
-    """Return warnings about a surface whose inside is in doubt; none for a clean one.
+    """Return a line for each doubt about a surface's inside, with its remedy; none for a clean one.
 
     Flatness is measured along the principal axes, so that a tilted sheet is seen too. A closed
     surface is judged by its mean thickness, 2 |volume| / area, relative to its longest side.
@@ -103,11 +103,6 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
             "the mesh encloses no volume: it is folded onto itself, or its parts are wound "
             'against each other (for the latter: prepare = ["orient"])'
         )
-    return _warnings(report)
-
-
-def _warnings(report: SurfaceReport) -> list[str]:
-    """Return a line for each doubtful property of the surface, with its remedy."""
     doubts = {
         f"the mesh is open ({report.boundary_edges} boundary edges): the generalized winding number will decide what "
         'is inside; prepare = ["repair"] closes holes': report.boundary_edges,

@@ -134,7 +134,7 @@ def build_lattice(
     is_solid = material.poisson is not None
     stiffening = material.stiffening * (material.law == "stiffening")  # b of the springs' law, 0 for Hooke's
     first_owned = net.cells[:, 0] < len(net.octants)
-    others = ~first_owned & (stiffening > 0 or is_solid)  # they matter only where the law is of cells too
+    others = ~first_owned & (stiffening > 0 or is_solid)  # they matter where the law is of cells too
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])
     law = (_of_solid if is_solid else _of_springs)(net, h, material, of_cells)
     grids = cages.grids
@@ -284,12 +284,12 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mas
 
 
 def _sums_of_springs(net: Topology, values: Floats, share: Rows) -> Floats:
-    """Return the sum (s,) of the ``values`` (c,) of the cells that share each spring, on all its ranks in one order.
+    """Return the sum (s,) of ``values`` (c,) of the cells that share each spring, in one order on all ranks.
 
     share : (c, 8, 8) of its value that a cell gives to the spring between two of its corners
     """
-    sums: Floats = _sums_by_direction(net.cells, values, share, len(net.octants))[net.springs[:, 0], net.direction]
-    return sums
+    sums: Rows = _sums_by_direction(net.cells, values, share, len(net.octants))
+    return sums[net.springs[:, 0], net.direction]
 
 
 @numba.njit(cache=True)

@@ -125,7 +125,7 @@ class Geometry:
         return nearest_of_body(self.bodies, self.cages, self.topology)
 
     def outside(self, nodes: Positions) -> Floats | None:
-        """Return how far nodes (l, 3) stick out of the surfaces [m]; None where cells are whole (collective)."""
+        """Return how far nodes (l, 3) stick out of surfaces [m]; None where cells are whole (collective)."""
         return None if self.cages.share is None else np.linalg.norm(nodes - self.nearest, axis=1)
 
 

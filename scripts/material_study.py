@@ -43,7 +43,6 @@ OFFSETS = ((0.0, 0.0), (0.3, 0.7), (0.5, 0.5))  # of the grid across the bar [ce
 SPRINGS = None  # in place of Poisson's ratio of a neo-Hookean solid
 LAWS = {"springs": SPRINGS, "neo-Hookean": NU}
 KINDS = {"whole": ("whole", SPRINGS), "fill": ("fill", SPRINGS), "neo-Hookean": ("fill", NU)}  # of boundary cells
-COMM = MPI.COMM_SELF
 
 
 # ---- lattices, and the Hessian at rest
@@ -59,7 +58,7 @@ def lattice_of(
     """The lattice of a mesh in a grid that begins ``offset`` (3,) cells before it."""
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
     bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
-    cages = fill([BodySurface(COMM, surface, examine(surface), bounds)], h, boundary=boundary)
+    cages = fill([BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)], h, boundary=boundary)
     law = {} if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
     return build_lattice(cages, Material.model_validate({"density": DENSITY, "young_modulus": E} | law))
 
@@ -196,7 +195,7 @@ def steps(
     lattice: Lattice, t: float, q: np.ndarray, before: np.ndarray, loads: Iterable[np.ndarray], error: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """q_(n+1) and q_n, one pair for each of the loads (n, 3) [N]; from q_n and q_(n-1)."""
-    stepper = Stepper(COMM, lattice, t, find_preset("newton"), error=error)
+    stepper = Stepper(MPI.COMM_SELF, lattice, t, find_preset("newton"), error=error)
     try:
         for load in loads:
             q, before = stepper.step(StepProblem(q, 2 * q - before, load)).position, q

@@ -169,7 +169,7 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
         nodes = count(where)
         held = count(where & reduce(np.logical_or, lasting, lattice.pinned))
         if held == nodes and force.pulls:
-            free = f"of {nodes} nodes in its region none is free while it acts, pins and anchors hold all"
-            raise InputError(f"{table.key} moves nothing: {free}")
+            why = f"of {nodes} nodes in its region none is free while it acts, pins and anchors hold all"
+            raise InputError(f"{table.key} moves nothing: {why}")
         words.append(f"{table.key} pulls {nodes} nodes" + f" ({held} of them held)" * bool(held))
     return tuple(words)

@@ -177,7 +177,7 @@ class OwnForce(Timed):
 
 
 def shares_by_mass(comm: "MPI.Comm", where: Mask, mass: Floats) -> Rows:
-    """Return what each of nodes (owned,) bool has of a force, (owned, 1), as their mass [kg] (collective)."""
+    """Return the parts (owned, 1) that nodes (owned,) bool have of a force, by mass (collective)."""
     loaded = np.where(where, mass, 0.0)
     share: Rows = loaded[:, None] / comm.allreduce(loaded.sum())
     return share

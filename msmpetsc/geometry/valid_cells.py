@@ -134,7 +134,7 @@ class Slab(NamedTuple):
 
 
 def slab_edges(ranks: int, planes: int) -> Indices:
-    """Return where each rank's slab begins, and the last ends (ranks + 1,); spare ranks have none."""
+    """Return where the ranks' slabs begin and the last ends, (ranks + 1,); spare ranks have none."""
     used = min(ranks, planes)
     return planes * np.minimum(np.arange(ranks + 1), used) // used
 

@@ -125,16 +125,16 @@ class Lattice:
 def build_lattice(
     cages: Cages, material: Material, of_cells: MaterialOfCells | None = None, topology: "Topology | None" = None
 ) -> Lattice:
-    """Build masses and springs of the valid cells, of a boundary cell what is inside (cut_cells) (collective).
+    """Build masses and springs of valid cells, of boundary cells what is inside (cut_cells; collective).
 
     of_cells : what each cell is made of, where that is not ``material`` for all (lattice.region)
     topology : that of the cages, where it is known already
     """
     h, net = cages.grids.cell_size, topology or topology_of(cages)
     is_solid = material.poisson is not None
-    stiffening = material.stiffening * (material.law == "stiffening")  # b of the springs' law, 0 for Hooke's
+    stiffening = material.stiffening * (material.law == "stiffening")  # b, 0 for Hooke's law
     first_owned = net.cells[:, 0] < len(net.octants)
-    others = ~first_owned & (stiffening > 0 or is_solid)  # they matter where the law is of cells too
+    others = ~first_owned & (stiffening > 0 or is_solid)  # matter where the law is of cells too
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])
     law = (_of_solid if is_solid else _of_springs)(net, h, material, of_cells)
     grids = cages.grids
@@ -284,12 +284,13 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mas
 
 
 def _sums_of_springs(net: Topology, values: Floats, share: Rows) -> Floats:
-    """Return the sum (s,) of ``values`` (c,) of the cells that share each spring, in one order on all ranks.
+    """Return the sum (s,) of ``values`` (c,) of cells that share each spring, in one order on all ranks.
 
     share : (c, 8, 8) of its value that a cell gives to the spring between two of its corners
     """
-    sums: Rows = _sums_by_direction(net.cells, values, share, len(net.octants))
-    return sums[net.springs[:, 0], net.direction]
+    of_nodes = _sums_by_direction(net.cells, values, share, len(net.octants))
+    sums: Floats = of_nodes[net.springs[:, 0], net.direction]
+    return sums
 
 
 @numba.njit(cache=True)

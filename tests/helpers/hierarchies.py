@@ -6,15 +6,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-from lattices import block
+from lattices import ORIGIN, block, cages_of
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_array
 
-from msmpetsc.comm import SortedKeys
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.scene.body import Material
@@ -25,7 +22,6 @@ from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.presets import LATTICE_MULTIGRID
 
 CELL, YOUNG, DENSITY = 0.1, 2e5, 1000.0
-ORIGIN = np.array([1.0, -2.0, 3.0])
 COMM = MPI.COMM_SELF
 
 
@@ -93,10 +89,6 @@ def build(
 ) -> Lattice:
     """contrast : the cells beyond the middle of x are so many times stiffer; pins: the lowest nodes of x are held;
     poisson : of a solid."""
-    grid = Grid(ORIGIN, CELL, cells.max(axis=0) + 1)
-    mine = encode_morton(cells)[comm.rank :: comm.size]
-    table = SortedKeys(comm, mine)
-    cages = Cages(BodyGrids((grid,)), table, np.ones(len(table.keys), np.uint8))
     middle = cells[:, 0].mean()
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:
@@ -106,7 +98,7 @@ def build(
     stiff = {"law": "stiffening", "stiffening": stiffening} if stiffening else {}
     law = {"law": "neo-hookean", "poisson_ratio": poisson} if poisson else stiff
     material = Material(density=density, young_modulus=YOUNG, **law)
-    lattice = build_lattice(cages, material, of_cells if contrast != 1 else None)
+    lattice = build_lattice(cages_of(cells, CELL, comm), material, of_cells if contrast != 1 else None)
     low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
     return lattice.pin(lattice.nodes[:, 0] < low + 0.01 * CELL) if pins else lattice
 

@@ -19,12 +19,13 @@ E, H, DENSITY = 3e4, 0.2, 800.0
 T = 1 / 60
 GRAVITY = np.array([0, 0, -9.81])
 COMM = MPI.COMM_SELF
+ORIGIN = np.array([1.0, -2.0, 3.0])
 
 
-def cages_of(cells: np.ndarray, cell_size: float = H) -> Cages:
+def cages_of(cells: np.ndarray, cell_size: float = H, comm: MPI.Comm = COMM) -> Cages:
     """Cages made of exactly these cells (c, 3)."""
-    grid = Grid(np.array([1.0, -2.0, 3.0]), cell_size, cells.max(axis=0) + 1)
-    table = SortedKeys(MPI.COMM_SELF, encode_morton(cells))
+    grid = Grid(ORIGIN, cell_size, cells.max(axis=0) + 1)
+    table = SortedKeys(comm, encode_morton(cells)[comm.rank :: comm.size])
     return Cages(BodyGrids((grid,)), table, np.ones(len(table.keys), np.uint8))
 
 

@@ -111,13 +111,14 @@ class EnergyBalance:
             touch=environment.touch(q, time),
         )
 
-    def step(self, integrator: Integrator, before: State, time: float, time_step: float) -> tuple[StepResult, State]:
+    def step(self, integrator: Integrator, before: State, time: float) -> tuple[StepResult, State]:
         """Take the step of an integrator that ends at ``time``, and enter it into the energy budget (collective).
 
         Raises StepFailed where a number is not finite, or far more came from nowhere than the body ever had.
         """
         result, after = integrator.advance(before, time)
-        return result, replace(after, budget=self._examine(before, result, after, time, time_step))
+        budget = self._examine(before, result, after, time, integrator.time_step)
+        return result, replace(after, budget=budget)
 
     def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> EnergyBudget:
         v = (result.position - result.previous) / time_step

@@ -21,44 +21,45 @@ PREFIX = "fallback_"  # of the PETSc options of that
 WORDS = {"substep": "taken in shorter ones", "fallback": f"solved by {ROBUST}"}
 
 MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # str: prefix of its PETSc options
+TakeStep = Callable[[State, float], tuple[StepResult, State]]  # float: time of its end [s]
 
 
 class Recovery:
-    """Recovers the failed steps of one run. Integrators are made when they are needed, and kept while they are.
+    """Takes the steps of one run, failed ones another way: by integrators kept while they are needed.
 
     make    : makes an integrator
     balance : examines each step that one takes
+    take    : takes a step as the scene has it
     """
 
     state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
 
-    def __init__(self, scene: Scene, make: MakeIntegrator, balance: EnergyBalance):
-        self.time, self.solver, self.make, self.balance = scene.time, scene.solver, make, balance
+    def __init__(self, scene: Scene, make: MakeIntegrator, balance: EnergyBalance, take: TakeStep):
+        self.time, self.solver, self.make, self.balance, self.take = scene.time, scene.solver, make, balance, take
         self.on_failure, self.time_step = scene.safety.on_failure, scene.time.step
         self.spare: dict[int, Integrator] = {}  # by how often the step is halved
         self.recovered = 0  # steps
         self.level = 0  # that the next step begins with: a hard moment is seldom over at once
         self.deepest = 0  # level of the step in progress
 
-    @property
-    def is_on(self) -> bool:
-        """Whether the next step is recovered from its start, since the one before failed."""
-        return self.level > 0 and self.on_failure == "substep"  # else it was another scene that asked for it
-
-    def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time``, after its ``failure`` if any. Raises StepFailed."""
-        if failure and self.on_failure == "stop":
-            raise failure
-        if not self.recovered:
-            reason = str(failure).split("; try ")[0]
-            log.warning("t = %.6g s: the step %s: it is %s", time, reason, WORDS[self.on_failure])
+    def step(self, state: State, time: float) -> tuple[StepResult, State]:
+        """Take the step that ends at ``time``. Raises StepFailed."""
+        if not self.level or self.on_failure != "substep":  # a level may be of another scene
+            try:
+                return self.take(state, time)
+            except StepFailed as failure:
+                if self.on_failure == "stop":
+                    raise
+                if not self.recovered:
+                    reason = str(failure).split("; try ")[0]
+                    log.warning("t = %.6g s: the step %s: it is %s", time, reason, WORDS[self.on_failure])
         self.recovered += 1
         for integrator in self.spare.values():
             integrator.forget()  # so that a checkpoint need not remember them
         if self.on_failure == "fallback":
             result, after = self._take(0, state, time)
             return replace(result, cost=result.cost + Work(fallbacks=1)), after
-        return self._in_pieces(state, time, max(self.level, 1) if failure else self.level)
+        return self._in_pieces(state, time, self.level or 1)
 
     def sum_up(self) -> None:
         """Say at the end of a run how many steps were recovered."""
@@ -99,7 +100,7 @@ class Recovery:
             self.spare[level].set_up()
             self.spare[level].forget()  # as those that are kept
         before = state.over(self.time_step, short)
-        result, after = self.balance.step(self.spare[level], before, time, short)
+        result, after = self.balance.step(self.spare[level], before, time)
         previous = State(result.position, result.previous).over(short, self.time_step).q_previous
         return replace(result, previous=previous), after.over(short, self.time_step)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Any, ClassVar
 
@@ -113,7 +114,8 @@ class TimeLoop:
         if scene.time.error:
             self.adaptive = Adaptive(scene, self._make, self.balance)
         self.integrator = self.adaptive or self._make(scene.time, scene.solver)
-        self.recovery = Recovery(scene, self._make, self.balance)
+        take = self.adaptive.advance if self.adaptive else partial(self.balance.step, self.integrator)
+        self.recovery = Recovery(scene, self._make, self.balance, take)
         self.monitors, self.true_errors = Monitors(comm, model.lattice), TrueErrors()
         self.surface = None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
         self.forces = Forces(model, self.environment, self.elasticity)
@@ -157,15 +159,9 @@ class TimeLoop:
         self._overlaps(index, time)
         begin = perf_counter()
         try:
-            if self.recovery.is_on:
-                result, after = self.recovery.step(self.state, time, None)
-            elif self.adaptive:  # which has each of its own steps examined
-                result, after = self.adaptive.advance(self.state, time)
-            else:
-                result, after = self.balance.step(self.integrator, self.state, time, self.time_step)
+            result, self.state = self.recovery.step(self.state, time)
         except StepFailed as failure:
-            result, after = self._recovered(index, time, failure)
-        self.state = after
+            raise StepFailed(f"frame {index} (t = {time:.6g} s) {failure}", failure.kind, index) from None
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
@@ -173,21 +169,12 @@ class TimeLoop:
             assert isinstance(self.integrator, ImplicitEuler)  # which solves them
             errors = self.true_errors.errors(self.integrator.stepper, result.problem, result.position)
             self.effort.measure(errors)
-        self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
+        self.monitors.gain(index, time, self.state.budget, self.balance.remedy(result.explicit))
         self.step = index
         frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
         if index % REMEMBERED == 0:
             self._saved = self._save()
         return frame
-
-    def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State]:
-        """Take a failed step another way (collective). Raises StepFailed, naming the step."""
-        try:
-            if self.recovery.is_on:
-                raise failure
-            return self.recovery.step(self.state, time, failure)
-        except StepFailed as last:
-            raise StepFailed(f"frame {index} (t = {time:.6g} s) {last}", last.kind, index) from None
 
     def _overlaps(self, index: int, time: float) -> None:
         self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)

@@ -292,7 +292,7 @@ class Adaptive(Integrator):
             level = self.ticks.fitting(self.tick, longest)
             before, end = self._begun(state, level, restarts), self._reached(self.tick + self.ticks.length(level))
             try:
-                result, after = self.balance.step(self._integrator(level), before, end, self._length(level))
+                result, after = self.balance.step(self._integrator(level), before, end)
                 measure = self._measure(before, result, after, level)
                 stands = self.control.accepts(level, measure)
             except StepFailed:

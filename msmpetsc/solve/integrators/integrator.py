@@ -89,9 +89,11 @@ class State:
 class Integrator(Protocol):
     """Takes steps of one length. All methods are collective.
 
+    time_step  : [s]
     looks_back : it has a use for State.history
     """
 
+    time_step: float
     looks_back: bool = False
 
     def set_up(self) -> None:

@@ -4,6 +4,7 @@ Monitors warn once: of cells inside out, steps that ended far from their solutio
 nodes inside an obstacle that comes to be there. Besides: true errors of steps, and where the time went.
 """
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,13 +17,13 @@ from msmpetsc.contact.obstacles.moving_solid import describe_overlap
 from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.energy_balance import MUCH
 from msmpetsc.solve.integrators.integrator import EnergyBudget
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, REFERENCE, begun, seconds
 from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.work import NO_WORK
 
 REFERENCE_PRESET, REFERENCE_ERROR = "newton-multigrid", 1e-10
 REFERENCE_PREFIX = "reference_"  # of its PETSc options
@@ -56,15 +57,9 @@ class TrueErrors:
         if self.reference is None or self.stepper is not stepper:  # an anchor let go
             self.destroy()
             self.stepper = stepper
-            self.reference = Stepper(
-                stepper.comm,
-                stepper.lattice,
-                stepper.time_step,
-                find_preset(REFERENCE_PRESET),
-                REFERENCE_ERROR,
-                touches=stepper.touches,
-                prefix=REFERENCE_PREFIX,
-                static=stepper.static,
+            preset = find_preset(REFERENCE_PRESET)
+            self.reference = replace(
+                stepper, preset=preset, error=REFERENCE_ERROR, max_iterations=None, prefix=REFERENCE_PREFIX
             )
             self.reference.set_up()
         return self.reference
@@ -103,67 +98,70 @@ def times(comm: MPI.Comm, before: dict[str, float]) -> dict[str, float]:
 
 
 class Monitors:
-    """Monitors of one run. All ranks warn alike, rank 0 is heard."""
+    """Monitors of one run. All ranks warn alike, rank 0 is heard.
+
+    work : of the steps since the frame stored before
+    """
 
     state: ClassVar[dict[str, Range]] = {
-        **dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT), "worst_error": ANY, "worst_gain": ANY
-    }  # fmt: skip
+        **dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT),
+        **dict.fromkeys(("worst_error", "worst_gain", "work"), ANY),
+    }
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        self.comm, self.lattice = comm, lattice
+    def __init__(self, environment: Environment, time_step: float):
+        self.environment, self.time_step, self.lattice = environment, time_step, environment.lattice
+        self.comm = self.lattice.table.comm
         self.frames = self.most = self.now = self.far = self.gaining = 0
         self.worst_error = self.worst_gain = 0.0
+        self.work = NO_WORK
+
+    def _warn(self, index: int, time: float, text: str) -> None:
+        log.warning("frame %d (t = %.6g s): %s", index, time, text)
 
     def inverted(self, index: int, time: float, q: Positions) -> int:
         """Count the cells inside out at q (l, 3) [m] (collective)."""
-        self.now, position = worst_inverted(self.comm, self.lattice, q)
+        self.now, worst = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
             remedy = "a smaller time.step or a smaller solver.error helps to keep them as they were"
             if not self.lattice.stiffening > 0 and self.lattice.solid is None:
                 remedy = 'springs cannot turn them back, material.law = "neo-hookean" can'
-            log.warning(
-                "frame %d (t = %.6g s): %d cell%s inside out, the worst %s; %s",
-                index, time, self.now, "s are" if self.now > 1 else " is", position, remedy,
-            )  # fmt: skip
+            are = "s are" if self.now > 1 else " is"
+            self._warn(index, time, f"{self.now} cell{are} inside out, the worst {worst}; {remedy}")
         self.frames += self.now > 0
         self.most = max(self.most, self.now)
         return self.now
 
-    def error(self, index: int, time: float, error: float) -> None:
+    def error(self, index: int, time: float) -> None:
         """Take note of the estimated error of a frame's steps."""
+        error = self.work.step_error
         if not error <= FAR:
             if not self.far:
                 off = "with no minimum near"
                 if np.isfinite(error):
                     off = f"{error:.2g} off its solution, relative to what forces moved"
-                log.warning(
-                    "frame %d (t = %.6g s): its step ended %s; more solver.max_iterations, a solver.error in their "
-                    "place, or a smaller time.step mend that",
-                    index, time, off,
-                )  # fmt: skip
+                mends = "more solver.max_iterations, a solver.error in their place, or a smaller time.step mend that"
+                self._warn(index, time, f"its step ended {off}; {mends}")
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
-    def overlaps(self, index: int, environment: Environment, q: Positions, time: float, time_step: float) -> None:
+    def overlaps(self, index: int, time: float, q: Positions) -> None:
         """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3)
         [m] before it (collective)."""
-        new = [o for o in environment.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
-        for obstacle in new:
-            overlapping = describe_overlap(self.comm, self.lattice, obstacle, q, environment.fixed_at(time), time)
-            if overlapping:
-                log.warning(
-                    'frame %d (t = %.6g s): %s; "exchange" leaves nodes inside, other responses push them out',
-                    index, time, overlapping,
-                )  # fmt: skip
+        for obstacle in self.environment.obstacles:
+            if not obstacle.acts_at(time) or (index and obstacle.acts_at(time - self.time_step)):
+                continue
+            fixed = self.environment.fixed_at(time)
+            overlap = describe_overlap(self.comm, self.lattice, obstacle, q, fixed, time)
+            if overlap:
+                self._warn(index, time, f'{overlap}; "exchange" leaves nodes inside, other responses push them out')
 
     def gain(self, index: int, time: float, budget: EnergyBudget, remedy: str) -> None:
         """Take note of what the body has from nowhere after a step, and of what mends that."""
         if not budget.share <= MUCH:
             if not self.gaining:
-                log.warning(
-                    "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; try %s",
-                    index, time, 100 * budget.share, budget.share * budget.put_in, budget.put_in, remedy,
-                )  # fmt: skip
+                part = f"{budget.share * budget.put_in:.2g} J of {budget.put_in:.2g} J"
+                share = f"{100 * budget.share:.2g}% of all energy"
+                self._warn(index, time, f"{share}, {part}, came from nowhere; try {remedy}")
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, budget.share)
 

@@ -1,10 +1,10 @@
 """The run: one step after another, those that are stored yielded as frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
-from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
+from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.comm import Route
 from msmpetsc.constraints.holders import sums_by
 from msmpetsc.contact.obstacles.penalty import Contact
@@ -38,7 +38,7 @@ from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
-from msmpetsc.solve.recovery import ROBUST, Recovery
+from msmpetsc.solve.recovery import ROBUST, Recovery, TakeStep
 from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import NO_WORK, Work
 
@@ -73,21 +73,6 @@ def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
         raise InputError("the true error is of a step that is solved: verlet has none")
 
 
-@dataclass
-class Effort:
-    """Work and true errors of the steps since the frame stored before."""
-
-    state: ClassVar[dict[str, Range]] = {"work": ANY, "true_error": ANY, "energy_error": ANY}
-
-    work: Work = NO_WORK
-    true_error: float = np.nan
-    energy_error: float = np.nan
-
-    def measure(self, errors: Rows) -> None:
-        """Take note of a step whose true errors were measured."""
-        self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
-
-
 class TimeLoop:
     """The loop over the steps of a run, from its start. A context manager, which destroys its PETSc objects on leaving.
 
@@ -114,17 +99,18 @@ class TimeLoop:
         if scene.time.error:
             self.adaptive = Adaptive(scene, self._make, self.balance)
         self.integrator = self.adaptive or self._make(scene.time, scene.solver)
-        take = self.adaptive.advance if self.adaptive else partial(self.balance.step, self.integrator)
+        take: TakeStep = partial(self.balance.step, self.integrator)
+        if self.adaptive:  # which has each of its own steps examined
+            take = self.adaptive.advance
         self.recovery = Recovery(scene, self._make, self.balance, take)
-        self.monitors, self.true_errors = Monitors(comm, model.lattice), TrueErrors()
+        self.monitors, self.true_errors = Monitors(self.environment, self.time_step), TrueErrors()
         self.surface = None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
         self.forces = Forces(model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
-        self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
-        self.time_error = np.nan  # estimated, of the trajectory so far
+        self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
         self._saved = Checkpoint()
 
     def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
@@ -141,7 +127,7 @@ class TimeLoop:
     def advance(self) -> Iterator[Frame | None]:
         """Yield the same, and None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
-            self._overlaps(0, 0.0)
+            self.monitors.overlaps(0, 0.0, self.state.q)
             self.balance.show(self.state.q, self.state.velocity(self.time_step), 0.0, self.state.sides)
             yield self._frame(0, self.state.q)
         while self.step < self.steps:
@@ -156,28 +142,24 @@ class TimeLoop:
     def _advance(self, index: int) -> Frame | None:
         """Take the next step (collective); its frame if it is stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
-        self._overlaps(index, time)
+        self.monitors.overlaps(index, time, self.state.q)
         begin = perf_counter()
         try:
             result, self.state = self.recovery.step(self.state, time)
         except StepFailed as failure:
             raise StepFailed(f"frame {index} (t = {time:.6g} s) {failure}", failure.kind, index) from None
-        self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
-        self.time_error = result.time_error
+        self.monitors.work += result.cost + Work(wall_time=perf_counter() - begin)
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
         if self.true_error and index % self.true_error == 0 and result.problem and not is_recovered:
             assert isinstance(self.integrator, ImplicitEuler)  # which solves them
-            errors = self.true_errors.errors(self.integrator.stepper, result.problem, result.position)
-            self.effort.measure(errors)
+            true, energy = self.true_errors.errors(self.integrator.stepper, result.problem, result.position)
+            self.monitors.work += Work(true_error=true, energy_error=energy)
         self.monitors.gain(index, time, self.state.budget, self.balance.remedy(result.explicit))
         self.step = index
         frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
         if index % REMEMBERED == 0:
             self._saved = self._save()
         return frame
-
-    def _overlaps(self, index: int, time: float) -> None:
-        self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)
 
     def saved(self) -> Checkpoint:
         """The last step that the run may go on from: every ``REMEMBERED``-th."""
@@ -190,7 +172,7 @@ class TimeLoop:
         self.state.save(checkpoint, self.model.lattice.owned, self.integrator.looks_back, self.environment.has_sides)
         self.integrator.save(checkpoint)
         self.environment.forget()
-        for part in self._counting():
+        for part in (self.recovery, self.monitors):
             checkpoint.keep_counts(part)
         return checkpoint
 
@@ -199,14 +181,11 @@ class TimeLoop:
         checkpoint.refuse_rows_unlike(self.comm, self.saved())
         self.step = checkpoint.step
         self.state = State.restored(self.comm, self.model.lattice, checkpoint)
-        for part in self._counting():
+        for part in (self.recovery, self.monitors):
             checkpoint.restore_counts(part)
         if self.step:
             self.integrator.restore(checkpoint, self.step * self.time_step)
         self._saved = self._save()
-
-    def _counting(self) -> list[Counting]:
-        return [self.recovery, self.monitors, self.effort]
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
@@ -217,12 +196,12 @@ class TimeLoop:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
         time = index * self.time_step
         energies = self.balance.energies
-        effort = self.effort
+        work = self.monitors.work
         gained = self.state.budget.since_frame
+        self.monitors.error(index, time)
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
-            self.effort = Effort()
+            self.monitors.work = NO_WORK
             self.state = replace(self.state, budget=replace(self.state.budget, since_frame=0.0))
-        self.monitors.error(index, time, effort.work.step_error)
         position = to_host(q[: self.model.lattice.owned])
         return Frame(
             index=index,
@@ -235,10 +214,8 @@ class TimeLoop:
             self_contacts=energies.touch.contacts,
             self_distance=energies.touch.distance,
             self_contact=energies.touch.energy,
-            true_error=effort.true_error,
-            energy_error=effort.energy_error,
-            time_error=self.time_error,
-            **vars(effort.work),
+            time_error=step.time_error if step else np.nan,
+            **vars(work),
             probe=self.probe(q) if self.probe else None,
             **self.forces(q, time, self.state.sides, step),
             **(self.stress(q) if self.stress else {}),

@@ -80,7 +80,7 @@ def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Sign
 def assert_equal(found: dict, expected: dict) -> None:
     """Frames or checkpoints, bit by bit, but for how long they took."""
     assert found.keys() == expected.keys()
-    for name in expected.keys() - {"wall_time", "Effort.work.wall_time"}:
+    for name in expected.keys() - {"wall_time", "Monitors.work.wall_time"}:
         assert expected[name] is None or np.array_equal(found[name], expected[name], equal_nan=True), name
 
 

@@ -118,7 +118,7 @@ DAMAGE = [
     (dangling, "checkpoint/step"), (without, "surface/triangles"), (a_group, "surface/points"),
     (short, "lattice/springs"), (without, "lattice/cells"), (dangling, "embedding/weights"),
     (dangling, "lattice/cell_kind"), (a_group, "frames/surface"), (number(5), "LowestCurvature.knows_mode"),
-    (number(np.inf), "Effort.work.iterations"), (number(np.nan), "put_in"),
+    (number(np.inf), "Monitors.work.iterations"), (number(np.nan), "put_in"),
     (number(-1), "Monitors.frames"), (number(np.nan), "LowestCurvature.searched.total"),
 ]  # fmt: skip
 

@@ -13,7 +13,7 @@ from msmpetsc.build import Model
 from msmpetsc.constraints.loads import Anchor, Load, OwnForce
 from msmpetsc.contact.obstacles.friction import Movers, apply_friction
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
+from msmpetsc.contact.obstacles.penalty import Contact, Penalty
 from msmpetsc.contact.obstacles.reflection import StepTaken, slowed
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
 from msmpetsc.contact.surface.term import SurfaceContact
@@ -140,8 +140,6 @@ class Environment:
         before : (o, n) the sides when the step began
         held   : (n,) bool, the nodes that do not give way: they have no side
         """
-        if not self.has_sides:
-            return self.no_sides[:, : len(q)]
         sides = np.zeros((len(self.obstacles), len(q)), np.int8, like=q)
         for row, obstacle in enumerate(self.obstacles):
             if obstacle.solid.has_sides:
@@ -149,13 +147,12 @@ class Environment:
                 sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, side_before))
         return sides
 
-    def same_push(self, q: Positions, time: float, sides_a: Indices, sides_b: Indices) -> bool:
-        """Return whether penalties press on this rank's nodes at q alike with both sides (o, l)."""
+    def same_push(self, q: Positions, time: float, a: Indices, b: Indices) -> bool:
+        """Return whether penalties press alike on nodes at q with both sides (o, l) (collective)."""
         rows = q[: self.lattice.owned]
-        states = zip(self._states(time, sides_a), self._states(time, sides_b), strict=True)
-        return all(
-            np.array_equal(np.maximum(a.depths(rows)[0], 0), np.maximum(b.depths(rows)[0], 0)) for a, b in states
-        )
+        pressing = [row for row, p in enumerate(self.penalties) if p.obstacle.acts_at(time)]
+        pushed = ([self._pushed(row, (rows, side), time) for row in pressing] for side in (a, b))
+        return bool(self.lattice.table.comm.allreduce(all(map(np.array_equal, *pushed)), MPI.LAND))
 
     def contact(
         self,
@@ -212,11 +209,8 @@ class Environment:
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
         """Return what presses at a time, without friction; None if nothing does."""
-        states = self._states(time, sides)
+        states = [p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
         return Contact(states, self.lattice.owned) if states else None
-
-    def _states(self, time: float, sides: Indices | None) -> list[ContactState]:
-        return [p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
 
     def apply_friction(
         self, nodes: Movers, time: float, duration: float, substep: tuple[float, float], sides: Indices

@@ -27,7 +27,6 @@ from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators.integrator import Integrator, State
@@ -53,7 +52,6 @@ class ContactFaces:
     is_settled : the problem solved last was the right one
     """
 
-    comm: MPI.Comm
     environment: Environment
     q: Positions
     y: Positions
@@ -87,12 +85,9 @@ class ContactFaces:
         crossed, pressing = self._crossed(x), self.environment.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1
-        environment, differs = self.environment, False
-        if environment.has_sides and environment.penalties:  # which may press otherwise
-            alike = environment.same_push(x, self.time, self.sides, sides)
-            differs = self.comm.allreduce(not alike, MPI.LOR)
-        self.is_settled = not differs
-        if differs:
+        environment = self.environment
+        self.is_settled = not environment.has_sides or environment.same_push(x, self.time, self.sides, sides)
+        if not self.is_settled:
             self.sides = sides
             if self.solves == MOST_SOLVES:
                 raise StepFailed(
@@ -104,7 +99,7 @@ class ContactFaces:
         if self.end is None and environment.friction_lags(x, self.contact):
             self.end, self.is_settled = x, False
             return
-        if self.environment.penalties:  # what reflects goes by the way to x alone
+        if environment.penalties:  # what reflects goes by the way to x alone
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
         self.sides = crossed
 
@@ -127,7 +122,7 @@ class ImplicitEuler(Integrator):
         self.damping, self.retardation = environment.damping, environment.retardation
         self.tau = self._first_tau()
         self.anchors = environment.anchors_at(self.time_step)
-        self.stepper = self._new_stepper(self._lattice_at(self.time_step))
+        self.stepper = self._new_stepper(self.time_step)
 
     def _first_tau(self) -> float:
         return self.SHARE * self.time_step
@@ -172,7 +167,7 @@ class ImplicitEuler(Integrator):
         q_before : (l, 3) [m] one step before the state, of a step that looks so far back
         """
         fixed = self.stepper.lattice.pinned
-        faces = ContactFaces(self.comm, self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
+        faces = ContactFaces(self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         while not faces.is_settled:
             problem = replace(faces.problem(), rates=rates)
@@ -193,12 +188,9 @@ class ImplicitEuler(Integrator):
         taken = -viscosity.change(result.position, problem.fixed)
         return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
 
-    def _lattice_at(self, time: float) -> Lattice:
-        return self.environment.lattice.pin(self.environment.fixed_at(time))
-
-    def _new_stepper(self, lattice: Lattice) -> Stepper:
-        """Make the solver for the free nodes of a lattice."""
-        solver = self.solver
+    def _new_stepper(self, time: float) -> Stepper:
+        """Make the solver for the nodes that are free at a time [s]."""
+        solver, lattice = self.solver, self.environment.lattice.pin(self.environment.fixed_at(time))
         if self.retardation:
             factor = self.retardation / self.tau
             lattice = replace(lattice, stiffness=(1 + factor) * lattice.stiffness, viscous=factor)
@@ -221,7 +213,7 @@ class ImplicitEuler(Integrator):
             self.anchors = anchors
             self.destroy()
             self.tau = self._first_tau()  # whatever came before: a resumed run has not seen it
-            self.stepper = self._new_stepper(self._lattice_at(time))
+            self.stepper = self._new_stepper(time)
             self.set_up()
 
     def save(self, checkpoint: Checkpoint) -> None:

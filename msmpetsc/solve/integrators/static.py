@@ -83,7 +83,6 @@ class LoadPath:
     displaced  : whether the state before is a start, and not the rest shape
     """
 
-    comm: MPI.Comm
     stepper: Stepper
     environment: Environment
     state: State
@@ -96,9 +95,9 @@ class LoadPath:
         self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
         self.sides = self.state.sides
         first, lattice = self.time < 1.5 * self.time_step, self.stepper.lattice
-        at_rest = self.comm.allreduce(bool((self.base == lattice.nodes).all()), MPI.LAND)
+        at_rest = self.stepper.comm.allreduce(bool((self.base == lattice.nodes).all()), MPI.LAND)
         self.displaced = first and not at_rest
-        self.inverted = 0 if first else worst_inverted(self.comm, lattice, self.base)[0]
+        self.inverted = 0 if first else worst_inverted(self.stepper.comm, lattice, self.base)[0]
         self.holding: Rows | None = None  # r (owned, 3) [N], which keeps free nodes where they are; once asked for
         self.problem: StepProblem | None = None
 
@@ -109,13 +108,13 @@ class LoadPath:
         q = self.known[-1][1]
         time_step = 0.0 if len(self.known) > 1 else self.time_step  # obstacles move in the first load step alone
         fixed = self.stepper.lattice.pinned
-        faces = ContactFaces(self.comm, self.environment, q, q, self.time, time_step, self.sides, fixed)
+        faces = ContactFaces(self.environment, q, q, self.time, time_step, self.sides, fixed)
         while not faces.is_settled:
             problem = self._problem(faces.problem(), share)
             result = self.stepper.step(problem, self._guess(problem, share))
             faces.compare(result.position)
         lattice = self.stepper.lattice
-        count, where = worst_inverted(self.comm, lattice, result.position, corners=self.displaced)
+        count, where = worst_inverted(self.stepper.comm, lattice, result.position, corners=self.displaced)
         if steps.may_be_refused and count > self.inverted:
             raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
         self.known = [self.known[-1], (share, result.position)]
@@ -182,7 +181,7 @@ class Static(ImplicitEuler):
         if lowest > 0 and not WILL_DO[0] <= lowest <= WILL_DO[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()
-            self.stepper = self._new_stepper(self.stepper.lattice)
+            self.stepper = replace(self.stepper, time_step=self.damped_tau)
             self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
@@ -192,7 +191,7 @@ class Static(ImplicitEuler):
             return StepResult(state.q, state.q, Work(self.error, steps=1), static=True, problem=self.problem), state
         stepper = self.stepper
         begun = stepper.work_so_far()
-        path = LoadPath(self.comm, stepper, self.environment, state, time, self.time_step)
+        path = LoadPath(stepper, self.environment, state, time, self.time_step)
         result, path = self._follow(path)
         q, self.problem, self.error = result.position, path.problem, result.cost.step_error
         cost = replace(stepper.work_so_far() - begun, steps=1, step_error=self.error)

@@ -65,16 +65,6 @@ NEWTON = {
     **LATTICE_MULTIGRID,
 }
 
-LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
-    "npc_snes_type": "newtonls",
-    "npc_snes_linesearch_type": "basic",
-    "npc_snes_max_it": "1",
-    "npc_snes_norm_schedule": "none",
-    "npc_snes_divergence_tolerance": "-1",  # an impact may begin with 1e4 times y's residual
-    **JACOBI_CG,
-    "ksp_rtol": "1e-1",
-}
-
 PRESETS = {
     "anderson": Preset(
         "Anderson-accelerated local/global iterations with loose CG solves: easy steps to few digits, no Hessian",
@@ -83,7 +73,13 @@ PRESETS = {
             "snes_anderson_m": "5",
             "snes_npc_side": "left",
             "snes_max_it": "300",
-            **LOCAL_GLOBAL,
+            "npc_snes_type": "newtonls",  # a plain iteration, which preconditions the SNES
+            "npc_snes_linesearch_type": "basic",
+            "npc_snes_max_it": "1",
+            "npc_snes_norm_schedule": "none",
+            "npc_snes_divergence_tolerance": "-1",  # an impact may begin with 1e4 |F(y)|
+            **JACOBI_CG,
+            "ksp_rtol": "1e-1",
         },
         inexact=True,
     ),
@@ -148,7 +144,7 @@ PRESETS = {
 
 
 # a user who chooses another type does not want what only goes with ours
-BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_norm_type"}}
+BOUND_TO_TYPE = {"pc_type": "pc_factor_mat_solver_type", "ksp_type": "ksp_norm_type"}
 # these solve with A or the Hessian themselves, without a plain iteration as their preconditioner
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
 
@@ -214,10 +210,8 @@ class SolverOptions:
         database = PETSc.Options()
         given = [name for name in database.getAll() if name.startswith(prefix) and not in_use[name]]
         users = {name.removeprefix(prefix) for name in given}
-        ours = options.keys() - users
-        for chosen, bound in BOUND_TO_TYPE.items():
-            if chosen in users:
-                ours -= bound
+        bound = {BOUND_TO_TYPE[name] for name in BOUND_TO_TYPE.keys() & users}
+        ours = options.keys() - users - bound
         if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
             ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
         for name in ours:

@@ -23,7 +23,7 @@ from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, REFERENCE, begun, seconds
 from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.work import NO_WORK
+from msmpetsc.solve.work import Work
 
 REFERENCE_PRESET, REFERENCE_ERROR = "newton-multigrid", 1e-10
 REFERENCE_PREFIX = "reference_"  # of its PETSc options
@@ -113,7 +113,7 @@ class Monitors:
         self.comm = self.lattice.table.comm
         self.frames = self.most = self.now = self.far = self.gaining = 0
         self.worst_error = self.worst_gain = 0.0
-        self.work = NO_WORK
+        self.work = Work()
 
     def _warn(self, index: int, time: float, text: str) -> None:
         log.warning("frame %d (t = %.6g s): %s", index, time, text)

@@ -40,7 +40,7 @@ from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery, TakeStep
 from msmpetsc.solve.refused_options import refuse_unused
-from msmpetsc.solve.work import NO_WORK, Work
+from msmpetsc.solve.work import Work
 
 Integrators = dict[str, type[ImplicitEuler] | type[Verlet]]
 INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet, "static": Static}
@@ -200,7 +200,7 @@ class TimeLoop:
         gained = self.state.budget.since_frame
         self.monitors.error(index, time)
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
-            self.monitors.work = NO_WORK
+            self.monitors.work = Work()
             self.state = replace(self.state, budget=replace(self.state.budget, since_frame=0.0))
         position = to_host(q[: self.model.lattice.owned])
         return Frame(

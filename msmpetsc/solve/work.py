@@ -31,6 +31,5 @@ class Work:
         return replace(self, **{name: vars(self)[name] - vars(before)[name] for name in COUNTED})
 
 
-NO_WORK = Work()
 ERRORS = ("step_error", "true_error", "energy_error")
-COUNTED = [name for name in vars(NO_WORK) if name not in ERRORS]  # what adds up
+COUNTED = [name for name in vars(Work()) if name not in ERRORS]  # what adds up

@@ -67,7 +67,7 @@ def test_steps_start_at_multiples_of_themselves_and_end_at_events_and_at_the_end
     assert ticks.fitting(0, 6) == 1  # two steps, then half of the next two would be beyond the event
     assert ticks.fitting(2 * 16, 1) == 0
     assert ticks.fitting(3 * 16 + 1, 6) == -4
-    assert ticks.is_event(3 * 16) and not ticks.is_event(3 * 16 + 1)
+    assert 3 * 16 in ticks.events and 3 * 16 + 1 not in ticks.events
     tick, ends = 0, []
     while tick < ticks.ticks:
         level = ticks.fitting(tick, 6)

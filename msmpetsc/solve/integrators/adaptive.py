@@ -173,7 +173,7 @@ class Ticks:
     """Times of steps, counted in ticks: the shortest step. A step of a level starts at a multiple of its own length,
     so that frames lie at ends of steps or within one; none goes beyond a known event, nor the end of the run.
 
-    events : times [s] at which something begins, ends or turns, as near as ``NEAREST`` levels below a step
+    events : ticks at which something begins, ends or turns, of times [s] as near as ``NEAREST`` levels below a step
     """
 
     NEAREST = 4
@@ -198,10 +198,6 @@ class Ticks:
         while level > self.lowest and (tick % self.length(level) or tick + self.length(level) > limit):
             level -= 1
         return level
-
-    def is_event(self, tick: int) -> bool:
-        """Whether something begins, ends or turns at a tick."""
-        return tick in self.events
 
 
 class Adaptive(Integrator):
@@ -262,8 +258,7 @@ class Adaptive(Integrator):
         """Take the steps up to ``time``; what a frame shows then. Raises StepFailed."""
         frame = round(time / self.time_step)
         wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, Work())
-        if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
-            self.tick = wanted - self.ticks.length(0)
+        self.tick = max(self.tick, wanted - self.ticks.length(0))  # after a recovered step
         while self.tick < wanted:
             result, state = self._step(state)
             total = replace(result, cost=total.cost + result.cost)
@@ -283,7 +278,7 @@ class Adaptive(Integrator):
 
     def _step(self, state: State) -> tuple[StepResult, State]:
         """Take the next step, again and shorter if its error is too large. Raises StepFailed."""
-        restarts = self.ticks.is_event(self.tick)
+        restarts = self.tick in self.ticks.events
         cost = Work()
         while True:
             longest = self.control.level
@@ -315,7 +310,7 @@ class Adaptive(Integrator):
 
     def _reached(self, tick: int) -> float:
         """Time of a step that ends at a tick [s]: just before what begins or ends there."""
-        return self.ticks.time(tick) * (JUST_BEFORE if self.ticks.is_event(tick) else 1.0)
+        return self.ticks.time(tick) * (JUST_BEFORE if tick in self.ticks.events else 1.0)
 
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
         owned, t = slice(self.lattice.owned), self._length(level)

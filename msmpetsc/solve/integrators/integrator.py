@@ -31,9 +31,6 @@ class EnergyBudget:
         return min(self.gained, self.steady) / self.put_in if self.put_in else 0.0
 
 
-NO_ENERGY = EnergyBudget()
-
-
 @dataclass(frozen=True)
 class State:
     """q_n and q_(n-1), (l, 3) [m], ghosts included; the velocity is (q_n - q_(n-1)) / t. After
@@ -47,7 +44,7 @@ class State:
     q_previous: Positions
     history: tuple[Positions, Rows] | None = None
     sides: Indices | None = None
-    budget: EnergyBudget = NO_ENERGY  # of energy, as the steps so far have filled it
+    budget: EnergyBudget = EnergyBudget()  # of energy, as the steps so far have filled it
 
     def velocity(self, time_step: float) -> Rows:
         """Velocities (l, 3) [m/s]."""
@@ -82,7 +79,7 @@ class State:
         if SIDES in checkpoint.rows:
             sides = with_ghosts(comm, lattice, checkpoint.rows[SIDES].astype(np.int8))
             sides = like(lattice.nodes, np.ascontiguousarray(sides.T))
-        numbers = {name: checkpoint.number(name, 0.0, *FINITE) for name in vars(NO_ENERGY)}
+        numbers = {name: checkpoint.number(name, 0.0, *FINITE) for name in vars(EnergyBudget())}
         return State(q, q_previous, history, sides, EnergyBudget(**numbers))
 
 

@@ -69,7 +69,6 @@ class Verlet(Integrator):
         self.highest = HighestMode(comm, self.lattice, self.elasticity)
         owned = self.lattice.owned
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
-        self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.elastic = self.gradient[:owned]  # grad E without what obstacles push
         self.sides = environment.no_sides[:, :owned]
@@ -231,15 +230,13 @@ class Verlet(Integrator):
 
     def _strike(self, begin: float, end: float) -> None:
         """Find faces of contact; the velocity of a node that bounces off is what then led it there."""
-        np.multiply(self.v, begin - end, out=self.before)
-        self.before += self.q
-        self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)
-        after, before, work = self.environment.strike(
-            self.q, self.before, StepTaken(end, end - begin, self.sides), self.fixed
-        )
+        start = self.q - (end - begin) * self.v
+        self.sides = self.environment.contact_faces(start, self.q, end, end - begin, self.sides, self.fixed)
+        step = StepTaken(end, end - begin, self.sides)
+        after, before, work = self.environment.strike(self.q, start, step, self.fixed)
         self.work += work
-        if before is not self.before:
-            struck = np.flatnonzero((before != self.before).any(axis=1))
+        if before is not start:
+            struck = np.flatnonzero((before != start).any(axis=1))
             self.v[struck] = (after[struck] - before[struck]) / (end - begin)
             self.q[struck] = after[struck]
 

@@ -5,18 +5,14 @@ What a step adds to the error of the trajectory is its local error: from positio
     implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
-Means of these over neighbours, and what the README counts besides, ``StepControl`` adds up; it chooses the next step.
+Means of these over neighbours, and what the README counts besides, ``StepControl`` adds up.
 
 A run whose motion is of size U may end with its trajectory off by ``error`` U. Steps pay for that
 with their local errors, from a credit that grows as the motion does, and with time:
 
     credit(t) = error / 2 (U(t) + 1/T integral_0^t U)
 
-A step may spend what it earns itself and a share of what was saved, and always a part of what each step could, were
-all as long as those so far. Steps are 2^level times as long as the scene's.
-
-Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and
-so does the history that BDF2 needs where the length changes. All methods are collective.
+All methods are collective.
 """
 
 import math
@@ -83,7 +79,7 @@ class NeighbourMean:
 
 
 def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
-    """Positions and velocities at a share s of a step, by the cubic through those at its ends; s may lie outside."""
+    """Positions and velocities at a share s of a step, by Hermite's cubic between its ends; s may lie outside."""
     t, r = time_step, 1 - s
     q = r * r * (1 + 2 * s) * q_0 + s * r * r * t * v_0 + s * s * (3 - 2 * s) * q_1 - s * s * r * t * v_1
     v = 6 * s * r / t * (q_1 - q_0) + r * (1 - 3 * s) * v_0 + s * (3 * s - 2) * v_1
@@ -99,7 +95,7 @@ class Measure:
 
 
 class StepControl:
-    """Chooses levels and keeps the account of one run. The same numbers on all ranks lead to the same choices.
+    """Chooses levels, of steps 2^level times the scene's, and keeps the account of one run. Ranks choose alike.
 
     order           : of the integrator
     error           : asked of the trajectory, relative to the size of the motion

@@ -48,10 +48,16 @@ class TrueErrors:
         """
         try:
             with begun(REFERENCE):
-                return self._errors(self._reference(stepper), problem, position)
+                reference = self._reference(stepper)
+                reference.forget()  # what is measured does not depend on what was measured before
+                exact = reference.step(problem, position).position
         except StepFailed as failure:
             log.warning("the true error of a step is not known: its reference %s", failure)
             return np.full(2, np.nan)
+        start, distance = (_distances(reference, x, exact) for x in (problem.y, position))
+        errors: Floats = np.divide(distance, start, out=np.zeros(2), where=start > 0)
+        errors[0] = reference.control.rounding.added_to(errors[0], start[0])
+        return errors
 
     def _reference(self, stepper: Stepper) -> Stepper:
         if self.reference is None or self.stepper is not stepper:  # an anchor let go
@@ -63,14 +69,6 @@ class TrueErrors:
             )
             self.reference.set_up()
         return self.reference
-
-    def _errors(self, reference: Stepper, problem: StepProblem, position: Positions) -> Floats:
-        reference.forget()  # what is measured does not depend on what was measured before
-        exact = reference.step(problem, position).position
-        start, distance = (_distances(reference, x, exact) for x in (problem.y, position))
-        errors: Floats = np.divide(distance, start, out=np.zeros(2), where=start > 0)
-        errors[0] = reference.control.rounding.added_to(errors[0], start[0])
-        return errors
 
     def destroy(self) -> None:
         """Collective."""

@@ -72,7 +72,7 @@ class Frame:
     wall_time: Annotated[float, _number("f8", "s", "computing time")]
     true_error: Annotated[float, _number("f8", "1", "true relative error of a step, in position")] = math.nan
     energy_error: Annotated[float, _number("f8", "1", "true relative error of a step, in energy")] = math.nan
-    inverted: Annotated[int, _number("i8", "1", "cells turned inside out, -1 if not counted")] = 0
+    inverted: Annotated[int, _number("i8", "1", "cells turned inside out")] = 0
     products: Annotated[int, _number("i8", "1", "products with the Hessian, and at multigrid's finest level")] = 0
     proof_products: Annotated[int, _number("i8", "1", "of these, to estimate errors and to search for saddles")] = 0
     substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0

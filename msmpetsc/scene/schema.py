@@ -99,12 +99,11 @@ class Solver(Table):
 
 
 class Safety(Table):
-    """Checks of a run, and recovery of steps that fail."""
+    """Recovery of steps that fail."""
 
     on_failure: Literal["stop", "substep", "fallback"] = Field(
         "stop", description="stop the run; take that step in shorter ones; or solve it with a slower, robust method"
     )
-    checks: bool = Field(True, description="balance the energy of every step, and count cells inside out")
 
 
 class Probe(Table):

@@ -93,8 +93,7 @@ class TimeLoop:
         self.probe = ProbePoints(comm, model.lattice, points) if points else None  # may refuse: no PETSc objects yet
         self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
         swings = scene.time.integrator != "implicit-euler"
-        checks = scene.safety.checks
-        self.balance = EnergyBalance(comm, self.environment, self.elasticity, swings, checks)
+        self.balance = EnergyBalance(self.environment, self.elasticity, swings)
         self.adaptive: Adaptive | None = None
         if scene.time.error:
             self.adaptive = Adaptive(scene, self._make, self.balance)
@@ -209,8 +208,8 @@ class TimeLoop:
             position=position,
             surface=self.surface(position) if self.surface else None,
             **{name: getattr(energies, name) for name in ("kinetic", "elastic", "potential", "contact", "momentum")},
-            inverted=self.monitors.inverted(index, time, q) if self.balance.checks else -1,
-            energy_gained=max(gained, 0.0) if self.balance.checks else np.nan,
+            inverted=self.monitors.inverted(index, time, q),
+            energy_gained=max(gained, 0.0),
             self_contacts=energies.touch.contacts,
             self_distance=energies.touch.distance,
             self_contact=energies.touch.energy,

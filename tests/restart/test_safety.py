@@ -82,24 +82,11 @@ def test_rescue_carries_such_a_run_on(tmp_path: Path, monkeypatch: pytest.Monkey
     assert np.abs(frames[-1].position).max() < 1.5  # the beam is 1 m long
 
 
-@pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
-def test_without_checks_the_motion_is_the_same(tmp_path: Path, integrator: str):
-    """Energies are summed where a frame is stored; what only checks know is missing."""
-    time, output = TIME | {"integrator": integrator}, {"every": 2}
-    _, checked = play(beam(tmp_path, time=time, output=output))
-    _, bare = play(beam(tmp_path, time=time, output=output, safety={"checks": False}))
-    np.testing.assert_array_equal(bare[-1].position, checked[-1].position)
-    for name in ("kinetic", "elastic", "potential"):
-        np.testing.assert_array_equal(of(bare, name), of(checked, name))
-    assert (of(bare, "inverted") == -1).all() and np.isnan(of(bare, "energy_gained")).all()
-    assert (of(checked, "inverted") == 0).all() and np.isfinite(of(checked, "energy_gained")).all()
-
-
-def test_without_checks_a_step_that_is_not_finite_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_step_that_is_not_finite_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     step = Stepper.step
     monkeypatch.setattr(Stepper, "step", lambda *given: replace(step(*given), position=step(*given).position * np.nan))
     with pytest.raises(StepFailed, match="not finite"):
-        play(beam(tmp_path, safety={"checks": False}))
+        play(beam(tmp_path))
 
 
 def test_inverted_cells_are_counted_and_told_with_their_place(tmp_path: Path, caplog: pytest.LogCaptureFixture):

@@ -59,7 +59,7 @@ class Checkpoints:
         number = Stop.agreed(self.comm)
         if due or number:
             began = perf_counter()
-            saved = simulation.saved()
+            saved = simulation.saved
             if saved.step != self._written:
                 self.file.write_checkpoint(saved)
                 self._written = saved.step

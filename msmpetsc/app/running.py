@@ -219,7 +219,7 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
     write_model(comm, file, model)
     if plan.resumed:
         plan.resumed.restore(comm, file, simulation)
-    file.start_frames(simulation.stored, model.lattice.owned, simulation.rows, simulation.saved())
+    file.start_frames(simulation.stored, model.lattice.owned, simulation.rows, simulation.saved)
     return simulation.stored_until(simulation.step) if simulation.step else 0
 
 

@@ -80,6 +80,7 @@ class TimeLoop:
     step          : steps taken
     steps         : steps of the whole run
     stored        : number of frames of the whole run; ``stored_until(step)`` of a part
+    saved         : the last step that the run may go on from: every ``REMEMBERED``-th
     """
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, true_error: int | None = None):
@@ -110,7 +111,7 @@ class TimeLoop:
         q, velocity = model.start
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
-        self._saved = Checkpoint()
+        self.saved = Checkpoint()
 
     def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
         """Make the integrator that a scene's tables ask for, its PETSc options of this prefix (collective)."""
@@ -157,13 +158,8 @@ class TimeLoop:
         self.step = index
         frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
         if index % REMEMBERED == 0:
-            self._saved = self._save()
+            self.saved = self._save()
         return frame
-
-    def saved(self) -> Checkpoint:
-        """The last step that the run may go on from: every ``REMEMBERED``-th."""
-        rows = {name: to_host(rows) for name, rows in self._saved.rows.items()}
-        return replace(self._saved, rows=rows)
 
     def _save(self) -> Checkpoint:
         """Store the state, and forget what is no part of it: a resumed run would not have it."""
@@ -173,18 +169,19 @@ class TimeLoop:
         self.environment.forget()
         for part in (self.recovery, self.monitors):
             checkpoint.keep_counts(part)
+        checkpoint.rows = {name: to_host(rows) for name, rows in checkpoint.rows.items()}
         return checkpoint
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint, before any step is taken (collective)."""
-        checkpoint.refuse_rows_unlike(self.comm, self.saved())
+        checkpoint.refuse_rows_unlike(self.comm, self.saved)
         self.step = checkpoint.step
         self.state = State.restored(self.comm, self.model.lattice, checkpoint)
         for part in (self.recovery, self.monitors):
             checkpoint.restore_counts(part)
         if self.step:
             self.integrator.restore(checkpoint, self.step * self.time_step)
-        self._saved = self._save()
+        self.saved = self._save()
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
@@ -235,7 +232,7 @@ class TimeLoop:
     def __enter__(self) -> "TimeLoop":
         try:
             self.integrator.set_up()
-            self._saved = self._save()
+            self.saved = self._save()
         except InputError:
             self.destroy()
             raise

@@ -94,14 +94,14 @@ def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
         with TimeLoop(comm, scene, model) as simulation:
             for frame in simulation.advance():
                 frames.append(frame)
-                saved.append(copy.deepcopy(simulation.saved()))
+                saved.append(copy.deepcopy(simulation.saved))
         count = len(saved)
         begins = {every, 2 * every, 4 * every, count // 2 // every * every, (count - 2) // every * every}
         for begin in begins & {*range(1, count - 1)}:
             with TimeLoop(comm, scene, model) as simulation:
                 simulation.restore(saved[begin])
                 for frame, index in zip(simulation.advance(), range(begin + 1, begin + 3), strict=False):
-                    after = simulation.saved()
+                    after = simulation.saved
                     assert after.step == saved[index].step == index // every * every
                     assert_equal(after.rows, saved[index].rows)
                     assert_equal(after.numbers, saved[index].numbers)

@@ -120,7 +120,7 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
     def rows(scene: dict) -> set[str]:
         read = load_scene(block_scene(tmp_path, **scene))
         with TimeLoop(COMM, read, build_model(COMM, read)) as simulation:
-            return simulation.saved().rows.keys() - {"q", "q_previous"}
+            return simulation.saved.rows.keys() - {"q", "q_previous"}
 
     followed = {"lowest_mode", "loads"}  # whether a step is at a minimum is asked of every implicit one
     assert rows(swing(solver=LOOSE)) == followed

@@ -289,7 +289,7 @@ def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path
     path = block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0.0, 0.0, -9.81]})
     scene = load_scene(path)
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-        saved = simulation.saved()
+        saved = simulation.saved
         saved.numbers |= {"Recovery.level": 3, "Recovery.recovered": 2}
         simulation.restore(saved)
         assert len(list(simulation.advance())) == 3

@@ -4,8 +4,6 @@ Each rank has the columns of W that belong to its nodes, so that S is the sum of
 force f on the points is W^T f on each rank's nodes. Rank 0 has the whole of S, as it has the surface mesh.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
@@ -14,13 +12,6 @@ from msmpetsc.backend.arrays import Indices, Positions, Rows
 from msmpetsc.comm import Route
 from msmpetsc.contact.surface.obstacle_surfaces import ObstacleSurfaces
 from msmpetsc.lattice.lattice import Lattice
-
-
-class Carried(NamedTuple):
-    """Some of the points as this rank's nodes carry them: where they are among those, and their weights (k, owned)."""
-
-    at: Indices
-    weights: csr_array
 
 
 class SurfacePoints:
@@ -64,8 +55,9 @@ class SurfacePoints:
             first += len(rows)
         return points
 
-    def carried(self, numbers: Indices) -> Carried:
-        """Return what this rank's nodes carry of the points with these numbers (k,), ascending."""
+    def carried(self, numbers: Indices) -> csr_array:
+        """Return the weights (k, owned) by which this rank's nodes carry the points with these numbers (k,)."""
         row = np.searchsorted(self.rows, numbers)
         at = np.flatnonzero(np.append(self.rows, -1)[row] == numbers)
-        return Carried(at, self.weights[row[at]])
+        chosen = csr_array((np.ones(len(at)), (at, row[at])), shape=(len(numbers), len(self.rows)))
+        return csr_array(chosen @ self.weights)

@@ -13,7 +13,6 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
-from msmpetsc.contact.surface.points import Carried
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
 TINY = np.finfo(float).tiny
@@ -24,19 +23,19 @@ SMALL = 1e-4  # of the barrier's distance: points that move less change the ener
 class SurfaceHessian:
     """W^T H_c W over k points in contact.
 
-    carried : those points, as this rank's nodes carry them
+    weights : W (k, owned), by which this rank's nodes carry those points
     points  : H_c (3k, 3k) [N/m], on all ranks
     """
 
     comm: MPI.Comm
-    carried: Carried
+    weights: csr_array
     points: csr_array
 
     @cached_property
     def _carrying(self) -> tuple[Indices, csr_array, csr_array]:
         """This rank's nodes (c,) that carry points, these points' weights (k, c) and their transpose."""
-        nodes = np.unique(self.carried.weights.indices)
-        weights = self.carried_by(nodes)
+        nodes = np.unique(self.weights.indices)
+        weights = csr_array(self.weights[:, nodes])
         return nodes, weights, csr_array(weights.T)
 
     def add_product(self, v: Array, product: Array) -> None:
@@ -47,21 +46,13 @@ class SurfaceHessian:
             self.comm.Allreduce(MPI.IN_PLACE, moved)
         product[nodes] += back @ (self.points @ moved.ravel()).reshape(-1, 3)
 
-    def carried_by(self, nodes: Indices) -> csr_array:
-        """Return the weights (k, n) of some of this rank's nodes (n,) for all points in contact."""
-        at, weights = self.carried
-        rows = csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(self.points.shape[0] // 3, len(at)))
-        return csr_array(rows @ weights[:, nodes])
-
     def split(self, compliance: Floats, most: int) -> "tuple[SurfaceHessian | None, SurfaceHessian | None]":
         """Return the part of the stiff points, of the stiffest so many, and that of the others; None for none.
 
         compliance : (n,) [m/N] of nodes of this rank: a point is stiff that gives way less than they let it
         """
-        at, weights = self.carried
-        given = np.zeros(self.points.shape[0] // 3)
-        given[at] = weights.power(2) @ compliance
-        stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * self.comm.allreduce(given)
+        given = self.comm.allreduce(self.weights.copy().power(2) @ compliance)  # scipy sorts what it takes powers of
+        stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * given
         order = np.argsort(-stiffness, kind="stable")
         stiff = min(most, int((stiffness > 1).sum()))
         parts = np.sort(order[:stiff]), np.sort(order[stiff:])
@@ -69,17 +60,14 @@ class SurfaceHessian:
         return joined, held
 
     def _part(self, numbers: Indices) -> "SurfaceHessian":
-        at, weights = self.carried
-        own = np.isin(at, numbers)
         rows = (3 * numbers[:, None] + np.arange(3)).ravel()
-        carried = Carried(np.searchsorted(numbers, at[own]), weights[own])
-        return SurfaceHessian(self.comm, carried, csr_array(self.points[rows][:, rows]))
+        return SurfaceHessian(self.comm, self.weights[numbers], csr_array(self.points[rows][:, rows]))
 
     @cached_property
     def blocks(self) -> Rows:
         """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
         nodes, weights, _ = self._carrying
-        blocks, joined = np.zeros((self.carried.weights.shape[1], 9)), np.empty((len(nodes), 9))
+        blocks, joined = np.zeros((self.weights.shape[1], 9)), np.empty((len(nodes), 9))
         for row in range(3):
             for column in range(3):
                 acting = csr_array(self.points[row::3][:, column::3]) @ weights
@@ -190,8 +178,8 @@ class SurfaceContact:
         if moment is None:
             return
         touched, forces = self.comm.bcast(self._forces(moment))
-        at, weights = self.contacts.points.carried(touched)
-        gradient[: weights.shape[1]] += weights.T @ forces[at]
+        weights = self.contacts.points.carried(touched)
+        gradient[: weights.shape[1]] += weights.T @ forces
 
     def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
         """Return on rank 0 the points (k,) that are pushed, and the gradient there (k, 3) [N]."""
@@ -266,8 +254,7 @@ class SurfaceContact:
         if whole is None or kept is None:
             return np.zeros(self.contacts.owned)
         sums = np.asarray(np.abs(kept.points - whole.points).sum(axis=1)).reshape(-1, 3).max(axis=1)
-        at, weights = kept.carried
-        bound: Floats = self.contacts.points.spread * (np.abs(weights).T @ sums[at])
+        bound: Floats = self.contacts.points.spread * (np.abs(kept.weights.copy()).T @ sums)
         return bound
 
     def _curvature(self, moment: ContactsAt, projected: bool, secant: Mask | None) -> tuple[Indices, csr_array] | None:

@@ -11,7 +11,6 @@ from scipy.linalg.lapack import dpstrf
 from scipy.sparse import csr_array, eye_array, kron
 
 from msmpetsc.backend.arrays import Array, Rows
-from msmpetsc.contact.surface.points import Carried
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 
@@ -34,7 +33,7 @@ class ContactSmoother:
 
     def __init__(self, unknowns: Unknowns, surface: SurfaceHessian, t2: float, inverse: Array):
         self.comm = unknowns.comm
-        weights = surface.carried_by(unknowns.free)
+        weights = surface.weights[:, unknowns.free]
         self.nodes = np.unique(weights.indices)
         self.weights, self.inverse = csr_array(weights[:, self.nodes]), inverse[self.nodes].reshape(-1, 3, 3)
         self.back = csr_array(self.weights.T)
@@ -86,13 +85,13 @@ class CoarseContact:
         if surface is None:
             return matrices[-1]
         self.scalar = self.scalar or self._scalar()
-        weights = surface.carried_by(self.unknowns.free)
+        weights = surface.weights[:, self.unknowns.free]
         for matrix, p in zip(matrices, self.scalar, strict=True):
             whole = sum(surface.comm.allgather(weights @ p))  # in the order of the ranks: the same sum each time
             first, last = (bound // 3 for bound in matrix.getOwnershipRange())
             weights = csr_array(whole[:, first:last])
             if matrix is not matrices[-1]:
-                own = SurfaceHessian(surface.comm, Carried(np.arange(len(whole.indptr) - 1), weights), surface.points)
+                own = SurfaceHessian(surface.comm, weights, surface.points)
                 add_diagonal(matrix, self.t2 * own.blocks)
         joined = kron(weights, eye_array(3), "csr").T @ (surface.points @ kron(whole, eye_array(3), "csr"))
         self.coarsest = matrices[-1].copy()

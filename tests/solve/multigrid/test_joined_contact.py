@@ -10,7 +10,6 @@ from block_scene import play
 from mpi4py import MPI
 from pinch import pinch_scene
 
-from msmpetsc.contact.surface.points import Carried
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.solve.multigrid import cycle
 from msmpetsc.solve.multigrid.contact import ContactSmoother
@@ -29,13 +28,12 @@ def surface() -> SurfaceHessian:
         along[a] = rng.normal(size=3)
         along[b] = -along[a]
         points += stiffness * np.outer(along, along)
-    carried = Carried(np.arange(POINTS), sparse.csr_array(weights))
-    return SurfaceHessian(MPI.COMM_SELF, carried, sparse.csr_array(points))
+    return SurfaceHessian(MPI.COMM_SELF, sparse.csr_array(weights), sparse.csr_array(points))
 
 
 def joined(surface: SurfaceHessian) -> np.ndarray:
     """C = t^2 W^T H_c W (3n, 3n), columns x, y, z of a node together."""
-    w = np.kron(surface.carried.weights.toarray(), np.eye(3))
+    w = np.kron(surface.weights.toarray(), np.eye(3))
     return T2 * w.T @ surface.points.toarray() @ w
 
 

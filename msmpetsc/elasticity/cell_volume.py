@@ -294,37 +294,36 @@ def _add_bound(first: int, count: int, step: int, blocks: Rows, cells: Resistanc
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of a rank that resist: all that its nodes are corners of, and those that it owns, which stand first.
+    """The cells of a rank that resist: all that its nodes are corners of, those that it owns first.
 
+    owned  : number of cells that it owns
     around : (8, owned) on a GPU the rows of each owned node among those of all cells' corners, the last row past them;
         (8, 0) on a CPU
     """
 
     law: Resistance
-    owned: Resistance
+    owned: int
     around: Indices
 
     @classmethod
     def of_lattice(cls, lattice: Lattice, stiffness: Floats, volume: float) -> "Cells":
         """Return the cells of a lattice, in the memory that its nodes are in."""
-        cells, stiffness, owned = lattice.local_cells, like(lattice.nodes, stiffness), slice(lattice.cells_owned)
-        own = cells[owned]
-        laws = Resistance(cells, stiffness, volume, cells), Resistance(own, stiffness[owned], volume, own)
-        around = np.empty((8, 0), np.int64)
+        cells, around = lattice.local_cells, np.empty((8, 0), np.int64)
         if not on_host(cells):
             around = rows_of(to_host(cells).ravel(), lattice.owned)
-        return cls(*laws, like(lattice.nodes, around))
+        law = Resistance(cells, like(cells, stiffness), volume, cells)
+        return cls(law, lattice.cells_owned, like(cells, around))
 
     def energy(self, q: Positions) -> float:
         """Return the energy [J] of the cells that this rank owns."""
-        parts = np.empty(len(self.owned.cells), like=q)
-        _energy_of(len(parts), parts, self.owned, q)
+        parts = np.empty(self.owned, like=q)
+        _energy_of(len(parts), parts, self.law, q)
         return float(parts.sum())
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy at q less that at base [J], corner by corner so that a small change keeps its digits."""
-        parts = np.empty(len(self.owned.cells), like=q)
-        _change_of(len(parts), parts, self.owned, Way.to(q, base))
+        parts = np.empty(self.owned, like=q)
+        _change_of(len(parts), parts, self.law, Way.to(q, base))
         return float(parts.sum())
 
     def resisting(self, q: Positions) -> Resistance:

@@ -60,7 +60,7 @@ class Elasticity:
         """Corner nodes (c, 8) of the cells of the law that this rank owns, in its order; (0, 8) of springs alone."""
         if self.solid:
             return self.solid.corners
-        return np.empty((0, 8), np.int64) if self.cells is None else to_host(self.cells.owned.cells)
+        return to_host(self.cells.law.cells)[: self.cells.owned] if self.cells else np.empty((0, 8), np.int64)
 
     @property
     def bound(self) -> float | None:

@@ -34,7 +34,7 @@ class Elasticity:
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
         self.viscosity: Viscosity | None = None
         if self.solid and lattice.viscous:
-            self.viscosity = Viscosity.of_solid(self.solid, lattice.viscous, lattice.owned, lattice.nodes)
+            self.viscosity = Viscosity(self.solid, lattice.viscous, lattice.owned, lattice.nodes)
         if self.solid is None:
             self.springs = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
         if lattice.stiffening > 0:

@@ -9,13 +9,11 @@ nothing but for what its turn was not foreseen. D is convex, and its K constant 
 they turn with it, and would have to be turned, too. Of n cells across they are 1 / n^2 of a bend.
 """
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_by_one
+from msmpetsc.elasticity.cell_blocks import ROWS, STATE, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
 from msmpetsc.elasticity.neo_hookean import rotation_of, write_state
@@ -34,36 +32,29 @@ def _turned_states(first: int, count: int, step: int, q: Positions, cells: CellR
         write_state(state, state_at(i), r, -m if turns else 0.0, m + cells.constants[k + 112])
 
 
-@dataclass(eq=False)
 class Viscosity:
     """D of a step: what Elasticity asks of a law.
 
-    blocks : cells with their constants times beta / tau, without modes
+    factor : beta / tau
     owned  : number of nodes that this rank owns
+    before : x^ (l, 3) [m]; at first the nodes at rest
     """
 
-    blocks: Blocks
-    owned: int
-    before: Positions  # x^
-    hessian: CellHessians = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.begin(self.before, self.before)
-
-    @classmethod
-    def of_solid(cls, solid: NeoHookean, factor: float, owned: int, rest: Positions) -> "Viscosity":
-        """Return the viscosity of a solid; ``factor`` is beta / tau, ``rest`` the nodes (l, 3) [m]."""
+    def __init__(self, solid: NeoHookean, factor: float, owned: int, before: Positions):
         constants = solid.blocks.constants.copy().reshape(-1, ROWS, LANES)
-        constants[:, 6 : ROWS - 2] = 0.0
+        constants[:, 6 : ROWS - 2] = 0.0  # modes
         constants[:, ROWS - 2 :] *= factor
-        blocks = solid.blocks._replace(constants=constants.reshape(len(constants), -1))
-        return cls(blocks, owned, rest)
+        self.blocks = solid.blocks._replace(constants=constants.reshape(len(constants), -1))
+        self.owned, self.before, self.hessian = owned, before, self._turned_as(before)
 
     def begin(self, before: Positions, turned: Positions) -> None:
         """Take the data of a new step: x^ (l, 3) [m], and positions (l, 3) whose cells have turned as in the step."""
-        state = np.empty((len(self.blocks.nodes), STATE * LANES), like=before)
-        _turned_states(LANES * len(state), turned, one_by_one(self.blocks), state.ravel())
-        self.before, self.hessian = before, CellHessians(self.blocks, state)
+        self.before, self.hessian = before, self._turned_as(turned)
+
+    def _turned_as(self, q: Positions) -> CellHessians:
+        state = np.empty((len(self.blocks.nodes), STATE * LANES), like=q)
+        _turned_states(LANES * len(state), q, one_by_one(self.blocks), state.ravel())
+        return CellHessians(self.blocks, state)
 
     def energy(self, q: Positions) -> float:
         """Return this rank's part of D [J]."""

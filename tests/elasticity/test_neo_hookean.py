@@ -220,7 +220,7 @@ def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
 def test_viscosity_turns_with_its_cells_and_is_semidefinite_where_they_are_inside_out():
     """A turn's rate costs nothing; a stretch of turned cells what it does at rest: 2 mu |eps|^2 + lambda (tr eps)^2."""
     lattice = solid(3, 2, 2, poisson=0.45)
-    viscosity = Viscosity.of_solid(NeoHookean.of_lattice(lattice), 3.0, lattice.owned, lattice.nodes)
+    viscosity = Viscosity(NeoHookean.of_lattice(lattice), 3.0, lattice.owned, lattice.nodes)
     turn, rest = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), lattice.nodes
     viscosity.begin(rest @ turn.T, rest @ turn.T)
     spin, strain = np.cross([1.0, 2.0, 3.0], rest @ turn.T), RNG.normal(size=(3, 3))

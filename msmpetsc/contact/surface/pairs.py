@@ -130,22 +130,16 @@ class NearPairs:
         """Return the newest pairs; those at q if there are none yet."""
         return self._newest or self.look(q, time, self.law.distance)
 
-    def look(self, q: Positions, time: float, reach: float) -> Pairs:
-        """Look for pairs at q."""
+    def look(self, q: Positions, time: float, reach: float, moved: Rows | None = None) -> Pairs:
+        """Look for pairs at q, or on the way of the points from there by ``moved`` (p, 3) [m]."""
         points, reach = self.points(q, time), min(max(reach, LEAST * self.edge), FARTHEST * self.edge)
         candidates, ways = None, (0.0, 0.0)
         if self.barrier:
-            candidates = self.barrier.candidates(points, reach)
-            ways = self.barrier.clear_reach(candidates, points, reach)
+            candidates = self.barrier.candidates(points, reach, moved)
+            if moved is None:
+                ways = self.barrier.clear_reach(candidates, points, reach)
         apart, clear = self.comm.bcast(ways)
-        self._newest = Pairs(q[: self.owned].copy(), time, reach, apart, clear, points, candidates)
-        return self._newest
-
-    def look_along(self, q: Positions, time: float, points: Positions, moved: Rows) -> Pairs:
-        """Look for pairs on a way of the points (p, 3) [m] at q, by ``moved`` (p, 3) [m]."""
-        reach = LEAST * self.edge
-        candidates = self.barrier.candidates(points, reach, moved) if self.barrier else None
-        self._newest = Pairs(q[: self.owned].copy(), time, reach, 0.0, 0.0, points, candidates, moved)
+        self._newest = Pairs(q[: self.owned].copy(), time, reach, apart, clear, points, candidates, moved)
         return self._newest
 
     def moved(self, q: Positions, time: float, pairs: Pairs) -> float:
@@ -256,7 +250,7 @@ class Contacts:
         if bound >= pairs.apart and not self._serve(pairs, start + moved):
             if way > PIECE * self.near.edge:
                 return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
-            pairs = self.near.look_along(q, begin, start, moved)
+            pairs = self.near.look(q, begin, LEAST * self.near.edge, moved)
         candidates = None if bound < pairs.apart else pairs.candidates
         return float(self.comm.bcast(self.barrier.free_share(start, moved, candidates) if self.barrier else 1.0))
 

@@ -64,10 +64,10 @@ def gradient(contact: Contact, q: np.ndarray) -> np.ndarray:
     return total
 
 
-def hessian(contact: Contact, q: np.ndarray, true: bool) -> tuple[np.ndarray, np.ndarray]:
+def hessian(contact: Contact, q: np.ndarray, secants: list | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Nodes that any part of it is of, ascending, and the sums of their blocks."""
     total = np.zeros((len(q), 3, 3))
-    parts = list(contact.hessian(q, true))
+    parts = list(contact.hessian(q, secants))
     for nodes, blocks in parts:
         assert len(np.unique(nodes)) == len(nodes)
         total[nodes] += blocks
@@ -88,7 +88,7 @@ def test_the_gradient_is_the_slope_of_the_change(penalties: list[Penalty]):
 def test_a_small_change_keeps_its_digits(penalties: list[Penalty]):
     """Against the first and second derivative: a plain difference of energies has no digit left here."""
     contact, q, v = pressed(penalties)
-    nodes, blocks = hessian(contact, q, true=True)
+    nodes, blocks = hessian(contact, q)
     moved = q + 1e-11 * v
     v = moved - q  # q + v is rounded
     second = 0.5 * np.einsum("ai,aij,aj", v[nodes], blocks, v[nodes])
@@ -100,7 +100,7 @@ def test_the_blocks_are_the_slope_of_the_gradient(penalties: list[Penalty]):
     contact, q, v = pressed(penalties)
     step = 1e-7
     slope = (gradient(contact, q + step * v) - gradient(contact, q - step * v)) / (2 * step)
-    nodes, blocks = hessian(contact, q, true=True)
+    nodes, blocks = hessian(contact, q)
     product = np.zeros_like(q)
     product[nodes] = np.einsum("aij,aj->ai", blocks, v[nodes])
     np.testing.assert_allclose(product, slope, atol=1e-5 * np.abs(slope).max())
@@ -112,7 +112,7 @@ def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
     contact, q, v = pressed(BALLS["sphere"])
     step = 1e-7
     slope = (gradient(contact, q + step * v) - gradient(contact, q - step * v)) / (2 * step)
-    nodes, blocks = hessian(contact, q, true=True)
+    nodes, blocks = hessian(contact, q)
     out = q[nodes] - BALL.solid.center
     r = np.linalg.norm(out, axis=1)
     across = np.eye(3) - np.einsum("ai,aj->aij", out, out) / r[:, None, None] ** 2
@@ -124,8 +124,8 @@ def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
 @cases
 def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than_both(penalties: list[Penalty]):
     contact, q, _ = pressed(penalties)
-    nodes, true = hessian(contact, q, true=True)
-    same, above = hessian(contact, q, true=False)
+    nodes, true = hessian(contact, q)
+    same, above = hessian(contact, q, contact.all_secant())
     np.testing.assert_array_equal(same, nodes)
     rounding = 1e-12 * np.abs(above).max()
     assert np.linalg.eigvalsh(true).min() >= -rounding
@@ -146,7 +146,7 @@ def test_the_parabola_of_frictions_secant_nowhere_lies_below_its_potential(name:
     for moved in [reach * way for reach in (1e-4, 1e-2, 0.5, 1, 2, 10) for way in (v, back)]:
         d, change = moved[friction.nodes], friction.change(q + moved, q)
         for secant in (friction.all_secant(), None):
-            parabola = (force * moved).sum() + 0.5 * np.einsum("ai,aij,aj", d, friction.blocks(q, True, secant), d)
+            parabola = (force * moved).sum() + 0.5 * np.einsum("ai,aij,aj", d, friction.blocks(q, secant), d)
             below.append(parabola < change - 1e-9 * abs(change) - 1e-12)
     assert not any(below[::2])
     assert any(below[1::2]) or "sticking" in name

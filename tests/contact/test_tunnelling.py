@@ -73,7 +73,7 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
     deeper = q - [0, 0, 0.01]
     assert contact.change(deeper, q) == pytest.approx(contact.energy(deeper) - contact.energy(q))
     assert contact.bound(q).tolist() == [50, 50, 50, 0]
-    ((nodes, blocks),) = contact.hessian(q, true=True)
+    ((nodes, blocks),) = contact.hessian(q)
     assert nodes.tolist() == [0, 1, 2] and (blocks == 50 * np.diag([0, 0, 1])).all()
 
 

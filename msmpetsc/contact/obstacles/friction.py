@@ -91,22 +91,21 @@ class Friction:
         passes: Mask = ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
         return passes
 
-    def curvature(self, q: Positions, plane: Rows, true: bool, secant: Mask | None = None) -> Rows:
+    def curvature(self, q: Positions, plane: Rows, secant: Mask | None) -> Rows:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
 
-        The second part is not positive; unless ``true``, or where ``secant`` (a,), it is left out. What is then left
-        is no less than the Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
+        The second part is not positive; where ``secant`` (a,) it is left out. What is then left is no less than the
+        Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
 
         plane : I - n n^T (a or 1, 3, 3)
         """
         u, length = self.slip(q)
         slope = self.slope(length)
-        blocks = slope[:, None, None] * plane
-        if true:
-            direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
-            curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
-            less = curvature - slope if secant is None else np.where(secant, 0.0, curvature - slope)
-            blocks += less[:, None, None] * squares(direction)
+        direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
+        less = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0) - slope
+        if secant is not None:
+            less[secant] = 0.0
+        blocks = slope[:, None, None] * plane + less[:, None, None] * squares(direction)
         return self.limit[:, None, None] * blocks
 
 
@@ -144,9 +143,9 @@ class NodeFriction(Friction):
         """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) it acts on."""
         gradient[self.nodes] += self.force(q)
 
-    def blocks(self, q: Positions, true: bool, secant: Mask | None = None) -> Rows:
+    def blocks(self, q: Positions, secant: Mask | None) -> Rows:
         """Return the Hessian's blocks of the nodes (a, 3, 3) [N/m], as ``curvature`` has them."""
-        return self.curvature(q, like(q, np.eye(3)) - squares(self.normal), true, secant)
+        return self.curvature(q, like(q, np.eye(3)) - squares(self.normal), secant)
 
 
 def squares(vectors: Rows) -> Rows:

@@ -122,10 +122,9 @@ class ContactState:
     def stopped(self, q: Positions, base: Positions) -> tuple[Indices, Rows]:
         """Return the nodes (a,) that are pressed at q but not at base (n, 3), and by what to move them (a, 3) [m] to
         where they all but cease to: the Hessian there knows of them."""
-        depths, face = self.depths(q)
-        rows = np.flatnonzero((depths > 0) & (self.depths(base)[0] <= 0))
-        normals = self.obstacle.normals_at(q[rows], self.time, face[rows])
-        return rows, (1 - SHALLOW) * depths[rows][:, None] * normals
+        rows, depth, normal = self.pressed(q)
+        new = self.depths(base)[0][rows] <= 0
+        return rows[new], (1 - SHALLOW) * depth[new][:, None] * normal[new]
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy of the push at q less that at base (n, 3) [J]."""
@@ -200,7 +199,10 @@ class Contact:
         return of_nodes + (self.surface.released(q) if self.surface else 0.0)
 
     def all_secant(self) -> Secants:
-        """Return what ``hessian`` takes for all friction of obstacles to have its secant."""
+        """Return what ``hessian`` takes for all friction of obstacles to have its secant.
+
+        That goes with A: beside it friction's true Hessian, nothing along a slip, would let nodes run to and fro.
+        """
         return [*(state.friction.all_secant() if state.friction else None for state in self.states), None]
 
     def passes_kinks(self, q: Positions, base: Positions) -> Secants:
@@ -208,22 +210,20 @@ class Contact:
         of_nodes = [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
         return [*of_nodes, self.surface.passes_kink(q, base) if self.surface else None]
 
-    def hessian(self, q: Positions, true: bool, secants: Secants | None = None) -> Iterator[tuple[Indices, Rows]]:
+    def hessian(self, q: Positions, secants: Secants | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
         The Hessian is the sum of all; each block is positive semidefinite. Across the
         normal a solid that is round with radius r at a node has -k d / r, too, which is left out.
 
-        true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
-            Hessian, nothing along a slip, would let nodes run to and fro
-        secants : where friction has that of its secant all the same
+        secants : where friction has that of its secant
         """
         of_states = secants[:-1] if secants else [None] * len(self.states)
         for state, secant in zip(self.states, of_states, strict=True):
             rows, _, normal = state.pressed(q[: self.owned])
             yield rows, state.stiffness * squares(normal)
             if state.friction:
-                yield state.friction.nodes, state.friction.blocks(q, true, secant)
+                yield state.friction.nodes, state.friction.blocks(q, secant)
 
     def bound(self, q: Positions) -> Floats:
         """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes meet obstacles."""

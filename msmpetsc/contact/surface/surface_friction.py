@@ -57,7 +57,7 @@ class SurfaceFriction(Friction):
 
     def hessian(self, points: Positions, secant: Mask | None = None) -> csr_array:
         """Return the Hessian (3p, 3p) [N/m] at the points, of some slips by their ``secant`` (a,)."""
-        blocks = self.curvature(points, np.eye(3)[None], True, secant)
+        blocks = self.curvature(points, np.eye(3)[None], secant)
         middle = bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
         return csr_array(self.slips.T @ (middle @ self.slips))
 

@@ -43,11 +43,11 @@ class ContactBlocks:
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
-    def linearise(self, contact: Contact | None, q: Positions, true: bool, secants: Secants | None = None) -> None:
-        """Take the blocks at q, ``true`` ones, but for ``secants``, or such as go with A."""
+    def linearise(self, contact: Contact | None, q: Positions, secants: Secants | None) -> None:
+        """Take the blocks at q; where ``secants`` say so, those of friction's secant."""
         self.parts = []
         with CONTACT:
-            for nodes, blocks in contact.hessian(q, true, secants) if contact else ():
+            for nodes, blocks in contact.hessian(q, secants) if contact else ():
                 free = np.flatnonzero(self.row[nodes] >= 0)
                 if len(free):
                     self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
@@ -107,7 +107,7 @@ class TrueHessian:
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             if self.contact:
-                self.contact.linearise(contact, q, True, secants)
+                self.contact.linearise(contact, q, secants)
             secant = secants[-1] if secants else None  # of the surface
             self.surface = contact.surface.hessian(q, projected, secant) if contact and contact.surface else None
 

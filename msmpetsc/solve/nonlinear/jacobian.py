@@ -97,7 +97,7 @@ class Jacobian:
         if self.preset.true_hessian and not known:
             self.hessian.linearise(q, contact, projected, secants)
         elif self.blocks:
-            self.blocks.linearise(contact, q, False)
+            self.blocks.linearise(contact, q, contact.all_secant() if contact else None)
         changed = self.preconditioner.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()

@@ -163,14 +163,14 @@ class LatticePreconditioner:
         alone = len(self.multigrid.bodies.free) == 1 and not (surface and surface.contacts.obstacles.total)
         if surface and not alone and surface.presses(q):
             return False  # of one body alone it moves the middle no more than springs do
-        pressed = any(len(nodes) for nodes, _ in contact.hessian(q, True))
+        pressed = any(len(nodes) for nodes, _ in contact.hessian(q))
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
         """Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) if there are none."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
-        for nodes, added in contact.hessian(q, False) if contact else ():
+        for nodes, added in contact.hessian(q, contact.all_secant()) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
         return blocks
 

@@ -77,6 +77,8 @@ class FunctionSolid(DistanceSolid):
 
         Raises InputError where the function returns anything else.
         """
+        if not len(q):
+            return np.zeros(0), np.zeros((0, 3))
         with np.errstate(all="warn"):  # it is the user's own
             answer = self.function(q.copy())
         try:
@@ -102,11 +104,9 @@ class FunctionSolid(DistanceSolid):
         return Surface(points.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
 
     def _find(self, q: Positions) -> tuple[Floats, Indices]:
-        return (-self.distances(q)[0], one_face(q)) if len(q) else (np.zeros(0), one_face(q))
+        return -self.distances(q)[0], one_face(q)
 
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        if not len(q):
-            return np.zeros(0), np.zeros((0, 3))
         distance, gradient = self.distances(q)
         return -distance, gradient / np.maximum(np.linalg.norm(gradient, axis=1), TINY)[:, None]
 

@@ -87,16 +87,7 @@ def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Flo
     obstacles = []
     for number, table in enumerate(scene.obstacle):
         key = f"obstacle.{number}"
-        solid = _solid(comm, table, key, scene.folder)
-        if isinstance(solid, FunctionSolid):
-            with together(comm):
-                length = 1.0  # of the gradients at most nodes, as a distance's are
-                if lattice.owned:
-                    _, gradient = solid.distances(lattice.nodes[: lattice.owned])
-                    length = float(np.median(np.linalg.norm(gradient, axis=1)))
-                if abs(length - 1) > MOST_OFF:
-                    wrong = f"its gradient is {length:.3g} long at most nodes, not 1"
-                    raise InputError(f"{key}.function: no signed distance: {wrong}")
+        solid = _solid(comm, table, key, scene.folder, lattice.nodes[: lattice.owned])
         path = Motion.through(table.path, table.center)
         obstacles.append(Obstacle(solid, path, key, outside, start=table.start, stop=table.stop))
     return obstacles
@@ -117,14 +108,20 @@ def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
     return surface
 
 
-def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path) -> Solid:
+def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: Positions) -> Solid:
+    """Return the solid of a table, for bodies that have nodes (owned, 3) [m] at rest."""
     if table.mesh is not None:
         mesh = table.mesh
         surface = comm.bcast(on_root(comm, lambda: obstacle_surface(mesh, key, folder)))
         return MeshSolid(surface)
     if table.function is not None:
         with together(comm):
-            return FunctionSolid(OBSTACLES.find(table.function), key)
+            solid = FunctionSolid(OBSTACLES.find(table.function), key)
+            lengths = np.linalg.norm(solid.distances(nodes)[1], axis=1)
+            if len(nodes) and abs(np.median(lengths) - 1) > MOST_OFF:
+                wrong = f"its gradient is {np.median(lengths):.3g} long at most nodes, not 1"
+                raise InputError(f"{key}.function: no signed distance: {wrong}")
+            return solid
     if table.box is not None:
         return Faces.of_box(*np.array(table.box))
     if table.center is not None:

@@ -3,7 +3,7 @@
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, like, to_host
 from msmpetsc.elasticity.cell_volume import least_volumes, volume_ratios
 from msmpetsc.lattice.lattice import Lattice
 
@@ -13,13 +13,23 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 
     rows, measure : (k,) local nodes, and what is measured of each
     """
-    rows, measure = to_host(rows), np.nan_to_num(to_host(measure), nan=np.inf)
-    candidate: tuple[float, int, Floats | None] = (-1.0, 0, None)
-    if len(rows):
-        best = int(np.argmax(measure))
-        candidate = measure[best], lattice.global_numbers[rows[best]], to_host(lattice.nodes[int(rows[best])])
+    number, where = _greatest(comm, lattice, rows[:, None], np.nan_to_num(to_host(measure), nan=np.inf))
+    return f"node {number}, {where}"
+
+
+def _greatest(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) -> tuple[int, str]:
+    """Return where a measure (k,) is greatest: a node's global number, and the body and point at rest (collective).
+
+    corners : (k, c) local nodes of what is measured, whose mean is the point and whose first the node
+    """
+    candidate = -np.inf, 0, np.zeros(3)
+    if len(corners):
+        best = int(np.argmax(to_host(measure)))
+        nodes = to_host(corners[best])
+        point = to_host(lattice.nodes[like(lattice.nodes, nodes)].mean(axis=0))
+        candidate = float(measure[best]), int(lattice.global_numbers[nodes[0]]), point
     _, number, point = max(comm.allgather(candidate), key=lambda candidate: candidate[0])
-    return f"node {number}, {rest_point(lattice, number, point)}"
+    return number, f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
 
 
 def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool = False) -> tuple[int, str]:
@@ -36,13 +46,7 @@ def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool
     total = comm.allreduce(int((volumes <= 0).sum()))
     if not total:
         return 0, ""
-    candidate = np.inf, 0, np.zeros(3)
-    if len(cells):
-        worst = int(volumes.argmin())
-        point = to_host(lattice.nodes[cells[worst]].mean(axis=0))
-        candidate = float(volumes[worst]), lattice.global_numbers[int(cells[worst][0])], point
-    _, number, point = min(comm.allgather(candidate), key=lambda candidate: candidate[0])
-    return total, rest_point(lattice, number, point)
+    return total, _greatest(comm, lattice, cells, -volumes)[1]
 
 
 def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
@@ -53,11 +57,6 @@ def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
     resists = lattice.stiffening > 0 or lattice.solid is not None
     law = "" if resists else ' (material.law = "neo-hookean" resists that)'
     return f", {count} cell{'s are' if count > 1 else ' is'} inside out{law}"
-
-
-def rest_point(lattice: Lattice, number: int, point: Floats) -> str:
-    """Return a point (3,) [m] at rest in words, with the body of the node of this global number."""
-    return f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
 
 
 def of_body(lattice: Lattice, number: int) -> str:

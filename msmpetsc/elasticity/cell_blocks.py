@@ -10,6 +10,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Rows, like, on_host, to_host
 from msmpetsc.elasticity.cell_strain import LANES
+from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
@@ -108,13 +109,3 @@ def add_corners(write: Callable[[Rows], None], around: Indices, corners: int, ro
     own = np.zeros((corners + 1, rows.shape[1]), like=rows)  # the last is of no corner
     write(own)
     rows[: around.shape[1]] += own[around].sum(axis=0)
-
-
-def rows_of(nodes: Indices, owned: int) -> Indices:
-    """Return (8, owned) which of the rows that have these ``nodes`` (n,) are each owned node's; n past the last."""
-    by_node = np.argsort(nodes, kind="stable")
-    by_node = by_node[: np.searchsorted(nodes[by_node], owned)]
-    node = nodes[by_node]
-    rows = np.full((8, owned), len(nodes))
-    rows[np.arange(len(node)) - np.searchsorted(node, node), node] = by_node
-    return rows

@@ -19,9 +19,9 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.cell_blocks import add_corners, rows_of
+from msmpetsc.elasticity.cell_blocks import add_corners
 from msmpetsc.elasticity.cell_strain import Six, strain
-from msmpetsc.elasticity.springs import Product, Vector, Way, between, dot
+from msmpetsc.elasticity.springs import Product, Vector, Way, between, dot, rows_of
 from msmpetsc.lattice.lattice import Lattice
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed

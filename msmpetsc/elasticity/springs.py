@@ -351,18 +351,13 @@ class SpringGather(OwnedSprings):
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringGather":
         """Return the springs of a lattice, in the memory that its nodes are in."""
-        springs, owned = to_host(lattice.springs), lattice.owned
+        springs = to_host(lattice.springs)
         ends = np.concatenate([springs, springs[:, ::-1]])
-        by_node = np.argsort(ends[:, 0], kind="stable")
-        by_node = by_node[: np.searchsorted(ends[by_node, 0], owned)]
-        node, spring = ends[by_node, 0], by_node % max(len(springs), 1)
-        slot = np.arange(len(node)) - np.searchsorted(node, node)
+        rows = rows_of(ends[:, 0], lattice.owned)
         lengths, kind = np.unique(to_host(lattice.rest_length), return_inverse=True)
-        shape = (int(slot.max(initial=0)) + 1, owned)
-        neighbour, kinds, stiffness = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape)
-        neighbour[slot, node] = ends[by_node, 1]
-        kinds[slot, node] = kind[spring]
-        stiffness[slot, node] = to_host(lattice.stiffness)[spring]
+        neighbour = np.append(ends[:, 1], -1).astype(np.int32)[rows]
+        kinds = np.append(np.tile(kind, 2), 0).astype(np.uint8)[rows]
+        stiffness = np.append(np.tile(to_host(lattice.stiffness), 2), 0.0)[rows]
         sent = partial(like, lattice.nodes)
         around = Around(sent(neighbour), sent(kinds), sent(stiffness), sent(lengths), lattice.stiffening)
         return cls(Springs.of_lattice(lattice, lattice.springs_owned), around)
@@ -387,6 +382,17 @@ class SpringGather(OwnedSprings):
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         self._sum_around(_diagonal_around, blocks, q)
+
+
+def rows_of(nodes: Indices, owned: int) -> Indices:
+    """Return which rows of those of ``nodes`` (n,) are each owned node's, (8 or more, owned); n past the last."""
+    by_node = np.argsort(nodes, kind="stable")
+    by_node = by_node[: np.searchsorted(nodes[by_node], owned)]
+    node = nodes[by_node]
+    slot = np.arange(len(node)) - np.searchsorted(node, node)
+    rows = np.full((max(int(slot.max(initial=0)) + 1, 8), owned), len(nodes))
+    rows[slot, node] = by_node
+    return rows
 
 
 @kernel

@@ -21,7 +21,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_h
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.cell_blocks import add_corners
 from msmpetsc.elasticity.cell_strain import Six, strain
-from msmpetsc.elasticity.springs import Product, Vector, Way, between, dot, rows_of
+from msmpetsc.elasticity.springs import Product, Vector, Way, add_block, between, dot, rows_of
 from msmpetsc.lattice.lattice import Lattice
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed
@@ -235,14 +235,6 @@ def corner_curvature(e: Frame, n: Vector, resistance: float, least: float) -> fl
 
 
 @numba.njit(cache=True)
-def add_square(block: Floats, factor: float, g: Vector) -> None:
-    """Add factor g g^T to a block (9,)."""
-    for r in range(3):
-        for c in range(3):
-            block[3 * r + c] += factor * g[r] * g[c]
-
-
-@numba.njit(cache=True)
 def vector_of(role: int, vectors: Frame) -> Vector:
     """Return, of three vectors at the far ends of a corner's edges, that of a role; the corner's balances them."""
     a, b, c = vectors
@@ -289,7 +281,8 @@ def _add_bound(first: int, count: int, step: int, blocks: Rows, cells: Resistanc
             curvature = corner_curvature(e, n[0], law.stiffness[i], law.volume)
             if curvature > 0.0:
                 for role in range(4):
-                    add_square(blocks[law.rows[i, FRAMES[frame, role]]], 2.0 * curvature, vector_of(role, n))
+                    block = blocks[law.rows[i, FRAMES[frame, role]]]
+                    add_block(block, 0.0, 2.0 * curvature, vector_of(role, n))
 
 
 @dataclass(frozen=True)

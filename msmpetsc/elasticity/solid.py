@@ -15,8 +15,8 @@ from msmpetsc.elasticity import cell_lanes, cell_threads
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, add_corners, blocks_of, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import cell_energies, constants_at, gradient_at, linearise, state_at
-from msmpetsc.elasticity.cell_volume import add_square
 from msmpetsc.elasticity.neo_hookean import along_cofactors, corner_stiffness, kept_cofactors, lost
+from msmpetsc.elasticity.springs import add_block
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -55,7 +55,7 @@ def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: Cell
             block[0] += own
             block[4] += own
             block[8] += own
-            add_square(block, curvature, along_cofactors(n, g))
+            add_block(block, 0.0, curvature, along_cofactors(n, g))
 
 
 def _loops(array: Array) -> ModuleType:

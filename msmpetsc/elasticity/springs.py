@@ -269,7 +269,7 @@ def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
         e = between(q, ends[s, 1], ends[s, 0])
         c, ex, ey, ez = spring_block(e, rest_length[s], stiffness[s], stiffening, True)
         for end in range(2):
-            add_spring_block(blocks[ends[s, end]], c, ex, ey, ez)
+            add_block(blocks[ends[s, end]], c, 1.0, (ex, ey, ez))
 
 
 @numba.njit(cache=True)
@@ -304,17 +304,11 @@ def add_elastic_product(ends: Indices, blocks: Rows, v: Rows, product: Rows) -> 
 
 
 @numba.njit(cache=True)
-def add_spring_block(block: Floats, c: float, ex: float, ey: float, ez: float) -> None:
-    """Add c I + e e^T to a block (9,)."""
-    block[0] += c + ex * ex
-    block[1] += ex * ey
-    block[2] += ex * ez
-    block[3] += ex * ey
-    block[4] += c + ey * ey
-    block[5] += ey * ez
-    block[6] += ex * ez
-    block[7] += ey * ez
-    block[8] += c + ez * ez
+def add_block(block: Floats, c: float, factor: float, g: Vector) -> None:
+    """Add c I + factor g g^T to a block (9,)."""
+    for row in range(3):
+        for column in range(3):
+            block[3 * row + column] += factor * g[row] * g[column] + c * (row == column)
 
 
 class Around(NamedTuple):
@@ -456,4 +450,5 @@ def _diagonal_around(first: int, count: int, step: int, blocks: Rows, springs: A
             if j < 0:
                 break
             length, k = lengths[kind[s, i]], stiffness[s, i]
-            add_spring_block(blocks[i], *spring_block(between(q, j, i), length, k, stiffening, True))
+            c, ex, ey, ez = spring_block(between(q, j, i), length, k, stiffening, True)
+            add_block(blocks[i], c, 1.0, (ex, ey, ez))

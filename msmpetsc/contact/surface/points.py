@@ -20,6 +20,7 @@ class SurfacePoints:
     bodies : number of points that nodes carry; ``total`` with the obstacles'
     spread : greatest sum of the sizes of a point's weights: no point moves farther than that times the farthest node
     rows   : (k,) the points that nodes of this rank carry, ascending; ``weights`` (k, owned) theirs
+    sums   : (total, s) on rank 0 sums what all send of these, in the order of the ranks: the same each time
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array, obstacles: ObstacleSurfaces):
@@ -36,7 +37,9 @@ class SurfacePoints:
         shape = (len(self.rows), lattice.owned)
         self.weights = coo_array((to_owner.send(embedding.data), (row.ravel(), nodes)), shape=shape).tocsr()
         self.to_root = Route(comm, np.zeros(len(self.rows), np.int64))
-        self.received = np.split(self.to_root.send(self.rows), np.cumsum(self.to_root.received)[:-1])
+        sent = self.to_root.send(self.rows)
+        sums = np.ones(len(sent)), (sent, np.arange(len(sent)))
+        self.sums = csr_array(sums, shape=(self.total if comm.rank == 0 else 0, len(sent)))
 
     def __call__(self, q: Positions, time: float) -> Positions:
         """Return the points (total, 3) [m] of positions q (owned or more, 3) at a time [s] on rank 0; else none."""
@@ -47,12 +50,7 @@ class SurfacePoints:
 
     def moved(self, v: Rows) -> Rows:
         """Return W v (total, 3) of nodes' v (owned or more, 3), 0 for obstacles, on rank 0; (0, 3) on the others."""
-        parts = self.to_root.send(self.weights @ v[: self.weights.shape[1]])
-        points = np.zeros((self.total if self.comm.rank == 0 else 0, 3))
-        first = 0
-        for rows in self.received if self.comm.rank == 0 else ():  # in the order of the ranks: the same sum each time
-            points[rows] += parts[first : first + len(rows)]
-            first += len(rows)
+        points: Rows = self.sums @ self.to_root.send(self.weights @ v[: self.weights.shape[1]])
         return points
 
     def carried(self, numbers: Indices) -> csr_array:

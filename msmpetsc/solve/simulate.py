@@ -320,7 +320,7 @@ class Forces:
         for state in contact.states if contact else ():
             gradient = np.zeros_like(q[:owned])
             state.add_gradient(q[:owned], gradient)
-            push[self.keys.index(state.obstacle.key)] -= to_host(gradient.sum(axis=0))
+            push[self.keys.index(state.penalty.obstacle.key)] -= to_host(gradient.sum(axis=0))
         bodies = len(lattice.first_of_body)
         touching = np.zeros((bodies, 3))
         if contact and contact.surface:

@@ -38,7 +38,7 @@ class Penalty:
 
     def state_at(self, time: float, sides: Indices | None = None) -> "ContactState":
         """Return the obstacle at a time [s] without friction; ``sides`` (owned or more,) of nodes."""
-        return ContactState(self.obstacle, time, self.stiffness, None, sides)
+        return ContactState(self, time, sides)
 
     def during(
         self,
@@ -70,29 +70,25 @@ class Penalty:
             depth = np.clip(coming[nodes], 0, 2 * depth)  # what just came in tells little
         limit, begin = self.friction * self.stiffness * depth, np.zeros((1, 3), like=q)
         friction = NodeFriction(limit, stick, begin, nodes, normal, carried)
-        return replace(state, friction=friction, mu=self.friction)
+        return replace(state, friction=friction)
 
 
 @dataclass(frozen=True)
 class ContactState:
     """An obstacle as it stands at a time [s], where a step ends.
 
-    stiffness : [N/m] on each node
-    friction  : of the step, if any
-    sides     : (owned or more,) by which face each node came in (solids.side_of); None: the nearest
-    mu        : of friction
+    sides    : (owned or more,) by which face each node came in (solids.side_of); None: the nearest
+    friction : of the step, if any
     """
 
-    obstacle: Obstacle
+    penalty: Penalty
     time: float
-    stiffness: float
-    friction: NodeFriction | None
-    sides: Indices | None = None
-    mu: float = 0.0
+    sides: Indices | None
+    friction: NodeFriction | None = None
 
     def after(self, before: "list[ContactState]", q: Positions) -> "ContactState":
         """Return the same with friction that goes on from that of the step before, which ended at q (owned, 3) [m]."""
-        last = next((state.friction for state in before if state.obstacle is self.obstacle), None)
+        last = next((state.friction for state in before if state.penalty is self.penalty), None)
         return replace(self, friction=self.friction.after(last, q)) if self.friction else self
 
     def friction_limits(self, q: Positions) -> Floats:
@@ -100,22 +96,23 @@ class ContactState:
         if not self.friction:
             return np.zeros(2)
         _, depth, _ = self.pressed(q)
-        return np.array([float(self.friction.limit.sum()), self.mu * self.stiffness * float(depth.sum())])
+        limit_at_q = self.penalty.friction * self.penalty.stiffness * float(depth.sum())
+        return np.array([float(self.friction.limit.sum()), limit_at_q])
 
     def depths(self, q: Positions) -> tuple[Floats, Indices]:
         """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
-        return self.obstacle.depths(q, self.time, self.sides)
+        return self.penalty.obstacle.depths(q, self.time, self.sides)
 
     def pressed(self, q: Positions) -> Pressed:
         """Return which of the positions (n, 3) are pressed, rows (a,), how deep (a,) [m] and the normals (a, 3)."""
         depths, face = self.depths(q)
         rows = np.flatnonzero(depths > 0)
-        return rows, depths[rows], self.obstacle.normals_at(q[rows], self.time, face[rows])
+        return rows, depths[rows], self.penalty.obstacle.normals_at(q[rows], self.time, face[rows])
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] of the push and the friction at q (owned, 3) to ``gradient`` (owned or more, 3)."""
         rows, depth, normal = self.pressed(q)
-        gradient[rows] -= (self.stiffness * depth)[:, None] * normal
+        gradient[rows] -= (self.penalty.stiffness * depth)[:, None] * normal
         if self.friction:
             self.friction.add_gradient(q, gradient)
 
@@ -133,9 +130,9 @@ class ContactState:
         depths, base_depths = np.maximum(depths, 0), np.maximum(base_depths, 0)
         deeper = depths - base_depths
         if len(within):
-            seen, moved = self.obstacle.seen_from(q[within], self.time), (q - base)[within]
-            deeper[within] = self.obstacle.solid.deeper(seen, moved, face[within])
-        return 0.5 * self.stiffness * float(deeper @ (depths + base_depths))
+            obstacle, moved = self.penalty.obstacle, (q - base)[within]
+            deeper[within] = obstacle.solid.deeper(obstacle.seen_from(q[within], self.time), moved, face[within])
+        return 0.5 * self.penalty.stiffness * float(deeper @ (depths + base_depths))
 
 
 class Contact:
@@ -155,7 +152,7 @@ class Contact:
         energy = 0.0
         for state in self.states:
             inside = np.maximum(state.depths(q[: self.owned])[0], 0)
-            energy += 0.5 * state.stiffness * float(inside @ inside)
+            energy += 0.5 * state.penalty.stiffness * float(inside @ inside)
         return energy
 
     def change(self, q: Positions, base: Positions) -> float:
@@ -221,7 +218,7 @@ class Contact:
         of_states = secants[:-1] if secants else [None] * len(self.states)
         for state, secant in zip(self.states, of_states, strict=True):
             rows, _, normal = state.pressed(q[: self.owned])
-            yield rows, state.stiffness * squares(normal)
+            yield rows, state.penalty.stiffness * squares(normal)
             if state.friction:
                 yield state.friction.nodes, state.friction.blocks(q, secant)
 
@@ -229,7 +226,7 @@ class Contact:
         """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes meet obstacles."""
         bound = np.zeros(self.owned, like=q)
         for state in self.states:
-            bound += state.stiffness * (state.depths(q[: self.owned])[0] > 0)
+            bound += state.penalty.stiffness * (state.depths(q[: self.owned])[0] > 0)
             if state.friction:
                 bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
         return bound + self.surface.bound(q) if self.surface else bound

@@ -8,7 +8,7 @@ import trimesh
 from trimesh.triangles import closest_point, points_to_barycentric
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
-from msmpetsc.contact.obstacles.solids import TINY, Solid, one_face
+from msmpetsc.contact.obstacles.solids import TINY, Solid
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import DistanceFunction
 from msmpetsc.geometry.surface import Surface
@@ -104,7 +104,7 @@ class FunctionSolid(DistanceSolid):
         return Surface(points.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
 
     def _find(self, q: Positions) -> tuple[Floats, Indices]:
-        return -self.distances(q)[0], one_face(q)
+        return -self.distances(q)[0], np.zeros(len(q), np.int64)
 
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
         distance, gradient = self.distances(q)

@@ -77,8 +77,9 @@ class Ways(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always")
-def behind(q: Positions, i: int, points: Positions, normals: Rows, face: int) -> float:
+def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
     """Return how far the position q[i] (3,) lies behind a face [m]; negative in front of it."""
+    points, normals = planes
     distance: float = -normals[face, 0] * (q[i, 0] - points[face, 0])
     distance -= normals[face, 1] * (q[i, 1] - points[face, 1])
     distance -= normals[face, 2] * (q[i, 2] - points[face, 2])
@@ -86,40 +87,40 @@ def behind(q: Positions, i: int, points: Positions, normals: Rows, face: int) ->
 
 
 @numba.njit(cache=True, inline="always")
-def depth(q: Positions, i: int, points: Positions, normals: Rows, side: int) -> tuple[float, int]:
+def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
     """Return how deep q[i] (3,) lies behind the face of its ``side`` [m], and that face.
 
     Without a side: how deep in the solid, not positive outside, and the nearest face.
     """
     if side > 0:
-        return behind(q, i, points, normals, side - 1), side - 1
+        return behind(q, i, planes, side - 1), side - 1
     least, face = np.inf, 0
-    for f in range(len(points)):
-        distance = behind(q, i, points, normals, f)
+    for f in range(len(planes.points)):
+        distance = behind(q, i, planes, f)
         if distance < least:
             least, face = distance, f
     return least, face
 
 
 @numba.njit(cache=True)
-def _stays(q: Positions, i: int, points: Positions, normals: Rows, face: int) -> bool:
+def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
     """Return whether q[i] lies behind a face and has not slid off it past another.
 
     The opposite face is left aside: that of a thin plate may be passed.
     """
-    if behind(q, i, points, normals, face) <= 0.0:
+    if behind(q, i, planes, face) <= 0.0:
         return False
-    for f in range(len(points)):
+    for f in range(len(planes.points)):
         along = 0.0
         for c in range(3):
-            along += normals[f, c] * normals[face, c]
-        if along > OPPOSITE and behind(q, i, points, normals, f) <= 0.0:
+            along += planes.normals[f, c] * planes.normals[face, c]
+        if along > OPPOSITE and behind(q, i, planes, f) <= 0.0:
             return False
     return True
 
 
 @numba.njit(cache=True)
-def side_of(q: Positions, end: Positions, i: int, points: Positions, normals: Rows, side: int) -> int:
+def side_of(q: Positions, end: Positions, i: int, planes: Planes, side: int) -> int:
     """Return 1 + the face by which a node is in contact on its straight way from q[i] to end[i], 0 if it meets none.
 
     side : by which it was before: it keeps that until it is out of the solid
@@ -127,14 +128,14 @@ def side_of(q: Positions, end: Positions, i: int, points: Positions, normals: Ro
     It is the node that counts here, however far it sticks out of the surface: with a side, but no
     depth yet, it is on its way in, or out again.
     """
-    if side > 0 and _stays(q, i, points, normals, side - 1):
+    if side > 0 and _stays(q, i, planes, side - 1):
         return side
-    inside, face = depth(q, i, points, normals, 0)
+    inside, face = depth(q, i, planes, 0)
     if inside > 0.0:
         return face + 1
     enter, leave, side = -1.0, 1.0, 0  # fractions of the way
-    for f in range(len(points)):
-        first, last = behind(q, i, points, normals, f), behind(end, i, points, normals, f)
+    for f in range(len(planes.points)):
+        first, last = behind(q, i, planes, f), behind(end, i, planes, f)
         if first <= 0.0:
             if last < 0.0 or last == first:
                 return 0
@@ -148,17 +149,15 @@ def side_of(q: Positions, end: Positions, i: int, points: Positions, normals: Ro
 
 @kernel
 def _depths_of(first: int, count: int, step: int, q: Positions, planes: Planes, of: Depths) -> None:
-    points, normals = planes
     for i in range(first, count, step):
-        of.depths[i], of.faces[i] = depth(q, i, points, normals, of.sides[i])
+        of.depths[i], of.faces[i] = depth(q, i, planes, of.sides[i])
 
 
 @kernel
 def _sides_of(first: int, count: int, step: int, q: Positions, planes: Planes, ways: Ways) -> None:
-    points, normals = planes
     ends, before, sides = ways
     for i in range(first, count, step):
-        sides[i] = side_of(q, ends, i, points, normals, before[i])
+        sides[i] = side_of(q, ends, i, planes, before[i])
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ class BallSolid(Solid):
     radius: float
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        return self.radius - np.linalg.norm(q - self.center, axis=1), one_face(q)
+        return self.radius - np.linalg.norm(q - self.center, axis=1), np.zeros(len(q), np.int64, like=q)
 
     def normals(self, q: Positions, face: Indices) -> Rows:
         out = q - self.center
@@ -225,11 +224,6 @@ class BallSolid(Solid):
 
     def sent(self, send: Send) -> "BallSolid":
         return replace(self, center=send(self.center))
-
-
-def one_face(q: Positions) -> Indices:
-    """Return the faces (n,) of positions (n, 3) in a solid that has but one."""
-    return np.zeros(len(q), np.int64, like=q)
 
 
 def no_sides(q: Positions) -> Indices:

@@ -91,20 +91,16 @@ def _volume(a: Vector, b: Vector, c: Vector) -> float:
 
 
 @numba.njit(cache=True)
-def lack_of(volume: float, least: float) -> float:
-    """Return 1 - J / J_0 of a corner; ``least``: J_0 h^3 [m^3]."""
-    return 1.0 - volume / least
-
-
-@numba.njit(cache=True)
 def corner_change(e: Frame, before: Frame, d: Frame, resistance: float, least: float) -> float:
     """Return the energy of a corner of the edges e less that of its edges ``before``, which changed by d [J].
+
+    least : J_0 h^3 [m^3]
 
     It comes from how the nodes moved, so that a small change keeps its digits: with d_k = e_k -
     e'_k, J - J' = d_1 . e_2 x e_3 + d_2 . e_3 x e'_1 + d_3 . e'_1 x e'_2.
     """
-    lack = lack_of(_volume(e[0], e[1], e[2]), least)
-    lack_before = lack_of(_volume(before[0], before[1], before[2]), least)
+    lack = 1.0 - _volume(e[0], e[1], e[2]) / least
+    lack_before = 1.0 - _volume(before[0], before[1], before[2]) / least
     if lack <= 0.0 or lack_before <= 0.0:
         return resistance * (max(lack, 0.0) ** 3 - max(lack_before, 0.0) ** 3)
     larger = dot(d[0], _cross(e[1], e[2])) + dot(d[1], _cross(e[2], before[0]))
@@ -115,7 +111,7 @@ def corner_change(e: Frame, before: Frame, d: Frame, resistance: float, least: f
 @numba.njit(cache=True)
 def corner_slope(e: Frame, n: Frame, resistance: float, least: float) -> float:
     """Return d energy / d volume of a corner with the edges e and cofactors n [N/m^2]: not positive."""
-    lack = max(lack_of(dot(e[0], n[0]), least), 0.0)
+    lack = max(1.0 - dot(e[0], n[0]) / least, 0.0)
     return -3.0 * resistance * lack * lack / least
 
 
@@ -170,7 +166,7 @@ def _energy_of(first: int, count: int, step: int, parts: Floats, law: Resistance
         energy = 0.0
         for frame in range(8):
             e = edges(q, law.cells[i], frame)
-            lack = max(lack_of(_volume(e[0], e[1], e[2]), law.volume), 0.0)
+            lack = max(1.0 - _volume(e[0], e[1], e[2]) / law.volume, 0.0)
             energy += law.stiffness[i] * lack**3
         parts[i] = energy
 
@@ -231,7 +227,7 @@ def _add_corner(rows: Rows, at: Indices, frame: int, factor: float, vectors: Fra
 def corner_curvature(e: Frame, n: Vector, resistance: float, least: float) -> float:
     """Return d^2 energy / d volume^2 of a corner with the edges e, n the first of its cofactors
     [N/m^5]: not negative, and 0 where it does not resist."""
-    return 6.0 * resistance * max(lack_of(dot(e[0], n), least), 0.0) / least**2
+    return 6.0 * resistance * max(1.0 - dot(e[0], n) / least, 0.0) / least**2
 
 
 @numba.njit(cache=True)

@@ -28,7 +28,6 @@ class Elasticity:
 
     def __init__(self, lattice: Lattice):
         self.owned = lattice.owned
-        on_cpu = on_host(lattice.nodes)
         self.springs: SpringScatter | SpringGather | None = None
         self.cells: Cells | None = None
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
@@ -36,7 +35,7 @@ class Elasticity:
         if self.solid and lattice.viscous:
             self.viscosity = Viscosity(self.solid, lattice.viscous, lattice.owned, lattice.nodes)
         if self.solid is None:
-            self.springs = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
+            self.springs = (SpringScatter if on_host(lattice.nodes) else SpringGather).of_lattice(lattice)
         if lattice.stiffening > 0:
             volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
             self.cells = Cells.of_lattice(lattice, RESISTANCE * resistance, ONSET * volume)

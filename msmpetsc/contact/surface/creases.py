@@ -27,9 +27,9 @@ def neighbours(
 ) -> Mapping[tuple[int, int], bool]:
     """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than
     ``distance`` [m] at rest."""
-    kinds = (candidates.fv_candidates, 1), (candidates.ee_candidates, 2)
-    pairs = [_cross_pairs(kind, mesh, points, distance, split) for kind, split in kinds]
-    groups = np.concatenate([np.empty((0, 4, 2), np.int64), *pairs])
+    of_points = _cross_pairs(candidates.fv_candidates, mesh, points, distance, [(0, 1), (0, 2), (0, 3), (0, 3)])
+    of_edges = _cross_pairs(candidates.ee_candidates, mesh, points, distance, [(0, 2), (0, 3), (1, 2), (1, 3)])
+    groups = np.concatenate([of_points, of_edges])
     if len(groups) == 0:
         return {}
     edges = np.concatenate([mesh.edges, mesh.edges[:, ::-1], np.repeat(np.arange(len(points))[:, None], 2, axis=1)])
@@ -43,14 +43,12 @@ def neighbours(
     return {(int(i), int(j)): False for i, j in np.unique(local, axis=0) if i < j}
 
 
-def _cross_pairs(kind: list[Any], mesh: Any, points: Positions, distance: float, split: int) -> Indices:
+def _cross_pairs(kind: list[Any], mesh: Any, points: Positions, distance: float, cross: list[Any]) -> Indices:
     """Return of each near candidate the pairs (k, 4, 2) of a point of the first and one of the
-    second part; of a point and a triangle there are three, one of them twice."""
+    second part, by their places in ``cross``: of a point and a triangle there are three, one of them twice."""
     points, edges, faces = np.asfortranarray(points), mesh.edges, mesh.faces
     near = [c.vertex_ids(edges, faces) for c in kind if c.compute_distance(points, edges, faces) < distance**2]
-    ids = np.array(near, np.int64).reshape(-1, 4)
-    chosen = [(0, 1), (0, 2), (0, 3), (0, 3)] if split == 1 else [(0, 2), (0, 3), (1, 2), (1, 3)]
-    return ids[:, chosen]
+    return np.array(near, np.int64).reshape(-1, 4)[:, cross]
 
 
 def creases(

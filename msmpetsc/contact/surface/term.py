@@ -177,20 +177,14 @@ class SurfaceContact:
         moment = self._acting(q)
         if moment is None:
             return
-        touched, forces = self.comm.bcast(self._forces(moment))
-        weights = self.contacts.points.carried(touched)
+        forces, points = self._gradient(moment), self.contacts.points
+        touched = np.flatnonzero(forces[: points.bodies].any(axis=1))
+        touched, forces = self.comm.bcast((touched, forces[touched]))
+        weights = points.carried(touched)
         gradient[: weights.shape[1]] += weights.T @ forces
 
-    def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
-        """Return on rank 0 the points (k,) that are pushed, and the gradient there (k, 3) [N]."""
-        if self.contacts.barrier is None:
-            return None
-        forces = self._gradient(moment)
-        touched = np.flatnonzero(forces[: self.contacts.points.bodies].any(axis=1))
-        return touched, forces[touched]
-
     def _gradient(self, moment: ContactsAt) -> Rows:
-        """Return the gradient (total, 3) [N] on rank 0, friction included."""
+        """Return the gradient (total, 3) [N] on rank 0, friction included; (0, 3) on the others."""
         rubs = self.friction.gradient(moment.points) if self.friction else 0.0
         return self._pushes(moment) + rubs
 

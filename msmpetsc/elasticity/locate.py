@@ -18,9 +18,9 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 
 
 def _greatest(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) -> tuple[int, str]:
-    """Return where a measure (k,) is greatest: a node's global number, and the body and point at rest (collective).
+    """Return where a measure (k,) is greatest: a node's global number, its place (collective).
 
-    corners : (k, c) local nodes of what is measured, whose mean is the point and whose first the node
+    corners : (k, c) local nodes of what is measured: its place is their mean, its node the first
     """
     candidate = -np.inf, 0, np.zeros(3)
     if len(corners):

@@ -198,7 +198,7 @@ class Contact:
     def all_secant(self) -> Secants:
         """Return what ``hessian`` takes for all friction of obstacles to have its secant.
 
-        That goes with A: beside it friction's true Hessian, nothing along a slip, would let nodes run to and fro.
+        With A, friction's true Hessian, nothing along a slip, would let nodes run to and fro.
         """
         return [*(state.friction.all_secant() if state.friction else None for state in self.states), None]
 

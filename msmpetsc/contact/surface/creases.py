@@ -45,7 +45,7 @@ def neighbours(
 
 def _cross_pairs(kind: list[Any], mesh: Any, points: Positions, distance: float, cross: list[Any]) -> Indices:
     """Return of each near candidate the pairs (k, 4, 2) of a point of the first and one of the
-    second part, by their places in ``cross``: of a point and a triangle there are three, one of them twice."""
+    second part, by their places in ``cross``: of a point and a triangle there are three, one twice."""
     points, edges, faces = np.asfortranarray(points), mesh.edges, mesh.faces
     near = [c.vertex_ids(edges, faces) for c in kind if c.compute_distance(points, edges, faces) < distance**2]
     return np.array(near, np.int64).reshape(-1, 4)[:, cross]

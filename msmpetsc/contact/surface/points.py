@@ -20,7 +20,7 @@ class SurfacePoints:
     bodies : number of points that nodes carry; ``total`` with the obstacles'
     spread : greatest sum of the sizes of a point's weights: no point moves farther than that times the farthest node
     rows   : (k,) the points that nodes of this rank carry, ascending; ``weights`` (k, owned) theirs
-    sums   : (total, s) on rank 0 sums what all send of these, in the order of the ranks: the same each time
+    sums   : (total, s) on rank 0 sums what all send of these, in the order of the ranks
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array, obstacles: ObstacleSurfaces):
@@ -54,7 +54,7 @@ class SurfacePoints:
         return points
 
     def carried(self, numbers: Indices) -> csr_array:
-        """Return the weights (k, owned) by which this rank's nodes carry the points with these numbers (k,)."""
+        """Return the weights (k, owned) of this rank's nodes in points with these numbers (k,)."""
         row = np.searchsorted(self.rows, numbers)
         at = np.flatnonzero(np.append(self.rows, -1)[row] == numbers)
         chosen = csr_array((np.ones(len(at)), (at, row[at])), shape=(len(numbers), len(self.rows)))

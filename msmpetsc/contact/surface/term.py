@@ -51,7 +51,7 @@ class SurfaceHessian:
 
         compliance : (n,) [m/N] of nodes of this rank: a point is stiff that gives way less than they let it
         """
-        given = self.comm.allreduce(self.weights.copy().power(2) @ compliance)  # scipy sorts what it takes powers of
+        given = self.comm.allreduce(self.weights.copy().power(2) @ compliance)  # power sorts its matrix
         stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * given
         order = np.argsort(-stiffness, kind="stable")
         stiff = min(most, int((stiffness > 1).sum()))

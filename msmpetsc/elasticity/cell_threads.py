@@ -15,16 +15,12 @@ from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_b
 from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
     changes,
-    cofactors,
-    determinant,
     gradient_of,
     pull,
-    quadratic,
     quadratic_change,
     slopes_at,
     turned_pull,
     volume_change,
-    volume_energy,
     write_state,
 )
 from msmpetsc.elasticity.springs import Way
@@ -97,15 +93,6 @@ def _write_states(first: int, count: int, step: int, q: Positions, cells: CellRo
 
 
 @kernel
-def _write_energies(first: int, count: int, step: int, q: Positions, cells: CellRows, energies: Floats) -> None:
-    for i in range(first, count, step):
-        k, e, f = constants_at(cells, i), strains_at(q, cells, i), gradient_at(q, cells, i)
-        m, j = cells.constants[k + 104], determinant(f, cofactors(f))
-        volume = volume_energy(j, m, cells.constants[k + 112]) - 1.5 * m
-        energies[i] = 0.5 * quadratic(cells.constants, k, e, e) + cells.h4**2 * volume
-
-
-@kernel
 def _write_changes(first: int, count: int, step: int, parts: Floats, cells: CellRows, way: Way) -> None:
     base, _, moved = way
     for i in range(first, count, step):
@@ -139,13 +126,13 @@ def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> Non
     _write_states(LANES * len(blocks.nodes), q, one_by_one(blocks, state), projected)
 
 
-def cell_energies(blocks: Blocks, q: Positions, energies: Rows) -> None:
-    """Write the energy of cells [J] at q (l, 3) [m], 0 at rest, into ``energies`` (b, LANES), of the first b blocks."""
-    _write_energies(energies.size, q, one_by_one(blocks), energies.ravel())
+def cell_changes(blocks: Blocks, count: int, q: Positions, base: Positions) -> Floats:
+    """Return E(q) - E(base) [J] of the first cells (count,), by how nodes moved: it keeps digits."""
+    parts: Floats = np.empty(count, like=q)
+    _write_changes(count, parts, one_by_one(blocks), Way.to(q, base))
+    return parts
 
 
 def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
-    """Return E(q) - E(base) [J] of the cells that the rank owns, by how the nodes moved: it keeps its digits."""
-    parts = np.empty(LANES * blocks.owned, like=q)
-    _write_changes(len(parts), parts, one_by_one(blocks), Way.to(q, base))
-    return float(parts.sum())
+    """Return E(q) - E(base) [J] of the cells that the rank owns."""
+    return float(cell_changes(blocks, LANES * blocks.owned, q, base).sum())

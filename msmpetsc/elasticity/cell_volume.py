@@ -161,17 +161,6 @@ def _least_volume_of(
 
 
 @kernel
-def _energy_of(first: int, count: int, step: int, parts: Floats, law: Resistance, q: Positions) -> None:
-    for i in range(first, count, step):
-        energy = 0.0
-        for frame in range(8):
-            e = edges(q, law.cells[i], frame)
-            lack = max(1.0 - _volume(e[0], e[1], e[2]) / law.volume, 0.0)
-            energy += law.stiffness[i] * lack**3
-        parts[i] = energy
-
-
-@kernel
 def _change_of(first: int, count: int, step: int, parts: Floats, law: Resistance, way: Way) -> None:
     base, q, moved = way
     for i in range(first, count, step):
@@ -303,14 +292,9 @@ class Cells:
         law = Resistance(cells, like(cells, stiffness), volume, cells)
         return cls(law, lattice.cells_owned, like(cells, around))
 
-    def energy(self, q: Positions) -> float:
-        """Return the energy [J] of the cells that this rank owns."""
-        parts = np.empty(self.owned, like=q)
-        _energy_of(len(parts), parts, self.law, q)
-        return float(parts.sum())
-
     def change(self, q: Positions, base: Positions) -> float:
-        """Return the energy at q less that at base [J], corner by corner so that a small change keeps its digits."""
+        """Return the energy at q less that at base [J] of the cells that this rank owns,
+        corner by corner so that a small change keeps its digits."""
         parts = np.empty(self.owned, like=q)
         _change_of(len(parts), parts, self.law, Way.to(q, base))
         return float(parts.sum())

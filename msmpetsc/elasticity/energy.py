@@ -27,7 +27,7 @@ class Elasticity:
     """
 
     def __init__(self, lattice: Lattice):
-        self.owned = lattice.owned
+        self.owned, self.rest = lattice.owned, lattice.nodes
         self.springs: SpringScatter | SpringGather | None = None
         self.cells: Cells | None = None
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
@@ -42,8 +42,9 @@ class Elasticity:
         self.parts = [part for part in (self.solid, self.springs, self.cells, self.viscosity) if part]
 
     def energy(self, q: Positions) -> float:
-        """Return E [J] of what this rank owns."""
-        return sum(part.energy(q) for part in self.parts)
+        """Return E [J] of what this rank owns: laws' changes from rest, where E is 0, and D."""
+        viscous = self.viscosity.energy(q) if self.viscosity else 0.0
+        return viscous + sum(law.change(q, self.rest) for law in (self.solid, self.springs, self.cells) if law)
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of what this rank owns."""

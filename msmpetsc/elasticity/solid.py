@@ -14,7 +14,7 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity import cell_lanes, cell_threads
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, add_corners, blocks_of, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
-from msmpetsc.elasticity.cell_threads import cell_energies, constants_at, gradient_at, linearise, state_at
+from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, linearise, state_at
 from msmpetsc.elasticity.neo_hookean import along_cofactors, corner_stiffness, kept_cofactors, lost
 from msmpetsc.elasticity.springs import add_block
 from msmpetsc.lattice.lattice import Lattice
@@ -128,16 +128,6 @@ class NeoHookean:
             yield
         finally:
             lame[:] = true
-
-    def energies(self, q: Positions, blocks: int) -> Rows:
-        """Return E [J] by cell (blocks, LANES), of the first blocks."""
-        energies = np.empty((blocks, LANES), like=q)
-        cell_energies(self.blocks, q, energies)
-        return energies
-
-    def energy(self, q: Positions) -> float:
-        """Return E [J] of the cells that this rank owns."""
-        return float(self.energies(q, self.blocks.owned).sum())
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of the cells that this rank owns."""

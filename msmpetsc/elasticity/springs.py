@@ -43,19 +43,11 @@ def dot(a: Vector, b: Vector) -> float:
 
 
 @numba.njit(cache=True)
-def spring_energy(e: Vector, r: float, k: float, b: float) -> float:
-    """Return 1/2 k (|e| - r)^2 (Eq. 13) of a spring e, and what stiffening b adds, [J]."""
-    stretch = math.sqrt(dot(e, e)) - r
-    energy = 0.5 * k * stretch * stretch
-    if b > 0.0:
-        strain = stretch / r
-        energy *= 1.0 + 0.5 * b * strain * strain
-    return energy
-
-
-@numba.njit(cache=True)
 def spring_change(before: Vector, d: Vector, r: float, k: float, b: float) -> float:
-    """Return the energy of a spring that changed by d less what it was ``before`` [J]."""
+    """Return the energy of a spring that changed by d less what it was ``before`` [J].
+
+    It is 1/2 k (|e| - r)^2 (Eq. 13) of a spring e, and what stiffening b adds.
+    """
     e = before[0] + d[0], before[1] + d[1], before[2] + d[2]
     length, length_before = math.sqrt(dot(e, e)), math.sqrt(dot(before, before))
     total = length + length_before
@@ -140,16 +132,6 @@ def between(q: Positions, a: int, b: int) -> Vector:
 
 
 @kernel
-def _elastic_energy(first: int, count: int, step: int, sums: Floats, springs: Springs, q: Positions) -> None:
-    ends, rest_length, stiffness, stiffening = springs
-    energy = 0.0
-    for s in range(first, count, step):
-        energy += spring_energy(between(q, ends[s, 1], ends[s, 0]), rest_length[s], stiffness[s], stiffening)
-    if first < count:
-        sums[first] = energy
-
-
-@kernel
 def _elastic_change(first: int, count: int, step: int, sums: Floats, springs: Springs, way: Way) -> None:
     ends, rest_length, stiffness, stiffening = springs
     base, _, moved = way
@@ -169,19 +151,12 @@ class OwnedSprings:
 
     owned: Springs
 
-    def energy(self, q: Positions) -> float:
-        """Return E [J] of the springs that this rank owns."""
-        return self._sum(_elastic_energy, q)
-
     def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of these springs, summed spring by spring so that a small change keeps its
         digits."""
-        return self._sum(_elastic_change, Way.to(q, base))
-
-    def _sum(self, loop: Callable[..., None], at: Positions | Way) -> float:
         count, ends = len(self.owned.ends), self.owned.ends
         sums = np.zeros(1 if on_host(ends) else count, like=ends, dtype=float)
-        loop(count, sums, self.owned, at)
+        _elastic_change(count, sums, self.owned, Way.to(q, base))
         return float(sums.sum())
 
 
@@ -379,7 +354,7 @@ class SpringGather(OwnedSprings):
 
 
 def rows_of(nodes: Indices, owned: int) -> Indices:
-    """Return which rows of those of ``nodes`` (n,) are each owned node's, (8 or more, owned); n past the last."""
+    """Return which rows of ``nodes`` (n,) are each owned node's, (8 or more, owned); n past the last."""
     by_node = np.argsort(nodes, kind="stable")
     by_node = by_node[: np.searchsorted(nodes[by_node], owned)]
     node = nodes[by_node]

@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
 from msmpetsc.elasticity.cell_blocks import STATE
 from msmpetsc.elasticity.cell_strain import LANES
+from msmpetsc.elasticity.cell_threads import cell_changes
 from msmpetsc.elasticity.neo_hookean import ONSET
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.lattice.lattice import Lattice
@@ -34,6 +35,7 @@ class StressField:
     def __init__(self, lattice: Lattice, solid: NeoHookean):
         assert lattice.solid is not None
         self.solid, self.cells, self.cells_owned = solid, lattice.solid, lattice.cells_owned
+        self.rest = lattice.nodes
         corners, of_blocks = to_host(lattice.local_cells), to_host(solid.blocks.nodes)
         first, lanes = np.unique(of_blocks[:, :, 0], return_index=True)  # before the lanes that fill up
         self.lanes = lanes[np.searchsorted(first, corners[:, 0])]
@@ -54,8 +56,8 @@ class StressField:
         share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
         stress: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
         stress[:, :3] += slope[:, None]
-        energy = to_host(self.solid.energies(q, len(self.solid.blocks.nodes)))
-        energies = energy.ravel()[self.lanes] / self.cells.volume
+        energies = cell_changes(self.solid.blocks, LANES * len(self.solid.blocks.nodes), q, self.rest)
+        energies = to_host(energies)[self.lanes] / self.cells.volume
         own = slice(self.cells_owned)
         of_nodes = _fields(self.around @ stress, self.around @ energies)
         return of_nodes | {f"cell_{name}": rows for name, rows in _fields(stress[own], energies[own]).items()}

@@ -106,12 +106,13 @@ class Layout:
             file["checkpoint/numbers"].attrs["names"] = " ".join(self.numbers)
 
     def first_misfit(self, file: h5py.File) -> str | None:
-        """Return the name of the first dataset that a file lacks or has in another shape; None if all fit."""
+        """Return the name of the first dataset that a file lacks, or has in another shape or with other names."""
         for plan in self.plans():
             dataset = file.get(plan.name)
             if dataset is None or dataset.shape != plan.shape or dataset.dtype != np.dtype(plan.dtype):
                 return plan.name
-        return None
+        names = file["checkpoint/numbers"].attrs["names"] if self.numbers else ""
+        return None if names == " ".join(self.numbers) else "checkpoint/numbers"
 
 
 def _rows_plan(name: str, times: int, rows: int, shape: tuple[int, ...], dtype: str) -> Plan:

@@ -80,10 +80,7 @@ def missing_cuda() -> str | None:
 
 
 class Memory:
-    """PETSc's vectors and matrices in the memory of the CPU.
-
-    types : PETSc's names of vectors and matrices there
-    """
+    """PETSc's vectors and matrices in the memory of the CPU; ``vec_type`` and ``mat_type`` are PETSc's names there."""
 
     vec_type, mat_type = PETSc.Vec.Type.STANDARD, PETSc.Mat.Type.AIJ
 

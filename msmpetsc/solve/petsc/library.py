@@ -56,11 +56,13 @@ def replaced_option(name: str, value: str) -> Iterator[None]:
     """Replace the value of an option while the block is run."""
     database, before = PETSc.Options(), PETSc.Options().getAll()
     database.setValue(name, value)
-    yield
-    if name in before:
-        database.setValue(name, before[name])
-    else:
-        database.delValue(name)
+    try:
+        yield
+    finally:
+        if name in before:
+            database.setValue(name, before[name])
+        else:
+            database.delValue(name)
 
 
 def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:

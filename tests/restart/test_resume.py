@@ -250,6 +250,13 @@ def test_a_longer_run_after_a_stop_between_frames_and_a_kill(whole: Path, stoppe
     assert_same(stopped, longer)
 
 
+def test_numbers_of_another_version_are_not_written_over(stopped: Path, capsys):
+    with h5py.File(stopped, "r+") as file:
+        file["checkpoint/numbers"].attrs["names"] += "_of_old"
+    assert main(["run", "--resume", str(stopped)]) == 2
+    assert "has no room for checkpoint/numbers as it is now: --force" in capsys.readouterr().err
+
+
 def test_a_run_cannot_end_before_its_checkpoint(stopped: Path, capsys):
     before = stopped.read_bytes()
     for duration, steps in ((0.1, 10), (0.096, 10), (0.094, 9)):

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """The cost of a step, `newton` beside what it took the place of. Needs the meshes.
 
-    scripts/bench.py [--only NAME ...] [--laws LAW ...] [--frames N] [--repeats N] [--ranks N] [--gpu] [--large]
+    scripts/bench.py [--only NAME ...] [--laws LAW ...] [--alone] [--frames N] [--repeats N] [--ranks N] [--gpu] [--large]
 
 Runs the paper's scenes, clamped beams of 9,000 and 96,000 cells and, with --large, of 995,000, each to a step error of
 1e-3 on one core: `newton` with `-pc_type jacobi` and `gamg`, with --ranks `newton` on so many, and `newton`, one after
-the other, and all of that again for each repeat. --only takes rows whose name contains NAME. --gpu takes `newton`
-alone, on one core, with --ranks on so many, and on the GPU of the machine.
+the other, and all of that again for each repeat. --only takes rows whose name contains NAME. --alone takes `newton`
+alone, on one core and with --ranks on so many, --gpu on the GPU of the machine as well.
 
 Figures are of all frames but the first, for what is done once shows in it: the mean time, its median over the repeats
 with the least and the greatest of them in brackets; `slowest tenth` is the mean of those frames. KSP iterations and
@@ -149,7 +149,8 @@ def methods_of(args: Namespace) -> dict[str, Method]:
     more = {f"{TODAY}, {args.ranks} ranks": Method(today.words, args.ranks)} if args.ranks > 1 else {}
     if args.gpu:
         return {TODAY: today, **more, "GPU": Method((*today.words, "--device", "cuda"))}
-    return {name: method for name, method in METHODS.items() if name != TODAY} | more | {TODAY: today}
+    others = {} if args.alone else {name: method for name, method in METHODS.items() if name != TODAY}
+    return others | more | {TODAY: today}
 
 
 def main() -> int:
@@ -160,6 +161,7 @@ def main() -> int:
     options.add_argument(
         "--laws", nargs="+", metavar="LAW", help="of materials; own, the scene's, and neo-hookean if absent"
     )
+    options.add_argument("--alone", action="store_true", help="no other methods beside newton")
     options.add_argument("--frames", type=int, metavar="N", help="steps of each run; all of the scene's if absent")
     options.add_argument("--repeats", type=int, default=5, metavar="N", help="runs of each method (%(default)s)")
     options.add_argument("--ranks", type=int, default=1, metavar="N", help="on so many ranks, too")

@@ -129,8 +129,8 @@ class ErrorControl:
         return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here
 
     def _is_next_no_dearer(self, now: Outcome) -> bool:
-        """Whether the next linear solve costs no more than an estimate, which with Jacobi's is one itself."""
-        if self.estimate.preconditioner.is_uniform or now.alarm or now.doubts or now.at_rounding:
+        """Whether the next linear solve costs no more than an estimate, which is one itself, and leads on."""
+        if now.alarm or now.doubts or now.at_rounding:
             return False
         return now.goal * now.distance < now.solved < np.inf
 

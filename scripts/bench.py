@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """The cost of a step, `newton` beside what it took the place of. Needs the meshes.
 
-    scripts/bench.py [--only NAME ...] [--laws LAW ...] [--alone] [--frames N] [--repeats N] [--ranks N] [--gpu] [--large]
+    scripts/bench.py [--only NAME ...] [--laws LAW ...] [--alone] [--frames N] [--repeats N] [--ranks N] [--gpu]
+        [--large]
 
 Runs the paper's scenes, clamped beams of 9,000 and 96,000 cells and, with --large, of 995,000, each to a step error of
 1e-3 on one core: `newton` with `-pc_type jacobi` and `gamg`, with --ranks `newton` on so many, and `newton`, one after

@@ -102,7 +102,7 @@ def too_long(timeout: float) -> str:
 
 def last_error(log: str) -> str:
     """Return the last line of a log that is an error, or else the last line."""
-    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    lines = [line.strip() for line in log.splitlines() if line.strip(" -")]  # no frame of mpiexec
     errors = [line for line in lines if "msmpetsc: error:" in line]
     return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
 

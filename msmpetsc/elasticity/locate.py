@@ -13,22 +13,22 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 
     rows, measure : (k,) local nodes, and what is measured of each
     """
-    number, where = _greatest(comm, lattice, rows[:, None], np.nan_to_num(to_host(measure), nan=np.inf))
+    number, where = _least(comm, lattice, rows[:, None], -np.nan_to_num(to_host(measure), nan=np.inf))
     return f"node {number}, {where}"
 
 
-def _greatest(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) -> tuple[int, str]:
-    """Return where a measure (k,) is greatest: a node's global number, its place (collective).
+def _least(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) -> tuple[int, str]:
+    """Return where a measure (k,) is least: a node's global number, its place (collective).
 
     corners : (k, c) local nodes of what is measured: its place is their mean, its node the first
     """
-    candidate = -np.inf, 0, np.zeros(3)
+    candidate = np.inf, 0, np.zeros(3)
     if len(corners):
-        best = int(np.argmax(to_host(measure)))
-        nodes = to_host(corners[best])
+        least = int(measure.argmin())
+        nodes = to_host(corners[least])
         point = to_host(lattice.nodes[like(lattice.nodes, nodes)].mean(axis=0))
-        candidate = float(measure[best]), int(lattice.global_numbers[nodes[0]]), point
-    _, number, point = max(comm.allgather(candidate), key=lambda candidate: candidate[0])
+        candidate = float(measure[least]), int(lattice.global_numbers[nodes[0]]), point
+    _, number, point = min(comm.allgather(candidate), key=lambda candidate: candidate[0])
     return number, f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
 
 
@@ -46,7 +46,7 @@ def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool
     total = comm.allreduce(int((volumes <= 0).sum()))
     if not total:
         return 0, ""
-    return total, _greatest(comm, lattice, cells, -volumes)[1]
+    return total, _least(comm, lattice, cells, volumes)[1]
 
 
 def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:

@@ -5,7 +5,7 @@ The hierarchy is that of the projected Hessian H, which is positive definite at 
 one has a preconditioner that is, too. The finest level is applied spring by spring or cell by cell in single precision,
 and smoothed with a block diagonal D. The first coarse one is summed spring by spring or cell by cell
 (solve.multigrid.galerkin), those below are products P^T H P of PETSc's; all but the coarsest are applied in single
-precision, too.
+precision, too (solve.multigrid.coarse_operator).
 """
 
 from collections.abc import Iterator
@@ -25,9 +25,10 @@ from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
 from msmpetsc.solve.multigrid.contact import CoarseContact, ContactSmoother
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
-from msmpetsc.solve.multigrid.galerkin import CoarseOperator, GalerkinSum, set_block_size
+from msmpetsc.solve.multigrid.galerkin import GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.events import FINE

@@ -1,0 +1,135 @@
+"""Matrices of coarse levels applied in single precision, on a CPU: PETSc's AIJ has but double."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask
+
+
+class BlockRows(NamedTuple):
+    """Some 3 x 3 blocks of a matrix: those of row i are begin[i] to begin[i + 1], the k-th of column columns[k].
+
+    place  : where the first number of each is among those of the AIJ
+    values : (k, 9) float32
+    """
+
+    begin: Indices
+    columns: Indices
+    place: Indices
+    values: Array
+
+    @classmethod
+    def chosen(cls, chosen: Mask, rows: int, row: Indices, columns: Indices, place: Indices) -> "BlockRows":
+        begin = np.searchsorted(row[chosen], np.arange(rows + 1))
+        values = np.empty((chosen.sum(), 9), np.float32)
+        return cls(begin, columns[chosen].astype(np.int32), place[chosen], values)
+
+
+class CoarseOperator:
+    """Applies the matrix of a coarse level in single precision. All methods are collective.
+
+    A product is as fast as its blocks stream from memory. Of a block and its transpose one is kept, in four
+    bytes a number and with one index: 0.6 kB a node, where the AIJ that it is made from has 2.9. It acts on
+    differences of nodes, and on the sum of each row's blocks, so that stiffness of which a translation feels
+    nothing takes none of its digits.
+
+    matrix   : AIJ of block size 3, symmetric, with full blocks
+    operator : MATPYTHON of which this is the context
+    """
+
+    def __init__(self, matrix: PETSc.Mat):
+        self.matrix = matrix
+        begin, columns, _ = matrix.getValuesCSR()
+        first, last = (bound // 3 for bound in matrix.getOwnershipRange())
+        self.length = np.diff(begin)[::3]
+        row = np.repeat(np.arange(last - first), self.length // 3)
+        within = 3 * np.arange(len(row)) - np.concatenate([[0], np.cumsum(self.length)])[row]
+        place = begin[3 * row] + within
+        columns = columns[place] // 3
+        is_own = (columns >= first) & (columns < last)
+        ghosts, number = np.unique(columns[~is_own], return_inverse=True)
+        self.own = BlockRows.chosen(is_own & (columns > first + row), last - first, row, columns - first, place)
+        columns[~is_own] = number
+        self.others = BlockRows.chosen(~is_own, last - first, row, columns, place)
+        self.sums = np.empty((last - first, 9), np.float32)
+        self.x, self.y = np.empty((2, last - first, 3), np.float32)
+        self.ghosts = PETSc.Vec().createSeq(3 * len(ghosts))
+        whole, wanted = matrix.createVecRight(), PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType))
+        self.scatter = PETSc.Scatter().create(whole, wanted, self.ghosts, None)
+        whole.destroy()
+        wanted.destroy()
+        self.operator = PETSc.Mat().createPython(matrix.getSizes(), self, comm=matrix.comm)
+        self.operator.setBlockSize(3)
+        self.operator.setUp()
+
+    def update(self) -> None:
+        """Take the blocks as the matrix has them now."""
+        begin, _, values = self.matrix.getValuesCSR()
+        self.sums[:] = np.add.reduceat(values.reshape(-1, 3), begin[:-1] // 3, axis=0).reshape(-1, 9)
+        for part in (self.own, self.others):
+            take_blocks(self.length, part, values)
+        self.operator.assemble()
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = H x."""
+        self.x[:] = x.array_r.reshape(-1, 3)
+        multiply_upper(self.own, self.sums, self.x, self.y)
+        if self.matrix.comm.size > 1:
+            self.scatter.scatter(x, self.ghosts)
+            add_product(self.others, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y)
+        y.array_w[:] = self.y.ravel()
+
+    def destroy(self, _: PETSc.Mat) -> None:
+        self.scatter.destroy()
+        self.ghosts.destroy()
+
+
+@numba.njit(cache=True)
+def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
+    """Take the values of blocks from the ``given`` numbers of an AIJ, whose rows have that length."""
+    for i in range(len(blocks.begin) - 1):
+        for k in range(blocks.begin[i], blocks.begin[i + 1]):
+            for r in range(3):
+                for c in range(3):
+                    blocks.values[k, 3 * r + c] = given[blocks.place[k] + r * length[i] + c]
+
+
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
+    """y = H x of blocks whose column is greater than their row, the others being their transposes.
+
+    sums : (n, 9) of all blocks of a row, by which a translation keeps its digits where H is stiff
+    """
+    begin, columns, _, h = blocks
+    y[:] = 0
+    for i in range(len(begin) - 1):
+        u, v, w = x[i, 0], x[i, 1], x[i, 2]
+        a = y[i, 0] + sums[i, 0] * u + sums[i, 1] * v + sums[i, 2] * w
+        b = y[i, 1] + sums[i, 3] * u + sums[i, 4] * v + sums[i, 5] * w
+        c = y[i, 2] + sums[i, 6] * u + sums[i, 7] * v + sums[i, 8] * w
+        for k in range(begin[i], begin[i + 1]):
+            j = columns[k]
+            d, e, f = x[j, 0] - u, x[j, 1] - v, x[j, 2] - w
+            a += h[k, 0] * d + h[k, 1] * e + h[k, 2] * f
+            b += h[k, 3] * d + h[k, 4] * e + h[k, 5] * f
+            c += h[k, 6] * d + h[k, 7] * e + h[k, 8] * f
+            y[j, 0] -= h[k, 0] * d + h[k, 3] * e + h[k, 6] * f
+            y[j, 1] -= h[k, 1] * d + h[k, 4] * e + h[k, 7] * f
+            y[j, 2] -= h[k, 2] * d + h[k, 5] * e + h[k, 8] * f
+        y[i, 0], y[i, 1], y[i, 2] = a, b, c
+
+
+@numba.njit(cache=True)
+def add_product(blocks: BlockRows, x: Array, ghosts: Array, y: Array) -> None:
+    """y += H (ghosts - x), x that of each block's row."""
+    begin, columns, _, h = blocks
+    for i in range(len(begin) - 1):
+        u, v, w = x[i, 0], x[i, 1], x[i, 2]
+        for k in range(begin[i], begin[i + 1]):
+            j = columns[k]
+            d, e, f = ghosts[j, 0] - u, ghosts[j, 1] - v, ghosts[j, 2] - w
+            for r in range(3):
+                y[i, r] += h[k, 3 * r] * d + h[k, 3 * r + 1] * e + h[k, 3 * r + 2] * f

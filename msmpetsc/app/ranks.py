@@ -62,6 +62,11 @@ def _variables(values: dict[str, str]) -> Iterator[None]:
             del os.environ[name]
 
 
+def lines_said(output: str) -> list[str]:
+    """Return the lines of what a child said, without the frame that mpiexec draws around its messages."""
+    return [line.strip() for line in output.splitlines() if line.strip(" -")]
+
+
 def environment(alone: bool = False) -> dict[str, str]:
     """Return the environment for a child, without the variables of the MPI of this process."""
     ours = {name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)}

@@ -250,9 +250,10 @@ def _of_solid(net: Topology, h: float, material: Material, of_cells: MaterialOfC
     """Return the constants of a solid: as with springs each corner's mass goes as the diagonal of L."""
     owned, count, made_of = len(net.octants), len(net.cells), _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    forms, volume = np.tile(WHOLE, (count, 1)), np.ones(count)
-    pairs = np.tile(laplacians(WHOLE[None], np.ones(1)), (count, 1, 1))
+    forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
+    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
     if net.share is not None and net.squares is not None:
+        forms, pairs = forms.copy(), pairs.copy()
         cut = np.flatnonzero(net.share.min(axis=1) < 1)
         volume[cut] = net.share[cut].mean(axis=1)
         forms[cut] = forms_of(net.share[cut], net.squares[cut])

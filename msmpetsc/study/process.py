@@ -11,7 +11,7 @@ from threading import Lock
 
 import psutil
 
-from msmpetsc.app.ranks import environment
+from msmpetsc.app.ranks import environment, lines_said
 from msmpetsc.study.forkserver import COLD, Forked
 
 GRACE = 3.0  # [s] between the request to end and the end
@@ -102,7 +102,7 @@ def too_long(timeout: float) -> str:
 
 def last_error(log: str) -> str:
     """Return the last line of a log that is an error, or else the last line."""
-    lines = [line.strip() for line in log.splitlines() if line.strip(" -")]  # no frame of mpiexec
+    lines = lines_said(log)
     errors = [line for line in lines if "msmpetsc: error:" in line]
     return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
 

@@ -27,8 +27,10 @@ def check_random_grids(shapes: list[tuple[int, int, int]], seeds: int) -> None:
         for seed in range(seeds):
             rng = np.random.default_rng(seed)
             boundary = rng.random(shape) < rng.uniform(0.3, 0.85)
-            slab = Slab(*slab_edges(comm.size, shape[0])[comm.rank : comm.rank + 2])
+            ends = slab_edges(comm.size, shape[0])
+            slab = Slab(*ends[comm.rank : comm.rank + 2])
             cells = np.argwhere(boundary)
+            assert (np.searchsorted(ends[1:], np.arange(slab.first, slab.last), side="right") == comm.rank).all()
             own = cells[(cells[:, 0] >= slab.first) & (cells[:, 0] < slab.last)]
             found = cells_of_gaps(enclosed_gaps(comm, own, slab))
             expected = np.argwhere(enclosed(boundary))

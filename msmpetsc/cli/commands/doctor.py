@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import msmpetsc
-from msmpetsc.app.ranks import environment
+from msmpetsc.app.ranks import environment, lines_said
 from msmpetsc.errors import EXTRAS
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
@@ -94,8 +94,7 @@ def probed(code: str, *launcher: str) -> tuple[str, str]:
         return BROKEN, f"does not answer within {PATIENCE} s: {' '.join(launcher)}"
     if done.returncode == 0:
         return OK, done.stdout.strip()
-    lines = [line for line in done.stderr.splitlines() if line.strip(" -")]  # no frame of mpiexec
-    last = [f"ends with status {done.returncode}", *lines][-1][:160]
+    last = [f"ends with status {done.returncode}", *lines_said(done.stderr)][-1][:160]
     if gone := re.search(r"^ModuleNotFoundError: No module named '(\w+)'$", done.stderr, re.M):
         return MISSING, f"{gone[1]}: {BRINGS.get(gone[1], f'pip install {gone[1]}')}"
     return BROKEN, last

@@ -117,14 +117,15 @@ def of_method(name: str, runs: Sequence[Sample]) -> dict[str, object]:
     cost, paper = runs[0].cost, PAPER.get(name.split("_")[0])
     seconds = median(means(runs, "wall_time"))
     memory = min(run.cost["memory"] for run in runs) / cost["nodes"] / 1e3
-    products, time = means(runs, "products")[0], cost["time"]
+    products, times = means(runs, "products")[0], [run.cost["time"] for run in runs]
+    finest = [time["fine"] / time["cycle"] for time in times if time.get("cycle")]
     return {
         "cells": cost["cells"],
         "frames": len(runs[0].frames["wall_time"]),
         "iterations": means(runs, "iterations")[0],
         "error": float(runs[0].frames["step_error"].max()),
         "proof": f"{means(runs, 'proof_products')[0] / products:.1%}" if products else None,
-        "coarse": f"{1 - time['fine'] / time['cycle']:.1%}" if time.get("cycle") else None,
+        "coarse": f"{1 - median(finest):.1%}" if finest else None,
         "us a cell": 1e6 * seconds / cost["cells"],
         "slowest tenth [ms]": 1e3 * median(slowest_tenth(run.frames["wall_time"][1:]) for run in runs),
         "frames/s (paper's CPU, GPU)": f"{1 / seconds:.3g} ({paper[4]}, {paper[5]})" if paper else 1 / seconds,

@@ -146,7 +146,6 @@ class Cost:
         device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
         time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm, before)
-        time["setup"] -= min(time["factor"], time["setup"])
         record = {
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
             **self.counts,

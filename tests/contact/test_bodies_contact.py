@@ -10,9 +10,12 @@ import trimesh
 from block_scene import play
 from conftest import result_on
 from crossings import count_crossings
+from mpi4py import MPI
 
-from msmpetsc.build import Model
+from msmpetsc.build import Model, build_model
+from msmpetsc.contact.surface.pairs import NearPairs
 from msmpetsc.fields import Frame
+from msmpetsc.scene.reading import load_scene
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
@@ -53,6 +56,20 @@ def crossings(model: Model, frames: list[Frame]) -> int:
     """Return how many edges cross triangles, over all frames."""
     assert model.surface is not None
     return sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames)
+
+
+def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
+    """A line search looked behind the block, and the way there is asked for again: once a corner passed through so."""
+    scene = fall(folder, "way", 0.02, time={"step": 0.01, "duration": 0.01})
+    model = build_model(MPI.COMM_SELF, load_scene(scene))
+    assert model.collision is not None
+    start = model.lattice.nodes.copy()
+    end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.02 + 2.5 * SIDE], 0.0)
+    contacts = NearPairs(MPI.COMM_SELF, model.collision).step(start, start, 0.0, 0.01)
+    contacts.find(start, with_points=True)
+    contacts.find(end, with_points=True)
+    free = 0.02 / (0.02 + 2.5 * SIDE)
+    assert 0.75 * free < contacts.free_share(start, end) < free  # a tenth of what collision detection finds is spared
 
 
 def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):

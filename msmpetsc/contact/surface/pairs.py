@@ -247,7 +247,8 @@ class Contacts:
         clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts else 0.0
         if 2 * way < self.comm.bcast(clearance):
             return 1.0
-        if bound >= pairs.apart and not self._serve(pairs, start + moved):
+        serves = self._serve(pairs, start) and self._serve(pairs, start + moved)  # else it passes pairs unknown there
+        if bound >= pairs.apart and not serves:
             if way > PIECE * self.near.edge:
                 return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
             pairs = self.near.look(q, begin, LEAST * self.near.edge, moved)

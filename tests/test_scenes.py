@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import run
+from crossings import count_crossings
 
 from msmpetsc.cli.main import main
 from msmpetsc.constraints.loads import Motion
@@ -122,6 +123,7 @@ def test_every_scene_has_the_papers_cells_or_its_own_and_four_moments():
     for name in ALL:
         scene = SceneFile.model_validate(tomllib.loads((SCENES / f"{name}.toml").read_text()))
         assert scene.cages.count == (own.get(name) or PAPER_CELLS[name.split("_")[0]])
+        assert scene.self_contact is None or scene.self_contact.surface is None  # what is drawn is what touches
         assert len(scene.picture.times) == 4 and scene.picture.times[-1] <= scene.time.duration
 
 
@@ -272,6 +274,7 @@ def test_a_bunny_that_falls_on_another_comes_to_rest_on_it(result):
     """So do the eight of the pile, which take three minutes."""
     run = result("two_bunnies")
     assert run.contacts[-1] > 0 and run.nearest[-1] > 0
+    assert not any(count_crossings(drawn, run.body[1]) for drawn in run.surface[10::20])  # what is drawn touches
     assert run.kinetic[-1] < 1e-2 * run.kinetic.max()
     assert run.surface[-1, :, 2].min() > -0.6 * run.h  # the nodes of an ear meet the ground, not its surface
     assert run.inverted(-1) == 0

@@ -316,7 +316,7 @@ SLIDES = {  # it falls on the ground, slides a little and is pressed
 
 
 def test_secants_of_friction_save_iterations(tmp_path: Path):
-    """Newton takes 88 in all; with true curvatures alone it is 108, with secants alone 175."""
+    """Newton takes 87 in all; with true curvatures alone it is 108, with secants alone 175."""
     assert sum(frame.iterations for frame in play(block_scene(tmp_path, **SLIDES))[1]) < 93
 
 

@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.contact.obstacles.solids import TINY
 
 STICK = 1e-2  # of the smallest body, longest sides a second: what friction holds gives way so far in a step
-PART = 0.3  # of the secant, of a slip that a full step took over a kink
 
 Pressed = tuple[Indices, Floats, Rows]
 
@@ -82,23 +81,21 @@ class Friction:
         u, length = self.slip(q)
         return (self.limit * self.slope(length))[:, None] * u
 
-    def all_secant(self) -> Floats:
-        """Return what ``blocks`` takes for all slips to have their secants, (a,)."""
-        return np.ones_like(self.limit)
+    def all_secant(self) -> Mask:
+        """Return what ``blocks`` takes for all slips to have their secants, (a,) bool."""
+        return self.limit >= 0
 
-    def passes_kink(self, q: Positions, base: Positions) -> Floats:
-        """Return how much of their secant slips have that turn round or come to stick from base to q, (a,); else 0.
-
-        A whole one comes in slowly: it is what leads back to no slip at all, where a part of e is mostly enough.
-        """
+    def passes_kink(self, q: Positions, base: Positions) -> Mask:
+        """Return which slips turn round or come to stick on their way from base to q, (a,) bool."""
         (u, length), (u_0, length_0) = self.slip(q), self.slip(base)
-        return np.where(((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick)), PART, 0.0)
+        passes: Mask = ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
+        return passes
 
-    def curvature(self, q: Positions, plane: Rows, secant: Floats | None) -> Rows:
+    def curvature(self, q: Positions, plane: Rows, secant: Mask | None) -> Rows:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
 
-        The second part is not positive; ``secant`` (a,) is how much of it is left out. Without it, what is left is no
-        less than the Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
+        The second part is not positive; where ``secant`` (a,) it is left out. What is then left is no less than the
+        Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
 
         plane : I - n n^T (a or 1, 3, 3)
         """
@@ -107,7 +104,7 @@ class Friction:
         direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
         less = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0) - slope
         if secant is not None:
-            less *= 1 - secant
+            less[secant] = 0.0
         blocks = slope[:, None, None] * plane + less[:, None, None] * squares(direction)
         return self.limit[:, None, None] * blocks
 
@@ -146,7 +143,7 @@ class NodeFriction(Friction):
         """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) it acts on."""
         gradient[self.nodes] += self.force(q)
 
-    def blocks(self, q: Positions, secant: Floats | None) -> Rows:
+    def blocks(self, q: Positions, secant: Mask | None) -> Rows:
         """Return the Hessian's blocks of the nodes (a, 3, 3) [N/m], as ``curvature`` has them."""
         return self.curvature(q, like(q, np.eye(3)) - squares(self.normal), secant)
 

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.contact.obstacles.friction import NodeFriction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
 SHALLOW = 1e-3  # of the depth that a node would come to, where it is stopped
-Secants = list[Floats | None]  # how much of their secant slips (a,) have, of each obstacle's friction and the surface's
+Secants = list[Mask | None]  # which slips (a,) have their secant, of each obstacle's friction and of the surface's
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
@@ -99,7 +99,7 @@ class SurfaceContact:
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
         self.friction: SurfaceFriction | None = None
-        self._hessians: dict[bool, tuple[ContactsAt, Floats | None, SurfaceHessian]] = {}  # with and without negatives
+        self._hessians: dict[bool, tuple[ContactsAt, Mask | None, SurfaceHessian]] = {}  # with and without negatives
         if contacts.law.friction > 0:
             moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
             self.rubs = moment.count > 0
@@ -215,18 +215,18 @@ class SurfaceContact:
             return 0.0
         return self.friction.released(moment.points)
 
-    def passes_kink(self, q: Positions, base: Positions) -> Floats | None:
+    def passes_kink(self, q: Positions, base: Positions) -> Mask | None:
         """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
         after, before, passes = self._acting(q), self._acting(base), None
         if self.friction and after and before:
             passes = self.friction.passes_kink(after.points, before.points)
-        of_root: Floats | None = self.comm.bcast(passes if passes is not None and passes.any() else None)
+        of_root: Mask | None = self.comm.bcast(passes if passes is not None and passes.any() else None)
         return of_root
 
-    def hessian(self, q: Positions, projected: bool, secant: Floats | None = None) -> SurfaceHessian | None:
+    def hessian(self, q: Positions, projected: bool, secant: Mask | None = None) -> SurfaceHessian | None:
         """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts.
 
-        secant : (a,) how much of its secant a slip's friction has
+        secant : (a,) which slips' friction has that of its secant
         """
         moment = self._acting(q)
         if moment is None:
@@ -251,9 +251,7 @@ class SurfaceContact:
         bound: Floats = self.contacts.points.spread * (np.abs(kept.weights.copy()).T @ sums)
         return bound
 
-    def _curvature(
-        self, moment: ContactsAt, projected: bool, secant: Floats | None
-    ) -> tuple[Indices, csr_array] | None:
+    def _curvature(self, moment: ContactsAt, projected: bool, secant: Mask | None) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
         barrier = self.contacts.barrier
         if barrier is None:

@@ -107,7 +107,7 @@ class FrictionKinks:
     """Which nodes' friction Newton's method takes by its secant, not by its true curvature, in the step in progress.
 
     A step begins with secants, whose parabola never goes too far (contact.obstacles.friction) but comes in slowly where
-    nodes slip on; then only those nodes have a part of them that the last full step took over a kink.
+    nodes slip on; then only those nodes have them that the last full step took over a kink.
 
     contact : of the step; None where there is none
     secants : of the next Hessian; None where there is no contact

@@ -217,9 +217,9 @@ class Contacts:
         """Return whether obstacles are at one time [s] where they are at another."""
         return not self.obstacles.moves(begin, end)
 
-    def _serve(self, pairs: Pairs, points: Positions) -> bool:
-        """Return whether points S (p, 3) are within the pairs' reach, by their own moves."""
-        return bool(self.comm.bcast(self.barrier is not None and pairs.serve(points)))
+    def _serve(self, pairs: Pairs, *places: Positions) -> bool:
+        """Return whether all of these places of points S (p, 3) are within the pairs' reach, by their own moves."""
+        return bool(self.comm.bcast(self.barrier is not None and all(map(pairs.serve, places))))
 
     def touch(self, q: Positions, time: float) -> Touch:
         """Return what there is of contacts at q and a time [s]."""
@@ -247,8 +247,8 @@ class Contacts:
         clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts else 0.0
         if 2 * way < self.comm.bcast(clearance):
             return 1.0
-        serves = self._serve(pairs, start) and self._serve(pairs, start + moved)  # else it passes pairs unknown there
-        if bound >= pairs.apart and not serves:
+        # pairs that serve at its end alone say nothing of what is passed on the way there
+        if bound >= pairs.apart and not self._serve(pairs, start, start + moved):
             if way > PIECE * self.near.edge:
                 return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
             pairs = self.near.look(q, begin, LEAST * self.near.edge, moved)

@@ -50,6 +50,7 @@ LATTICE_MULTIGRID = {  # the cycle of -pc_type mg
     "mg_coarse_ksp_type": "preonly",
     "mg_coarse_pc_type": "redundant",
     "mg_coarse_redundant_pc_type": "cholesky",
+    "mg_coarse_redundant_pc_factor_mat_solver_type": "petsc",  # on the CPU: cuSPARSE's took most of a cycle
     "mg_coarse_redundant_pc_factor_mat_ordering_type": "qmd",  # least fill of those that all PETSc have
     "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",  # PETSc's is absolute, and a light body's pivots are small
 }

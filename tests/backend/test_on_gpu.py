@@ -271,14 +271,20 @@ with pretended():
 
 
 @pytest.mark.slow
-def test_ranks_agree_on_gpus_too(tmp_path: Path):
-    """And a run of the command line: three ranks with ghosts, against one on the CPU."""
+@pytest.mark.parametrize("ranks", [3, pytest.param(2, marks=pytest.mark.cuda)])
+def test_ranks_agree_on_gpus_too(tmp_path: Path, ranks: int):
+    """And a run of the command line: ranks with ghosts, on pretended GPUs or a real one, against one on the CPU."""
     path = block_scene(tmp_path, **CASES["pressed, rubbed and stiffening"])
+    there = ["-c", ON_GPUS, "run"]
+    if ranks == 2:
+        if lacking := device.what_is_missing():
+            pytest.skip(lacking)
+        there = ["-m", "msmpetsc", "run", "--device", "cuda"]
     files, devices = [], []
-    for ranks, worker in ((1, ["-m", "msmpetsc"]), (3, ["-c", ON_GPUS])):
-        files.append(tmp_path / f"{ranks}.h5")
+    for count, worker in ((1, ["-m", "msmpetsc", "run"]), (ranks, there)):
+        files.append(tmp_path / f"{count}.h5")
         cost = files[-1].with_suffix(".json")
-        run(ranks, *worker, "run", path, "-o", files[-1], "--measure", cost, status=0)
+        run(count, *worker, path, "-o", files[-1], "--measure", cost, status=0)
         devices.append(json.loads(cost.read_text())["device"])
     assert devices == ["cpu", "cuda"]
     frames = [h5py.File(file)["frames/position"][:] for file in files]

@@ -4,6 +4,11 @@ It opposes the slip u with mu N once |u| passes a small e, and has a potential, 
 u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020, Incremental Potential Contact, Eq. 12 to 15), for N is
 known before the step is solved. It is convex.
 
+Newton's method has the force p of a slip, in mu N, as an unknown of its own, the dual: p = (f'/u) u, linearised in both
+(Chan, Golub and Mulet 1999, A nonlinear primal-dual method for total variation-based image restoration, SIAM J. Sci.
+Comput. 20). Beyond its stick a slip has no curvature along itself: a step by the true Hessian may turn it round, far
+too far. While p lies another way there is more, and where p is the slip's own force it is the true one.
+
 There the slip is that of one step, so that what holds creeps. Here it goes on from step to step, by e at most, as an
 elastic slip does (Simo and Laursen 1992, An augmented Lagrangian treatment of contact problems involving friction):
 what holds stays where it is.
@@ -16,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.obstacles.solids import TINY
 
 STICK = 1e-2  # of the smallest body, longest sides a second: what friction holds gives way so far in a step
@@ -81,32 +86,40 @@ class Friction:
         u, length = self.slip(q)
         return (self.limit * self.slope(length))[:, None] * u
 
-    def all_secant(self) -> Mask:
-        """Return what ``blocks`` takes for all slips to have their secants, (a,) bool."""
-        return self.limit >= 0
+    def no_duals(self) -> Rows:
+        """Return duals (a, 3) by which ``curvature`` is that of the secants: as f is concave in u^2, their parabolas
+        nowhere lie below the potential."""
+        return np.zeros((len(self.limit), 3), like=self.limit)
 
-    def passes_kink(self, q: Positions, base: Positions) -> Mask:
-        """Return which slips turn round or come to stick on their way from base to q, (a,) bool."""
-        (u, length), (u_0, length_0) = self.slip(q), self.slip(base)
-        passes: Mask = ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
-        return passes
+    def duals_after(self, q: Positions, base: Positions, duals: Rows | None) -> Rows:
+        """Return the duals (a, 3) that the full step from base to q leads to, no longer than 1; None: the forces."""
+        (u, _), (u_0, length_0) = self.slip(q), self.slip(base)
+        slope, tiny = self.slope(length_0), np.finfo(float).tiny
+        before = slope[:, None] * u_0 if duals is None else duals
+        along = (u_0 * (u - u_0)).sum(axis=1) / np.maximum(length_0, tiny)
+        turned = self._bend(length_0) / np.maximum(slope * length_0, tiny) * along
+        return shortened(slope[:, None] * u + turned[:, None] * before)
 
-    def curvature(self, q: Positions, plane: Rows, secant: Mask | None) -> Rows:
-        """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
+    def curvature(self, q: Positions, plane: Rows, duals: Rows | None) -> Rows:
+        """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) (w d^T + d w^T) / 2), (a, 3, 3) [N/m].
 
-        The second part is not positive; where ``secant`` (a,) it is left out. What is then left is no less than the
-        Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
+        d is the slip's direction and w = p / f' the dual's, no longer than 1, so that no block is negative.
 
         plane : I - n n^T (a or 1, 3, 3)
+        duals : p (a, 3); None: the forces, w = d, which is the Hessian
         """
         u, length = self.slip(q)
-        slope = self.slope(length)
-        direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
-        less = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0) - slope
-        if secant is not None:
-            less[secant] = 0.0
-        blocks = slope[:, None, None] * plane + less[:, None, None] * squares(direction)
-        return self.limit[:, None, None] * blocks
+        slope, tiny = self.slope(length), np.finfo(float).tiny
+        d = u / np.maximum(length, tiny)[:, None]
+        w = d if duals is None else shortened(duals / np.maximum(slope * length, tiny)[:, None])
+        mixed = 0.5 * (w[:, :, None] * d[:, None, :] + d[:, :, None] * w[:, None, :])
+        return self.limit[:, None, None] * (slope[:, None, None] * plane + self._bend(length)[:, None, None] * mixed)
+
+    def _bend(self, u: Floats) -> Floats:
+        """Return f'' - f' / u, (a,) [1/m], which is not positive."""
+        bend: Floats = np.where(u < self.stick, 2 * (1 - u / self.stick) / self.stick, 0.0)
+        bend -= self.slope(u)
+        return bend
 
 
 @dataclass(frozen=True)
@@ -143,14 +156,20 @@ class NodeFriction(Friction):
         """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) it acts on."""
         gradient[self.nodes] += self.force(q)
 
-    def blocks(self, q: Positions, secant: Mask | None) -> Rows:
+    def blocks(self, q: Positions, duals: Rows | None) -> Rows:
         """Return the Hessian's blocks of the nodes (a, 3, 3) [N/m], as ``curvature`` has them."""
-        return self.curvature(q, like(q, np.eye(3)) - squares(self.normal), secant)
+        return self.curvature(q, like(q, np.eye(3)) - squares(self.normal), duals)
 
 
 def squares(vectors: Rows) -> Rows:
     """Return v v^T of each of the vectors (a, 3), (a, 3, 3)."""
     return vectors[:, :, None] * vectors[:, None, :]
+
+
+def shortened(vectors: Rows) -> Rows:
+    """Return vectors (a, 3), those longer than 1 shortened to it."""
+    short: Rows = vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1.0)[:, None]
+    return short
 
 
 def smallest(bounds: Rows) -> float:

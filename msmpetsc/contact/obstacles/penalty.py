@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.obstacles.friction import NodeFriction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
 SHALLOW = 1e-3  # of the depth that a node would come to, where it is stopped
-Secants = list[Mask | None]  # which slips (a,) have their secant, of each obstacle's friction and of the surface's
+Duals = list[Rows | None]  # (a, 3) of each obstacle's friction and of the surface's; None: the slips' own forces
 
 
 @dataclass(frozen=True)
@@ -195,32 +195,35 @@ class Contact:
         of_nodes = sum(state.friction.released(q[: self.owned]) for state in self.states if state.friction)
         return of_nodes + (self.surface.released(q) if self.surface else 0.0)
 
-    def all_secant(self) -> Secants:
+    def no_duals(self) -> Duals:
         """Return what ``hessian`` takes for all friction of obstacles to have its secant.
 
         With A, friction's true Hessian, nothing along a slip, would let nodes run to and fro.
         """
-        return [*(state.friction.all_secant() if state.friction else None for state in self.states), None]
+        return [*(state.friction.no_duals() if state.friction else None for state in self.states), None]
 
-    def passes_kinks(self, q: Positions, base: Positions) -> Secants:
-        """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
-        of_nodes = [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
-        return [*of_nodes, self.surface.passes_kink(q, base) if self.surface else None]
+    def duals_after(self, q: Positions, base: Positions, duals: Duals) -> Duals:
+        """Return the duals of friction that the full step from base to q leads to."""
+        of_nodes = [
+            state.friction.duals_after(q, base, known) if state.friction else None
+            for state, known in zip(self.states, duals[:-1], strict=True)
+        ]
+        return [*of_nodes, self.surface.duals_after(q, base, duals[-1]) if self.surface else None]
 
-    def hessian(self, q: Positions, secants: Secants | None = None) -> Iterator[tuple[Indices, Rows]]:
+    def hessian(self, q: Positions, duals: Duals | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
         The Hessian is the sum of all; each block is positive semidefinite. Across the
         normal a solid that is round with radius r at a node has -k d / r, too, which is left out.
 
-        secants : where friction has that of its secant
+        duals : of friction; none: its true Hessian
         """
-        of_states = secants[:-1] if secants else [None] * len(self.states)
-        for state, secant in zip(self.states, of_states, strict=True):
+        of_states = duals[:-1] if duals else [None] * len(self.states)
+        for state, known in zip(self.states, of_states, strict=True):
             rows, _, normal = state.pressed(q[: self.owned])
             yield rows, state.penalty.stiffness * squares(normal)
             if state.friction:
-                yield state.friction.nodes, state.friction.blocks(q, secant)
+                yield state.friction.nodes, state.friction.blocks(q, known)
 
     def bound(self, q: Positions) -> Floats:
         """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes meet obstacles."""

@@ -55,9 +55,9 @@ class SurfaceFriction(Friction):
         gradient: Rows = (self.slips.T @ self.force(points).ravel()).reshape(-1, 3)
         return gradient
 
-    def hessian(self, points: Positions, secant: Mask | None = None) -> csr_array:
-        """Return the Hessian (3p, 3p) [N/m] at the points, of some slips by their ``secant`` (a,)."""
-        blocks = self.curvature(points, np.eye(3)[None], secant)
+    def hessian(self, points: Positions, duals: Rows | None = None) -> csr_array:
+        """Return the Hessian (3p, 3p) [N/m] at the points, as ``curvature`` has it of duals (a, 3)."""
+        blocks = self.curvature(points, np.eye(3)[None], duals)
         middle = bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
         return csr_array(self.slips.T @ (middle @ self.slips))
 

@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
@@ -99,7 +99,7 @@ class SurfaceContact:
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
         self.friction: SurfaceFriction | None = None
-        self._hessians: dict[bool, tuple[ContactsAt, Mask | None, SurfaceHessian]] = {}  # with and without negatives
+        self._hessians: dict[bool, tuple[ContactsAt, Rows | None, SurfaceHessian]] = {}  # with and without negatives
         if contacts.law.friction > 0:
             moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
             self.rubs = moment.count > 0
@@ -215,26 +215,26 @@ class SurfaceContact:
             return 0.0
         return self.friction.released(moment.points)
 
-    def passes_kink(self, q: Positions, base: Positions) -> Mask | None:
-        """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
-        after, before, passes = self._acting(q), self._acting(base), None
+    def duals_after(self, q: Positions, base: Positions, duals: Rows | None) -> Rows | None:
+        """Return friction's duals (a, 3) that the full step from base to q leads to; None: its own forces."""
+        after, before = self._acting(q), self._acting(base)
         if self.friction and after and before:
-            passes = self.friction.passes_kink(after.points, before.points)
-        of_root: Mask | None = self.comm.bcast(passes if passes is not None and passes.any() else None)
+            duals = self.friction.duals_after(after.points, before.points, duals)
+        of_root: Rows | None = self.comm.bcast(duals)
         return of_root
 
-    def hessian(self, q: Positions, projected: bool, secant: Mask | None = None) -> SurfaceHessian | None:
+    def hessian(self, q: Positions, projected: bool, duals: Rows | None = None) -> SurfaceHessian | None:
         """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts.
 
-        secant : (a,) which slips' friction has that of its secant
+        duals : (a, 3) of friction; None: its true Hessian
         """
         moment = self._acting(q)
         if moment is None:
             return None
         known = self._hessians.get(projected)
-        if known is None or known[0] is not moment or known[1] is not secant:
-            touched, points = self.comm.bcast(self._curvature(moment, projected, secant))
-            known = moment, secant, SurfaceHessian(self.comm, self.contacts.points.carried(touched), points)
+        if known is None or known[0] is not moment or known[1] is not duals:
+            touched, points = self.comm.bcast(self._curvature(moment, projected, duals))
+            known = moment, duals, SurfaceHessian(self.comm, self.contacts.points.carried(touched), points)
             self._hessians[projected] = known
         return known[2]
 
@@ -251,14 +251,14 @@ class SurfaceContact:
         bound: Floats = self.contacts.points.spread * (np.abs(kept.weights.copy()).T @ sums)
         return bound
 
-    def _curvature(self, moment: ContactsAt, projected: bool, secant: Mask | None) -> tuple[Indices, csr_array] | None:
+    def _curvature(self, moment: ContactsAt, projected: bool, duals: Rows | None) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
         barrier = self.contacts.barrier
         if barrier is None:
             return None
         parts = barrier.hessian(moment.contacts, moment.points, projected)
         if self.friction:
-            parts.append(self.friction.hessian(moment.points, secant))
+            parts.append(self.friction.hessian(moment.points, duals))
         whole = csr_array(sum(parts))
         rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
         touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))

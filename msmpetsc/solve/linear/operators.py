@@ -9,7 +9,7 @@ from petsc4py import PETSc
 from scipy.sparse import coo_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
-from msmpetsc.contact.obstacles.penalty import Contact, Secants
+from msmpetsc.contact.obstacles.penalty import Contact, Duals
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.elasticity.solid import CellHessians
@@ -43,11 +43,11 @@ class ContactBlocks:
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
-    def linearise(self, contact: Contact | None, q: Positions, secants: Secants | None) -> None:
-        """Take the blocks at q; where ``secants`` say so, those of friction's secant."""
+    def linearise(self, contact: Contact | None, q: Positions, duals: Duals | None) -> None:
+        """Take the blocks at q, by duals of friction if any."""
         self.parts = []
         with CONTACT:
-            for nodes, blocks in contact.hessian(q, secants) if contact else ():
+            for nodes, blocks in contact.hessian(q, duals) if contact else ():
                 free = np.flatnonzero(self.row[nodes] >= 0)
                 if len(free):
                     self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
@@ -100,16 +100,16 @@ class TrueHessian:
         self.products = 0
 
     def linearise(
-        self, q: Positions, contact: Contact | None, projected: bool = False, secants: Secants | None = None
+        self, q: Positions, contact: Contact | None, projected: bool = False, duals: Duals | None = None
     ) -> None:
         """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (elasticity.springs),
-        ``secants`` the true curvature of some friction (contact.obstacles.penalty)."""
+        ``duals`` the true curvature of friction (contact.obstacles.friction)."""
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             if self.contact:
-                self.contact.linearise(contact, q, secants)
-            secant = secants[-1] if secants else None  # of the surface
-            self.surface = contact.surface.hessian(q, projected, secant) if contact and contact.surface else None
+                self.contact.linearise(contact, q, duals)
+            of_surface = duals[-1] if duals else None
+            self.surface = contact.surface.hessian(q, projected, of_surface) if contact and contact.surface else None
 
     def take_slopes(self, slopes: Array) -> None:
         """Take other V U' of a solid's cells (elasticity.solid.CellHessians) than those at q."""

@@ -34,6 +34,7 @@ LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabo
 FINAL = 60.0  # times the error that would do: a linear solve from there on is to be the last
 PARABOLA = 0.2  # of F: what the linear solve has not left of it, where its bound is believed
 NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
+STALLED = 1e-6  # of |F|, below FULL_STEP_ERROR: an iteration that changes it by less moves within rounding
 STAYS = 0.5  # of the bound before: F no longer falls though each correction was known
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
 NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
@@ -100,7 +101,8 @@ class ErrorControl:
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """What is known at an iterate: its error, or a bound on it while that is far too large."""
         residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
-        at_rounding, alarm = self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
+        stalls = abs(residual - before.residual) < STALLED * residual < STALLED * FULL_STEP_ERROR * distance
+        at_rounding, alarm = stalls or self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm)
         now = replace(now, corrected=False, beside=np.inf)
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet

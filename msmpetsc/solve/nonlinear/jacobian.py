@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, greatest
-from msmpetsc.contact.obstacles.penalty import Contact, Secants
+from msmpetsc.contact.obstacles.penalty import Contact, Duals
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, assemble, python_matrix
 from msmpetsc.solve.nonlinear.functional import StepFunctional
@@ -86,46 +86,46 @@ class Jacobian:
         return diagonal
 
     def linearise(
-        self, q: Positions, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False
+        self, q: Positions, contact: Contact | None, projected: bool, duals: Duals | None, known: bool = False
     ) -> None:
         """Take the Jacobian at positions q (l, 3) [m] (collective): A is constant, only H and contact depend on q.
 
         projected : without the negative parts of H
-        secants   : of friction that H does not have the true curvature of
+        duals     : of friction; none: its true curvature
         known     : H was linearised at this very q already
         """
         if self.preset.true_hessian and not known:
-            self.hessian.linearise(q, contact, projected, secants)
+            self.hessian.linearise(q, contact, projected, duals)
         elif self.blocks:
-            self.blocks.linearise(contact, q, contact.all_secant() if contact else None)
+            self.blocks.linearise(contact, q, contact.no_duals() if contact else None)
         changed = self.preconditioner.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()
 
 
-class FrictionKinks:
-    """Which nodes' friction Newton's method takes by its secant, not by its true curvature, in the step in progress.
+class FrictionDuals:
+    """Forces of friction, which Newton's method has as unknowns beside positions (contact.obstacles.friction), in the
+    step in progress.
 
-    A step begins with secants, whose parabola never goes too far (contact.obstacles.friction) but comes in slowly where
-    nodes slip on; then only those nodes have them that the last full step took over a kink.
-
-    contact : of the step; None where there is none
-    secants : of the next Hessian; None where there is no contact
+    contact    : of the step; None where there is none
+    duals      : of the next Hessian; None where there is no contact. Nodes begin with their secants
     is_awaited : a full step comes next, from where the Hessian was taken
     """
 
     def __init__(self) -> None:
         self.contact: Contact | None = None
-        self.secants: Secants | None = None
+        self.duals: Duals | None = None
         self.is_awaited = False
 
     def begin(self, contact: Contact | None) -> None:
-        """Begin a step, with secants for all nodes in contact."""
+        """Begin a step."""
         self.contact, self.is_awaited = contact, False
-        self.secants = contact.all_secant() if contact else None
+        self.duals = contact.no_duals() if contact else None
 
     def see(self, q: Positions, base: Positions) -> None:
-        """Look at the full step from base to q (l, 3) [m], the first seen since it was awaited."""
-        if self.is_awaited and self.contact:
-            self.secants = self.contact.passes_kinks(q, base)
+        """Look at the full step from base to q (l, 3) [m], or at a part of it: then the full one went too far."""
+        if self.contact and self.duals and self.is_awaited:
+            self.duals = self.contact.duals_after(q, base, self.duals)
+        elif self.duals:
+            self.duals = [None if known is None else np.zeros_like(known) for known in self.duals]
         self.is_awaited = False

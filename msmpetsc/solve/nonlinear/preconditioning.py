@@ -170,7 +170,7 @@ class LatticePreconditioner:
         """Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) if there are none."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
-        for nodes, added in contact.hessian(q, contact.all_secant()) if contact else ():
+        for nodes, added in contact.hessian(q, contact.no_duals()) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
         return blocks
 

@@ -29,7 +29,7 @@ from msmpetsc.solve.nonlinear.error_control import (
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
-from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian
+from msmpetsc.solve.nonlinear.jacobian import FrictionDuals, Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.petsc.events import LOCAL
@@ -106,7 +106,7 @@ class Stepper:
         self.is_forced = False  # the last move was a full one, whatever g said of it
         self.is_bent = False  # such a move has raised |F|: g is to be asked all the same
         self.base = np.empty_like(self.lattice.nodes)  # positions that g is compared with
-        self.kinks, self.owned = FrictionKinks(), ExitStack()
+        self.friction, self.owned = FrictionDuals(), ExitStack()
         self.unknowns = Unknowns(self.comm, self.lattice, self.static)
         self.owned.callback(self.unknowns.destroy)
         elasticity = Elasticity(self.lattice)
@@ -206,7 +206,7 @@ class Stepper:
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:
         self.functional.begin(problem)
         self.base[:] = problem.fixed
-        self.kinks.begin(problem.contact)
+        self.friction.begin(problem.contact)
         self.control.estimate.convexity = 1.0
         self.is_forced = self.is_bent = False
         self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
@@ -345,7 +345,7 @@ class Stepper:
             return 0.0  # the start of a line search, which is where it was linearised
         with LOCAL:
             q = self.functional.positions(x)
-            self.kinks.see(q, self.base)
+            self.friction.see(q, self.base)
             change, distance = self.functional.change(q, self.base)
         outcome = self.outcome
         is_flat = outcome.bound < FULL_STEP_ERROR and (outcome.corrected or not outcome.doubts)
@@ -392,18 +392,18 @@ class Stepper:
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Take the Jacobian at x, and the start of the linear solve (SNES calls it before each)."""
         with LOCAL:
-            if snes.its > 0:
-                self.kinks.see(self.functional.positions(x), self.base)  # where no objective was asked for
+            if snes.its > 0 and self.friction.is_awaited:
+                self.friction.see(self.functional.positions(x), self.base)  # where no objective was asked for
             self.unknowns.to_nodes(x, self.base)
             self.projected = self.projected and snes.its < (self.preset.projected or PROJECTED)
             known = self.outcome.corrected and not self.projected  # the estimate has linearised at this very x
             self.jacobian.linearise(
-                self.base, self.functional.problem.contact, self.projected, self.kinks.secants, known
+                self.base, self.functional.problem.contact, self.projected, self.friction.duals, known
             )
             if self.slopes is not None and not (known or self.projected):
                 self.jacobian.hessian.take_slopes(self.slopes)
             self.slopes = None
-            self.kinks.is_awaited = True
+            self.friction.is_awaited = True
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
             if self.preset.inexact and not self.options.is_given("ksp_max_it"):
@@ -437,7 +437,8 @@ class Stepper:
                 self.outcome = self.control.led_by(self.ksp, self.outcome)
         before = self.outcome.residual
         if its > 0 or not self.has_npc:  # else known since _is_solved
-            self.outcome = self.control.judge(iterate, self.outcome)
+            known = self.outcome if its > 0 else replace(self.outcome, residual=np.inf)  # from where SNES begins again
+            self.outcome = self.control.judge(iterate, known)
         self.is_bent |= self.is_forced and self.outcome.residual > RAISED * before
         self.is_forced = False
         outcome = self.outcome

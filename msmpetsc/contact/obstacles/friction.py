@@ -4,14 +4,14 @@ It opposes the slip u with mu N once |u| passes a small e, and has a potential, 
 u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020, Incremental Potential Contact, Eq. 12 to 15), for N is
 known before the step is solved. It is convex.
 
+There the slip is that of one step, so that what holds creeps. Here it goes on from step to step, by e at most, as an
+elastic slip does (Simo and Laursen 1992, An augmented Lagrangian treatment of contact problems involving friction):
+what holds stays where it is.
+
 Newton's method has the force p of a slip, in mu N, as an unknown of its own, the dual: p = (f'/u) u, linearised in both
 (Chan, Golub and Mulet 1999, A nonlinear primal-dual method for total variation-based image restoration, SIAM J. Sci.
 Comput. 20). Beyond its stick a slip has no curvature along itself: a step by the true Hessian may turn it round, far
 too far. While p lies another way there is more, and where p is the slip's own force it is the true one.
-
-There the slip is that of one step, so that what holds creeps. Here it goes on from step to step, by e at most, as an
-elastic slip does (Simo and Laursen 1992, An augmented Lagrangian treatment of contact problems involving friction):
-what holds stays where it is.
 
 Explicit substeps take friction as a change of velocity.
 """
@@ -113,7 +113,8 @@ class Friction:
         d = u / np.maximum(length, tiny)[:, None]
         w = d if duals is None else shortened(duals / np.maximum(slope * length, tiny)[:, None])
         mixed = 0.5 * (w[:, :, None] * d[:, None, :] + d[:, :, None] * w[:, None, :])
-        return self.limit[:, None, None] * (slope[:, None, None] * plane + self._bend(length)[:, None, None] * mixed)
+        blocks: Rows = slope[:, None, None] * plane + self._bend(length)[:, None, None] * mixed
+        return self.limit[:, None, None] * blocks
 
     def _bend(self, u: Floats) -> Floats:
         """Return f'' - f' / u, (a,) [1/m], which is not positive."""

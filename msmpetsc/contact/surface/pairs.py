@@ -22,7 +22,7 @@ from msmpetsc.geometry.surface import Surface
 if TYPE_CHECKING:
     import ipctk
 
-REMEMBERED = 3  # positions whose contacts are kept: where a line search starts, and where it tries
+REMEMBERED = 3  # positions whose contacts are kept, and pairs: where a line search starts, and where it tries
 FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are 4 times the pairs
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 2.0  # times the move that is expected
@@ -111,7 +111,7 @@ class NearPairs:
         self.owned, surface = collision.points.weights.shape[1], collision.surface
         self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, collision) if surface else None)
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
-        self._newest: Pairs | None = None
+        self._known: list[Pairs] = []  # the newest first
         self.touching = False  # where contacts were asked for last
 
     def step(self, q: Positions, end: Positions, begin: float, time: float) -> "Contacts":
@@ -119,7 +119,7 @@ class NearPairs:
 
         Where nothing touches, pairs are looked for as far as the step leads, unless the known ones serve.
         """
-        pairs = self._newest
+        pairs = self._known[0] if self._known else None
         if not pairs or (
             not self.touching and max(self.moved(q, begin, pairs), self.moved(end, time, pairs)) > pairs.reach
         ):
@@ -128,7 +128,16 @@ class NearPairs:
 
     def around(self, q: Positions, time: float) -> Pairs:
         """Return the newest pairs; those at q if there are none yet."""
-        return self._newest or self.look(q, time, self.law.distance)
+        return self._known[0] if self._known else self.look(q, time, self.law.distance)
+
+    def serving(self, *places: Positions) -> Pairs | None:
+        """Return the newest pairs within whose reach all of these places of points S (p, 3) are, by their own moves."""
+        serve = [all(map(pairs.serve, places)) for pairs in self._known] if self.barrier else []
+        number: int = self.comm.bcast(serve.index(True) if any(serve) else -1)
+        if number < 0:
+            return None
+        self._known.insert(0, self._known.pop(number))
+        return self._known[0]
 
     def look(self, q: Positions, time: float, reach: float, moved: Rows | None = None) -> Pairs:
         """Look for pairs at q, or on the way of the points from there by ``moved`` (p, 3) [m]."""
@@ -139,8 +148,9 @@ class NearPairs:
             if moved is None:
                 ways = self.barrier.clear_reach(candidates, points, reach)
         apart, clear = self.comm.bcast(ways)
-        self._newest = Pairs(q[: self.owned].copy(), time, reach, apart, clear, points, candidates, moved)
-        return self._newest
+        newest = Pairs(q[: self.owned].copy(), time, reach, apart, clear, points, candidates, moved)
+        self._known = [newest, *self._known[: REMEMBERED - 1]]
+        return newest
 
     def moved(self, q: Positions, time: float, pairs: Pairs) -> float:
         """Return no less than how far points at q are from where the pairs were looked for [m]."""
@@ -159,7 +169,7 @@ class NearPairs:
 
     def forget(self) -> None:
         """Forget what earlier steps showed."""
-        self._newest, self.touching = None, False
+        self._known, self.touching = [], False
 
 
 class Contacts:
@@ -191,8 +201,8 @@ class Contacts:
             return ContactsAt(q, time, 0, np.empty((0, 3)), ())
         points, candidates = self.points_at(q, time), None
         if bound >= pairs.apart:
-            if bound > pairs.reach and not self._serve(pairs, points):
-                pairs = self.near.look(q, time, LEAST * self.near.edge)
+            if bound > pairs.reach:
+                pairs = self.near.serving(points) or self.near.look(q, time, LEAST * self.near.edge)
             candidates = pairs.candidates
         contacts = self.barrier.contacts(candidates, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
@@ -217,10 +227,6 @@ class Contacts:
         """Return whether obstacles are at one time [s] where they are at another."""
         return not self.obstacles.moves(begin, end)
 
-    def _serve(self, pairs: Pairs, *places: Positions) -> bool:
-        """Return whether all of these places of points S (p, 3) are within the pairs' reach, by their own moves."""
-        return bool(self.comm.bcast(self.barrier is not None and all(map(pairs.serve, places))))
-
     def touch(self, q: Positions, time: float) -> Touch:
         """Return what there is of contacts at q and a time [s]."""
         moment = self.find(q, time)
@@ -231,28 +237,33 @@ class Contacts:
         of_all: Touch = self.comm.bcast(touch)
         return of_all
 
+    def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[Pairs, float]:
+        """Return the newest pairs, and no less than how far points are from them on a way from q at ``begin`` [s]."""
+        pairs = self.near.around(q, begin)
+        return pairs, max(self.near.moved(q, begin, pairs), self.near.moved(end, self.time, pairs))
+
     def free_share(self, q: Positions, end: Positions, with_obstacles: bool = False) -> float:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on.
 
         with_obstacles : these go from where they are when the step begins
         """
         begin = self.begin if with_obstacles else self.time
-        pairs = self.near.around(q, begin)
-        bound = max(self.near.moved(q, begin, pairs), self.near.moved(end, self.time, pairs))
+        pairs, bound = self._bound(q, begin, end)
         if bound < pairs.clear:
             return 1.0
         contacts, start = self.find(q, begin).contacts, self.points_at(q, begin)
-        moved, pairs = self.points_at(end, self.time) - start, self.near.around(q, begin)
+        moved, (pairs, bound) = self.points_at(end, self.time) - start, self._bound(q, begin, end)
         way = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
         clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts else 0.0
         if 2 * way < self.comm.bcast(clearance):
             return 1.0
         # pairs that serve at its end alone say nothing of what is passed on the way there
-        if bound >= pairs.apart and not self._serve(pairs, start, start + moved):
+        serving = pairs if bound < pairs.apart else self.near.serving(start, start + moved)
+        if not serving:
             if way > PIECE * self.near.edge:
                 return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
-            pairs = self.near.look(q, begin, LEAST * self.near.edge, moved)
-        candidates = None if bound < pairs.apart else pairs.candidates
+            serving = self.near.look(q, begin, LEAST * self.near.edge, moved)
+        candidates = None if bound < pairs.apart else serving.candidates
         return float(self.comm.bcast(self.barrier.free_share(start, moved, candidates) if self.barrier else 1.0))
 
 

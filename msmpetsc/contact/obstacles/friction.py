@@ -25,6 +25,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.obstacles.solids import TINY
 
 STICK = 1e-2  # of the smallest body, longest sides a second: what friction holds gives way so far in a step
+WEAK = 1e-100  # f' below which it is as good as none; the square of what is divided by it has a number
 
 Pressed = tuple[Indices, Floats, Rows]
 
@@ -109,9 +110,9 @@ class Friction:
         duals : p (a, 3); None: the forces, w = d, which is the Hessian
         """
         u, length = self.slip(q)
-        slope, tiny = self.slope(length), np.finfo(float).tiny
-        d = u / np.maximum(length, tiny)[:, None]
-        w = d if duals is None else shortened(duals / np.maximum(slope * length, tiny)[:, None])
+        slope = self.slope(length)
+        d = u / np.maximum(length, np.finfo(float).tiny)[:, None]
+        w = d if duals is None else shortened(duals / np.maximum(slope * length, WEAK)[:, None])
         mixed = 0.5 * (w[:, :, None] * d[:, None, :] + d[:, :, None] * w[:, None, :])
         blocks: Rows = slope[:, None, None] * plane + self._bend(length)[:, None, None] * mixed
         return self.limit[:, None, None] * blocks

@@ -12,7 +12,9 @@ import pytest
 
 from msmpetsc.solve.petsc import device
 
-COST = {"cells": 1000, "nodes": 100_000, "memory": 2e8, "time": {"setup": 1.5, "cycle": 4.0, "fine": 3.0}}
+COST = {
+    "device": "cpu", "cells": 1000, "nodes": 100_000, "memory": 2e8, "time": {"setup": 1.5, "cycle": 4.0, "fine": 3.0}
+}  # fmt: skip
 
 
 def sample(seconds: list[float]) -> bench.Sample:

@@ -132,9 +132,9 @@ class NearPairs:
 
     def serving(self, *places: Positions) -> Pairs | None:
         """Return the newest pairs within whose reach all of these places of points S (p, 3) are, by their own moves."""
-        serve = [all(map(pairs.serve, places)) for pairs in self._known] if self.barrier else []
-        number: int = self.comm.bcast(serve.index(True) if any(serve) else -1)
-        if number < 0:
+        known = enumerate(self._known if self.barrier else ())
+        number: int | None = self.comm.bcast(next((i for i, pairs in known if all(map(pairs.serve, places))), None))
+        if number is None:
             return None
         self._known.insert(0, self._known.pop(number))
         return self._known[0]
@@ -257,13 +257,13 @@ class Contacts:
         clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts else 0.0
         if 2 * way < self.comm.bcast(clearance):
             return 1.0
-        # pairs that serve at its end alone say nothing of what is passed on the way there
-        serving = pairs if bound < pairs.apart else self.near.serving(start, start + moved)
-        if not serving:
-            if way > PIECE * self.near.edge:
+        candidates = None
+        if bound >= pairs.apart:
+            # pairs that serve at its end alone say nothing of what is passed on the way there
+            serving = self.near.serving(start, start + moved)
+            if not serving and way > PIECE * self.near.edge:
                 return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
-            serving = self.near.look(q, begin, LEAST * self.near.edge, moved)
-        candidates = None if bound < pairs.apart else serving.candidates
+            candidates = (serving or self.near.look(q, begin, LEAST * self.near.edge, moved)).candidates
         return float(self.comm.bcast(self.barrier.free_share(start, moved, candidates) if self.barrier else 1.0))
 
 

@@ -73,8 +73,7 @@ class EnergyBalance:
         self.comm = self.lattice.table.comm
         self.credit = CREDIT * self.swings
         self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
-        # positions that the last step ended at, their elastic energy [J]
-        self.known: tuple[Positions, float] | None = None
+        self.known: tuple[Positions, Energies] | None = None  # positions that the last step ended at, energies there
         self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
 
     def show(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> None:
@@ -132,7 +131,7 @@ class EnergyBalance:
                 + ("" if self.environment.exchanges else ', or safety.on_failure = "fallback"'),
                 "energy",
             )
-        self.known = after.q, ended.elastic
+        self.known = after.q, ended
         return budget
 
     def _entered(
@@ -170,7 +169,7 @@ class EnergyBalance:
         free = ~environment.fixed_at(time)[owned]
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
         contact = environment.push(when, sides)
-        known = self.known if self.known and q is self.known[0] else None  # whose elastic energy is known
+        known = self.known[1] if self.known and q is self.known[0] else None
         ended = result.position[owned], after.sides
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
@@ -186,8 +185,8 @@ class EnergyBalance:
             result.work,
             result.swing,
         )
-        sums[2] += environment.touch(q, time - time_step).energy
-        sums[0] += (known[1] if known else sums[1]) + sums[2]
+        sums[2] += (known.touch if known else environment.touch(q, time - time_step)).energy
+        sums[0] += (known.elastic if known else sums[1]) + sums[2]
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: SupportsFloat) -> Floats:

@@ -186,10 +186,13 @@ class Contacts:
         self._moments: list[ContactsAt] = []
         self._points: list[tuple[Positions, float, Positions]] = []  # q, time and points of some positions
 
-    def find(self, q: Positions, time: float | None = None, with_points: bool = False) -> ContactsAt:
+    def find(
+        self, q: Positions, time: float | None = None, with_points: bool = False, base: Positions | None = None
+    ) -> ContactsAt:
         """Return the contacts at positions q, and a time [s] if not that of the step's end.
 
         with_points : these are there, even if nothing is near
+        base        : where a way to q begins, of which it is then asked how much of it is free
         """
         q, time = q[: self.owned], self.time if time is None else time
         for moment in self._moments:
@@ -202,13 +205,22 @@ class Contacts:
         points, candidates = self.points_at(q, time), None
         if bound >= pairs.apart:
             if bound > pairs.reach:
-                pairs = self.near.serving(points) or self.near.look(q, time, LEAST * self.near.edge)
+                pairs = self.near.serving(points) or self._look(q, time, base)
             candidates = pairs.candidates
         contacts = self.barrier.contacts(candidates, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
         self.near.touching = count > 0
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
+
+    def _look(self, q: Positions, time: float, base: Positions | None) -> Pairs:
+        """Look for pairs at q, and on the way there from base, if that is not long."""
+        moved, reach = None, LEAST * self.near.edge
+        if base is not None:
+            moved = self.points_at(base, time) - self.points_at(q, time)
+            if self.comm.bcast(farthest(moved) > PIECE * self.near.edge if self.barrier else False):
+                moved = None
+        return self.near.look(q, time, reach, moved)
 
     def points_at(self, q: Positions, time: float) -> Positions:
         """Return the points (p, 3) [m] of positions q at a time [s] on rank 0; (0, 3) on the others."""

@@ -67,12 +67,10 @@ class SurfaceHessian:
     def blocks(self) -> Rows:
         """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
         nodes, weights, _ = self._carrying
-        blocks, joined = np.zeros((self.weights.shape[1], 9)), np.empty((len(nodes), 9))
-        for row in range(3):
-            for column in range(3):
-                acting = csr_array(self.points[row::3][:, column::3]) @ weights
-                joined[:, 3 * row + column] = weights.multiply(acting).sum(axis=0)
-        blocks[nodes] = joined
+        points, blocks = self.points.tobsr((3, 3)), np.zeros((self.weights.shape[1], 9))
+        first = np.repeat(np.arange(len(points.indptr) - 1), np.diff(points.indptr))  # point of each block, and
+        both = weights[first].multiply(weights[points.indices])  # second: w w' of all nodes that carry the two
+        blocks[nodes] = both.T @ points.data.reshape(-1, 9)
         return blocks
 
 
@@ -137,9 +135,9 @@ class SurfaceContact:
         by = self.friction.limit.sum() if self.friction else 0.0
         return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
 
-    def _acting(self, q: Positions) -> ContactsAt | None:
-        """Return the contacts at q, with the points for friction; None where nothing acts."""
-        moment = self.contacts.find(q, with_points=self.rubs)
+    def _acting(self, q: Positions, base: Positions | None = None) -> ContactsAt | None:
+        """Return the contacts at q, on a way from base, with the points for friction; None where nothing acts."""
+        moment = self.contacts.find(q, with_points=self.rubs, base=base)
         return moment if moment.count or self.rubs else None
 
     def presses(self, q: Positions) -> bool:
@@ -151,7 +149,7 @@ class SurfaceContact:
 
         Of a small move it is the mean of the forces at both times that: a difference of energies would lose its digits.
         """
-        after, before = self._acting(q), self._acting(base)
+        before, after = self._acting(base), self._acting(q, base)
         if after is None and before is None:
             return 0.0
         is_small, rubbed = self._is_small(q, base), 0.0

@@ -386,8 +386,9 @@ class Stepper:
             return None
         self.unknowns.from_nodes(after if stopped is None else stopped, end)
         free = functional.positions(end)  # nodes that are led stay where they are led to
-        (full, _), (change, _) = functional.change(after, before), functional.change(free, before)
-        return free if change < min(full, 0.0) else None
+        if functional.value(free) >= functional.value(after):  # without self-contact, which costs most
+            return None
+        return free if functional.change(free, before)[0] < 0 else None
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Take the Jacobian at x, and the start of the linear solve (SNES calls it before each)."""

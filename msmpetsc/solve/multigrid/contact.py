@@ -5,6 +5,7 @@ Diagonal blocks tell CG neither: they hold each node to the ground.
 """
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
@@ -13,6 +14,8 @@ from scipy.sparse import csr_array, eye_array, kron
 from msmpetsc.backend.arrays import Array, Rows
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
+
+SPARE = 2.0  # times the nonzeros of contact that are kept room for
 
 
 class ContactSmoother:
@@ -69,7 +72,9 @@ def root_of(matrix: Rows) -> Rows:
 class CoarseContact:
     """Contact C = t^2 (W P)^T H_c (W P) on coarse levels. All methods are collective.
 
-    The coarsest matrix has all of it, the levels between its diagonal blocks, so that they keep their nonzeros.
+    The coarsest matrix has all of it, the levels between its diagonal blocks, so that they keep their nonzeros. The
+    coarsest has nonzeros for the contact of before as well, as long as these are few: with the same ones PETSc
+    analyses it no more before it factors it, which takes longer than the factor.
 
     interpolations : P to each next finer level, of vectors
     """
@@ -78,10 +83,10 @@ class CoarseContact:
         self.unknowns, self.interpolations, self.t2 = unknowns, interpolations, t2
         self.scalar: list[csr_array] = []  # P of one coordinate, this rank's rows; until there is contact
         self.coarsest: PETSc.Mat | None = None  # with contact
+        self.nonzeros = csr_array((0, 0))  # ones where this rank's rows of it have room for contact
 
     def added(self, matrices: list[PETSc.Mat], surface: SurfaceHessian | None) -> PETSc.Mat:
         """Add contact to the matrices of all coarse levels but the last; the last one with contact."""
-        self.destroy()
         if surface is None:
             return matrices[-1]
         self.scalar = self.scalar or self._scalar()
@@ -94,11 +99,26 @@ class CoarseContact:
                 own = SurfaceHessian(surface.comm, weights, surface.points)
                 add_diagonal(matrix, self.t2 * own.blocks)
         joined = kron(weights, eye_array(3), "csr").T @ (surface.points @ kron(whole, eye_array(3), "csr"))
-        self.coarsest = matrices[-1].copy()
-        contact = aij(self.t2 * csr_array(joined), matrices[-1])
-        self.coarsest.axpy(1.0, contact, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        contact.destroy()
+        return self._coarsest(matrices[-1], csr_array(joined))
+
+    def _coarsest(self, without: PETSc.Mat, contact: csr_array) -> PETSc.Mat:
+        """Return the coarsest matrix with this rank's rows of contact [kg], itself as it is ``without``."""
+        here = csr_array((np.ones_like(contact.data), contact.indices, contact.indptr), contact.shape)
+        room = self.nonzeros + here if self.coarsest else here
+        if self.coarsest is None or without.comm.tompi4py().allreduce(room.nnz > self.nonzeros.nnz, MPI.LOR):
+            self.destroy()
+            self.nonzeros = room if room.nnz < SPARE * here.nnz else here
+            self.coarsest = without.copy()
+            self._add(aij(0.0 * self.nonzeros, without), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self.coarsest.zeroEntries()
+        self.coarsest.axpy(1.0, without, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        self._add(aij(self.t2 * contact, without), PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         return self.coarsest
+
+    def _add(self, contact: PETSc.Mat, nonzeros: PETSc.Mat.Structure) -> None:
+        assert self.coarsest is not None
+        self.coarsest.axpy(1.0, contact, nonzeros)
+        contact.destroy()
 
     def _scalar(self) -> list[csr_array]:
         """P of one coordinate of each level: of the finest rows of x come first, then of y and z."""

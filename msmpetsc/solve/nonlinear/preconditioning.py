@@ -184,6 +184,7 @@ class LatticePreconditioner:
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""
         self.is_stale = self.is_first = True
+        self.multigrid.contact.destroy()
 
     def destroy(self) -> None:
         self.multigrid.destroy()

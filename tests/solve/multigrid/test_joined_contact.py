@@ -8,11 +8,12 @@ import pytest
 import scipy.sparse as sparse
 from block_scene import play
 from mpi4py import MPI
+from petsc4py import PETSc
 from pinch import pinch_scene
 
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.solve.multigrid import cycle
-from msmpetsc.solve.multigrid.contact import ContactSmoother
+from msmpetsc.solve.multigrid.contact import CoarseContact, ContactSmoother
 
 POINTS, NODES, T2 = 7, 12, 1e-3
 
@@ -68,6 +69,27 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(surf
     one, rest = surface.split(compliance, 1)  # the stiffest alone
     assert one is not None and rest is not None and one.points.shape == (3, 3) and rest.points.shape == (18, 18)
     assert surface.split(1e-12 * compliance, POINTS)[0] is None
+
+
+def test_the_coarsest_matrix_has_the_contact_of_now_and_room_for_that_of_before():
+    """It is analysed anew where contact has come to where there was no room for it."""
+    size, rng = 12, np.random.default_rng(7)
+    without = PETSc.Mat().createAIJ((size, size), bsize=3, comm=MPI.COMM_SELF)
+    without.setUp()
+    without.setDiagonal(without.createVecRight() + 2.0)
+    coarse = CoarseContact(SimpleNamespace(comm=MPI.COMM_SELF), [], T2)
+    found = []
+    for joined_nodes in ((0, 1, 2), (0, 2), (1, 2), (3,)):
+        rows = (3 * np.array(joined_nodes)[:, None] + np.arange(3)).ravel()
+        contact = np.zeros((size, size))
+        contact[np.ix_(rows, rows)] = 1 + rng.random((len(rows), len(rows)))
+        matrix = coarse._coarsest(without, sparse.csr_array(contact))
+        np.testing.assert_allclose(matrix[:, :], 2 * np.eye(size) + T2 * contact)
+        found.append(matrix.handle)
+    assert found[0] == found[1] == found[2]
+    assert coarse.nonzeros.nnz == 9  # of the last contact alone: that of before would have taken ten times as many
+    coarse.destroy()
+    without.destroy()
 
 
 SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}

@@ -21,10 +21,10 @@ class FirstGuess:
     def best(self) -> Positions:
         """The start (l, 3) [m] of the step that the functional has begun (collective).
 
-        Besides y, as published: y and the elastic corrections of the last steps, kept and extrapolated; q_n, moved by
+        Besides y, as published: y and the elastic corrections of the last steps, extrapolated; q_n, moved by
         what the free flight moves on average where nothing is held, so that a step that stops early keeps the momentum;
         and the free flight y + t^2 M^(-1) f_ext itself. Of the best alone it is asked whether the surface crosses
-        something on the way there: to ask it of each, and to add the energy of contact, led to no fewer iterations.
+        something on the way there.
         """
         problem, lattice = self.functional.problem, self.functional.lattice
         q, y = problem.q, problem.y
@@ -34,11 +34,12 @@ class FirstGuess:
         flight[: lattice.owned] += self.functional.t2 * problem.load / lattice.mass[:, None]
         guesses = [y, q + self._drift(flight - q)]
         if self.corrections:
-            guesses += [y + self.corrections[0], y + 2 * self.corrections[0] - self.corrections[-1]]
+            guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
         surface = self.functional.surface
-        if surface is None or not surface.presses(q):  # else a free flight leads into what presses
+        met = surface is not None and surface.presses(q)  # parts of it push each other
+        if not met:  # else a free flight leads into what presses
             guesses.append(flight)
-        values = [self.functional.value(self._held(guess)) for guess in guesses]
+        values = [self.functional.value(self._held(guess), met) for guess in guesses]
         return self._without_crossing(guesses[int(np.argmin(values))])
 
     def _without_crossing(self, guess: Positions) -> Positions:

@@ -99,16 +99,18 @@ class StepFunctional:
             self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
         return Iterate(q, f)
 
-    def value(self, q: Positions) -> float:
+    def value(self, q: Positions, met: bool = False) -> float:
         """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart.
 
-        Without self-contact, which has a value only where no two triangles cross.
+        met : self-contact included, which costs most, and means little where triangles cross
         """
         problem, owned = self.problem, slice(self.lattice.owned)
         moved = q[owned] - problem.y[owned]
         acting = self.elasticity.energy(q) - float(np.vdot(moved, problem.load))
         if problem.contact:
             acting += problem.contact.change_at_nodes(q, problem.y)
+            if met and problem.contact.surface:
+                acting += problem.contact.surface.change(q, problem.q)
         inertia = 0.5 * self._inner(moved, moved)
         return float(self.comm.allreduce(inertia + self.t2 * acting))
 

@@ -205,7 +205,7 @@ class Contacts:
         points, candidates = self.points_at(q, time), None
         if bound >= pairs.apart:
             if bound > pairs.reach:
-                pairs = self.near.serving(points) or self._look(q, time, base)
+                pairs = self.near.serving(points) or self._look(q, time, points, base)
             candidates = pairs.candidates
         contacts = self.barrier.contacts(candidates, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
@@ -213,14 +213,12 @@ class Contacts:
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
-    def _look(self, q: Positions, time: float, base: Positions | None) -> Pairs:
-        """Look for pairs at q, and on the way there from base, if that is not long."""
-        moved, reach = None, LEAST * self.near.edge
-        if base is not None:
-            moved = self.points_at(base, time) - self.points_at(q, time)
-            if self.comm.bcast(farthest(moved) > PIECE * self.near.edge if self.barrier else False):
-                moved = None
-        return self.near.look(q, time, reach, moved)
+    def _look(self, q: Positions, time: float, points: Positions, base: Positions | None) -> Pairs:
+        """Look for pairs at q, whose points are S (p, 3) [m], and on the way there from base, if that is not long."""
+        moved = None if base is None else self.points_at(base, time) - points
+        if self.comm.bcast(moved is not None and len(moved) > 0 and farthest(moved) > PIECE * self.near.edge):
+            moved = None
+        return self.near.look(q, time, LEAST * self.near.edge, moved)
 
     def points_at(self, q: Positions, time: float) -> Positions:
         """Return the points (p, 3) [m] of positions q at a time [s] on rank 0; (0, 3) on the others."""

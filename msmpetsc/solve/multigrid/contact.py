@@ -15,7 +15,7 @@ from msmpetsc.backend.arrays import Array, Rows
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 
-SPARE = 2.0  # times the nonzeros of contact that are kept room for
+SPARE = 2.0  # times the nonzeros of the present contact: more room than that is not kept
 
 
 class ContactSmoother:

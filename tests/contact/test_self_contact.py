@@ -17,7 +17,7 @@ from stopped_runs import assert_goes_on_exactly
 
 from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.pairs import NearPairs
-from msmpetsc.contact.surface.surface_friction import limits_of, slips_of
+from msmpetsc.contact.surface.surface_friction import RubbingPairs, rubbing_pairs
 from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
@@ -287,20 +287,22 @@ def test_a_block_holds_on_a_tilted_one(tmp_path):
 def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
     """Or its slip, which goes on from step to step, would be lost, or be that of the other way."""
 
-    def pair(ids: list[int], weights: list[float]) -> SimpleNamespace:
-        jacobian = np.concatenate([weight * np.eye(3) for weight in weights], axis=1)
-        return SimpleNamespace(
-            vertex_ids=lambda edges, faces: ids, num_vertices=lambda: 4, edge0_id=0, mu_s=0.5, weight=1.0,
-            tangent_basis=np.eye(3)[:, :2], relative_velocity_jacobian=lambda: jacobian, normal_force_magnitude=2.0,
-        )  # fmt: skip
+    def found(first: int, second: int, at: tuple[float, float]) -> RubbingPairs:
+        pair = SimpleNamespace(
+            edge0_id=first, edge1_id=second, closest_point=np.array(at), weight=1.0, normal_force_magnitude=2.0
+        )
+        built = SimpleNamespace(vv_collisions=[], ev_collisions=[], ee_collisions=[pair], fv_collisions=[])
+        return rubbing_pairs([built], mesh)
 
-    mesh = SimpleNamespace(edges=None, faces=None, num_vertices=6)
-    found = [pair([1, 5, 2, 4], [0.3, 0.7, -0.4, -0.6])], [pair([2, 4, 1, 5], [0.4, 0.6, -0.3, -0.7])]
-    (pairs, limit), (other, _) = (limits_of(each, mesh) for each in found)
-    assert pairs.tolist() == other.tolist() == [[1, 5, 2, 4]] and limit == [1.0]
-    moved = np.random.default_rng(1).normal(size=18)
-    one, two = (slips_of(each, mesh) @ moved for each in found)
-    assert one.any() and np.array_equal(one, two)
+    edges, faces = np.array([[1, 5], [2, 4]]), np.empty((0, 3), int)
+    mesh = SimpleNamespace(edges=edges, faces=faces, num_vertices=6)
+    one, other = found(0, 1, (0.7, 0.6)), found(1, 0, (0.6, 0.7))
+    assert one.numbers.tolist() == other.numbers.tolist() == [[1, 5, 2, 4]] and one.push == [2.0]
+    np.testing.assert_allclose(one.shares, [[0.3, 0.7, -0.4, -0.6]])
+    points, moved = np.random.default_rng(1).normal(size=(2, 6, 3))
+    along, same = (pairs.slips(points) @ moved.ravel() for pairs in (one, other))
+    assert along.any() and np.array_equal(along, same)
+    assert along @ (one.shares @ points[one.numbers[0]])[0] == pytest.approx(0)  # in the plane of contact
 
 
 def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Path, caplog):

@@ -19,14 +19,12 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.contact.surface.creases import creases, neighbours
-from msmpetsc.contact.surface.surface_friction import SurfaceFriction, limits_of, slips_of
+from msmpetsc.contact.surface.surface_friction import RubbingPairs, SurfaceFriction, rubbing_pairs
 from msmpetsc.geometry.surface import Surface
 
 if TYPE_CHECKING:
     import ipctk
     from scipy.sparse import csc_matrix
-
-    from msmpetsc.contact.surface.surface_friction import Tangential
 
 ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # one for each distance that pairs push from
 
@@ -56,6 +54,7 @@ class Barrier:
 
     bodies : number of its first points, those of bodies; obstacles have the others, and do not meet each other
     edge   : mean length of the bodies' edges at rest [m]
+    rubbed : the points at which pairs that rub were asked for last, and these
     """
 
     def __init__(self, surface: Surface, law: BarrierLaw, bodies: int, meets_itself: bool = True):
@@ -77,6 +76,7 @@ class Barrier:
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
         self.creases: list[ipctk.Candidates] = []  # pairs of each distance after the first
+        self.rubbed: tuple[Positions, RubbingPairs] | None = None
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
         """Return a barrier from ``distance`` [m] on, as stiff over a depth as the law's own."""
@@ -171,24 +171,26 @@ class Barrier:
         start : (p, 3) where the points are if nothing slips [m]
         stick : slip below which it is not whole [m]
         """
-        tangential = self._tangential(contacts, points)
-        if not tangential:
+        pairs = self._rubbing(contacts, points)
+        if not len(pairs.push):
             return None
-        pairs, limit = limits_of(tangential, self.mesh)
-        return SurfaceFriction(limit, stick, np.zeros((1, 3)), start, pairs, slips_of(tangential, self.mesh))
+        limit, slips = self.law.friction * pairs.push, pairs.slips(points)
+        return SurfaceFriction(limit, stick, np.zeros((1, 3)), start, pairs.numbers, slips)
 
     def friction_limits(self, contacts: ContactSets, points: Positions) -> tuple[Indices, Floats]:
         """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N] at points (p, 3) [m]."""
-        return limits_of(self._tangential(contacts, points), self.mesh)
+        pairs = self._rubbing(contacts, points)
+        return pairs.numbers, self.law.friction * pairs.push
 
-    def _tangential(self, contacts: ContactSets, points: Positions) -> "Tangential":
-        of_all: Tangential = []
-        for potential, pairs in self._pushing(contacts):
-            built = self.ipctk.TangentialCollisions()
-            built.build(self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction)
-            # by kind, in copies: to go over ``built`` itself ends in a crash now and then (ipctk 1.6)
-            of_all += [*built.vv_collisions, *built.ev_collisions, *built.ee_collisions, *built.fv_collisions]
-        return of_all
+    def _rubbing(self, contacts: ContactSets, points: Positions) -> RubbingPairs:
+        """Return the pairs of contacts at points (p, 3) [m]; a step begins with those that the last one ended with."""
+        if self.rubbed is None or not np.array_equal(self.rubbed[0], points):
+            found = []
+            for potential, pairs in self._pushing(contacts):
+                found.append(self.ipctk.TangentialCollisions())
+                found[-1].build(self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction)
+            self.rubbed = points, rubbing_pairs(found, self.mesh)
+        return self.rubbed[1]
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite where there are no contacts."""

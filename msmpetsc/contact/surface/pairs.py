@@ -170,6 +170,8 @@ class NearPairs:
     def forget(self) -> None:
         """Forget what earlier steps showed."""
         self._known, self.touching = [], False
+        if self.barrier:
+            self.barrier.rubbed = None
 
 
 class Contacts:

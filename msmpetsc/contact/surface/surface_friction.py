@@ -8,15 +8,38 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import bsr_array, coo_array, csr_array
+from scipy.sparse import bsr_array, csr_array
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
-from msmpetsc.contact.obstacles.friction import Friction
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.contact.obstacles.friction import Friction, squares
 
 if TYPE_CHECKING:
     import ipctk
 
-    Tangential = list[ipctk.TangentialCollision]
+
+@dataclass(frozen=True)
+class RubbingPairs:
+    """Pairs of parts that press on each other.
+
+    numbers : (a, 4) of the points of each, -1 for none, those of its first part before those of its second
+    shares  : (a, 4) of these points in the way from the second part's nearest point to the first's
+    push    : (a,) N [N]
+    """
+
+    numbers: Indices
+    shares: Rows
+    push: Floats
+
+    def slips(self, points: Positions) -> bsr_array:
+        """Return the slips (3a, 3p) of pairs, each along the plane of its contact at points (p, 3)."""
+        apart = np.einsum("ai,aic->ac", self.shares, points[self.numbers])
+        normal = apart / np.linalg.norm(apart, axis=1)[:, None]
+        plane = np.eye(3) - squares(normal)
+        of_pair, corner = np.nonzero(self.numbers >= 0)
+        begin = np.append(0, np.cumsum((self.numbers >= 0).sum(axis=1)))
+        blocks = self.shares[of_pair, corner, None, None] * plane[of_pair]
+        shape = 3 * len(self.numbers), points.size
+        return bsr_array((blocks, self.numbers[of_pair, corner], begin), shape=shape)
 
 
 @dataclass(frozen=True)
@@ -24,13 +47,13 @@ class SurfaceFriction(Friction):
     """Friction of pairs of a surface's parts.
 
     start : (p, 3) where points are if nothing slips [m]
-    pairs : (a, 4) points of each, -1 for none (``ordered``)
+    pairs : (a, 4) points of each, -1 for none (``RubbingPairs``)
     slips : (3a, 3p) of moves of all points the slip of each pair
     """
 
     start: Positions
     pairs: Indices
-    slips: csr_array
+    slips: bsr_array
 
     def along(self, moved: Rows) -> Rows:
         slip: Rows = (self.slips @ moved.ravel()).reshape(-1, 3)
@@ -62,39 +85,34 @@ class SurfaceFriction(Friction):
         return csr_array(self.slips.T @ (middle @ self.slips))
 
 
-def slips_of(tangential: "Tangential", mesh: "ipctk.CollisionMesh") -> csr_array:
-    """Return the slips (3a, 3p) of pairs, each along the plane of its contact."""
-    rows, columns, values, named = [], [], [], _named(tangential, mesh)
-    for number, (pair, turned) in enumerate(zip(tangential, _turned(tangential, named), strict=True)):
-        along = pair.tangent_basis @ (pair.tangent_basis.T @ pair.relative_velocity_jacobian())
-        own = named[number, : pair.num_vertices()]
-        rows.append(np.repeat(3 * number + np.arange(3), along.shape[1]))
-        columns.append(np.tile((3 * own[:, None] + np.arange(3)).ravel(), 3))
-        values.append(-along.ravel() if turned else along.ravel())
-    at = np.concatenate(rows), np.concatenate(columns)
-    return csr_array(coo_array((np.concatenate(values), at), shape=(3 * len(named), 3 * mesh.num_vertices)))
-
-
-def limits_of(tangential: "Tangential", mesh: "ipctk.CollisionMesh") -> tuple[Indices, Floats]:
-    """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N].
+def rubbing_pairs(found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh") -> RubbingPairs:
+    """Return the pairs of some sets.
 
     Of two points or edges that one stands first whose first number is less, for ipctk has them as they were found.
     """
-    named = _named(tangential, mesh)
-    order = np.where((named[:, 3] < 0)[:, None], [1, 0, 2, 3], [2, 3, 0, 1])
-    turned = np.take_along_axis(named, order, 1)
-    pairs = np.where(_turned(tangential, named)[:, None], turned, named)
-    return pairs, np.array([pair.mu_s * pair.weight * pair.normal_force_magnitude for pair in tangential])
-
-
-def _named(tangential: "Tangential", mesh: "ipctk.CollisionMesh") -> Indices:
-    """Return the points (a, 4) of pairs, -1 for none, as ipctk has them."""
-    return np.array([pair.vertex_ids(mesh.edges, mesh.faces) for pair in tangential], int).reshape(-1, 4)
-
-
-def _turned(tangential: "Tangential", named: Indices) -> Mask:
-    """Return which pairs (a,) of two points or edges have the greater number first: what slips is then the other."""
-    of_edges = np.array([hasattr(pair, "edge0_id") for pair in tangential], bool)
-    second = np.where(of_edges, named[:, 2], named[:, 1])
-    turned: Mask = (of_edges | (named[:, 2] < 0)) & (named[:, 0] > second)
-    return turned
+    point, edge, face = np.arange(mesh.num_vertices)[:, None], mesh.edges, mesh.faces
+    numbers, shares, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]
+    for built in found:
+        # each kind in a copy: to go over ``built`` itself ends in a crash now and then (ipctk 1.6)
+        for pairs, *parts in (
+            (built.vv_collisions, ("vertex0_id", point), ("vertex1_id", point)),
+            (built.ev_collisions, ("vertex_id", point), ("edge_id", edge)),
+            (built.ee_collisions, ("edge0_id", edge), ("edge1_id", edge)),
+            (built.fv_collisions, ("vertex_id", point), ("face_id", face)),
+        ):
+            if not pairs:
+                continue
+            (first, of_first), (second, of_second) = (
+                (corners, corners[[getattr(pair, name) for pair in pairs]]) for name, corners in parts
+            )
+            sides = np.split(np.array([pair.closest_point for pair in pairs]), [of_first.shape[1] - 1], axis=1)
+            one, other = (np.column_stack([1 - side.sum(axis=1), side]) for side in sides)
+            if first is second:
+                turned = (of_first[:, 0] > of_second[:, 0])[:, None]
+                of_first, of_second = np.where(turned, of_second, of_first), np.where(turned, of_first, of_second)
+                one, other = np.where(turned, other, one), np.where(turned, one, other)
+            missing = (0, 0), (0, 4 - of_first.shape[1] - of_second.shape[1])
+            numbers.append(np.pad(np.hstack([of_first, of_second]), missing, constant_values=-1))
+            shares.append(np.pad(np.hstack([one, -other]), missing))
+            push.append(np.array([pair.weight * pair.normal_force_magnitude for pair in pairs]))
+    return RubbingPairs(np.concatenate(numbers), np.concatenate(shares), np.concatenate(push))

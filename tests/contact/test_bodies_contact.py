@@ -13,8 +13,10 @@ from crossings import count_crossings
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.pairs import NearPairs
 from msmpetsc.fields import Frame
+from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
@@ -56,6 +58,26 @@ def crossings(model: Model, frames: list[Frame]) -> int:
     """Return how many edges cross triangles, over all frames."""
     assert model.surface is not None
     return sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames)
+
+
+@pytest.mark.parametrize("turned", [np.eye(3), np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]])
+@pytest.mark.parametrize("bent", [0.0, 0.01])
+def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(turned: np.ndarray, bent: float):
+    """Boxes around ways are those without what is linear in them, and yet hold what comes near by that alone."""
+    rng = np.random.default_rng(0)
+    plates = [trimesh.creation.box([SIDE, SIDE, 0.01]).subdivide().subdivide() for _ in range(2)]
+    plates[1].apply_translation([0.003, 0.005, 0.01 + 1.15 * 0.02])
+    points, triangles = np.concatenate([p.vertices for p in plates]), plates[0].faces
+    triangles = np.concatenate([triangles, len(plates[0].vertices) + triangles])
+    moved = points @ np.diag([0.05, 0.02, -0.18]) + bent * rng.uniform(-1, 1, points.shape) + [0.3, 0.1, -0.2]
+    points, moved = points @ turned.T, moved @ turned.T
+    barrier = Barrier(Surface(points, triangles), BarrierLaw(0.02, 1.0, 0.0, 0.0), len(points))
+    on_way, reach = barrier.candidates(points, 1e-3, moved), 1e-3
+    for share in np.linspace(0, 1, 6):
+        at = points + share * moved + reach / 2 * rng.uniform(-1, 1, points.shape)
+        pushes = [barrier.gradient(barrier.contacts(pairs, at), at) for pairs in (on_way, barrier.candidates(at, 0.0))]
+        np.testing.assert_allclose(*pushes, atol=1e-12 * np.abs(pushes[1]).max())
+    assert np.abs(pushes[1]).max() > 0
 
 
 def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):

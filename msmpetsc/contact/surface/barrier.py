@@ -31,6 +31,7 @@ ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # one for each di
 KEPT = 0.9  # of the way to where surfaces meet
 PIECE = 2.0  # edges that points move in one piece of a way
 PIECES = 200  # of a way; what is longer is shortened
+STRETCHED = 0.2  # what is linear in a way: with more, boxes were larger for what they must allow for it
 
 
 @dataclass(frozen=True)
@@ -112,11 +113,18 @@ class Barrier:
 
     def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than
-        ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; but for those in creases."""
-        candidates, ends = self.ipctk.Candidates(), [np.asfortranarray(points)]
+        ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; but for those in creases.
+
+        Boxes around ways hold fewer pairs without what is linear in the points x of these, m = c + G x + r. Where a
+        pair is nearer than d on its way, |x - x' + t (r - r')| is less than d + |G| |x - x'|, and
+        |x - x'| less than (d + 2 max |r|) / (1 - |G|).
+        """
+        candidates, ends, near = self.ipctk.Candidates(), [np.asfortranarray(points)], self.law.distance + 2 * reach
         if moved is not None:
-            ends += [np.asfortranarray(points + moved - moved.mean(axis=0))]
-        candidates.build(self.mesh, *ends, 0.5 * self.law.distance + reach, self.ipctk.LBVH())
+            rest, linear = _without_linear_part(points, moved)
+            ends += [np.asfortranarray(points + rest)]
+            near += linear / (1 - linear) * (near + 2 * float(np.sqrt((rest**2).sum(axis=1).max())))
+        candidates.build(self.mesh, *ends, 0.5 * near, self.ipctk.LBVH())
         return candidates
 
     def clear_reach(self, candidates: "ipctk.Candidates", points: Positions, reach: float) -> tuple[float, float]:
@@ -234,3 +242,11 @@ class Barrier:
     def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
         return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
+
+
+def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
+    """Return what moves (p, 3) [m] of points (p, 3) [m] are beside what is linear in these, and the size of that."""
+    x, rest = points - points.mean(axis=0), moved - moved.mean(axis=0)
+    linear = np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ rest)
+    size = float(np.linalg.norm(linear, 2))
+    return (rest - x @ linear, size) if size < STRETCHED else (rest, 0.0)

@@ -18,6 +18,7 @@ from msmpetsc.contact.surface.pairs import NearPairs
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
@@ -105,6 +106,21 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
     ball, mass = model.lattice.body == 1, model.lattice.mass
     height = np.array([mass[ball] @ frame.position[ball, 2] for frame in frames]) / mass[ball].sum()
     assert height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2  # it stays above, and is hardly dented
+
+
+def test_the_best_guess_is_taken_though_not_all_are_weighed(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    chosen, least = [], FirstGuess._least
+
+    def checked(self: FirstGuess, guesses: list[np.ndarray], without: list[float]) -> int:
+        number = least(self, guesses, without)
+        values = [self.functional.value(self._held(guess), True) for guess in guesses]
+        chosen.append((number, int(np.argmin(values)), int(np.argmin(without))))
+        return number
+
+    monkeypatch.setattr(FirstGuess, "_least", checked)
+    play(fall(folder, "guesses", 1e-3, time={"step": 0.01, "duration": 0.2}))
+    taken, best, without = np.array(chosen).T
+    assert len(taken) > 10 and np.array_equal(taken, best) and (best != without).any()
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

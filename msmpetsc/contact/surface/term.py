@@ -153,10 +153,10 @@ class SurfaceContact:
         if after is None and before is None:
             return 0.0
         is_small, rubbed = self._is_small(q, base), 0.0
-        moved = self.contacts.points.moved(q - base) if is_small or self.rubs else np.zeros((0, 3))
+        moved = self.contacts.points.moved(q - base) if is_small else None
         if self.friction and after and before:
             rubbed = self.friction.change(after.points, before.points, moved)
-        if is_small:
+        if moved is not None:
             return rubbed + sum(0.5 * float(np.vdot(self._pushes(m), moved)) for m in (before, after) if m)
         return rubbed + self._energy(after) - self._energy(before)
 

@@ -39,8 +39,27 @@ class FirstGuess:
         met = surface is not None and surface.presses(q)  # parts of it push each other
         if not met:  # else a free flight leads into what presses
             guesses.append(flight)
-        values = [self.functional.value(self._held(guess), met) for guess in guesses]
-        return self._without_crossing(guesses[int(np.argmin(values))])
+        values = [self.functional.value(self._held(guess)) for guess in guesses]
+        best = self._least(guesses, values) if surface and met else int(np.argmin(values))
+        return self._without_crossing(guesses[best])
+
+    def _least(self, guesses: list[Positions], without: list[float]) -> int:
+        """The guess (a number) of least g, of which ``without`` is that without self-contact.
+
+        Self-contact costs most to ask for, and takes no more away than it stores where the step begins.
+        """
+        functional = self.functional
+        problem, best, least = functional.problem, 0, np.inf
+        assert functional.surface is not None
+        contacts = functional.surface.contacts
+        stored = functional.t2 * contacts.touch(problem.q, contacts.begin).energy
+        for number in np.argsort(without):
+            if without[number] - stored >= least:
+                break
+            value = functional.value(self._held(guesses[number]), True)
+            if value < least:
+                best, least = int(number), value
+        return best
 
     def _without_crossing(self, guess: Positions) -> Positions:
         """The guess, or as much of the way there, beside the body's own as a whole, as leads to no crossing.

@@ -157,25 +157,38 @@ class Environment:
     def contact(
         self,
         q: Positions,
-        way: tuple[Positions, Positions | None],
+        last: Positions | None,
         time: float,
         time_step: float,
         sides: Indices | None,
         end: Positions | None = None,
+        apart: bool = False,
     ) -> Contact | None:
         """Return what presses in the step from q, with friction; None if nothing does (collective).
 
-        way : about where it ends, and (l, 3) [m] positions one step before q, of a step that looks back to them
-        end : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
+        last  : (l, 3) [m] positions one step before q, of a step that looks back to them
+        end   : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
+        apart : the surface that meets itself or obstacles is left out
         """
-        owned, surface, before, (about, last) = self.lattice.owned, None, self._before(q), way
+        owned, surface, before = self.lattice.owned, None, self._before(q)
         states, held, ended = [], before.states if before else [], None if end is None else end[:owned]
         for p, side in self._pressing(time, sides):
             states.append(p.during(q[:owned], time, time_step, side[:owned], last, ended).after(held, q[:owned]))
-        if self.self_contact:
-            self._contacts = self.self_contact.step(q, about, max(time - time_step, 0.0), time)
+        if self._contacts and not apart:
             surface = SurfaceContact(self._contacts, q, time_step, last, end, before.surface if before else None)
         return Contact(states, owned, surface) if states or surface else None
+
+    def begin_contacts(self, q: Positions, time: float, time_step: float) -> bool:
+        """Begin a step at q: whether the surface touches nothing there (collective); False without one."""
+        if not self.self_contact:
+            return False
+        begin = max(time - time_step, 0.0)
+        self._contacts = Contacts(self.self_contact, begin, time, self._contacts)
+        return self._contacts.find(q, begin).count == 0
+
+    def stays_apart(self, q: Positions, x: Positions) -> bool:
+        """Return whether the surface touches nothing on the way of the step begun from q to x (collective)."""
+        return self._contacts is not None and self._contacts.stay_apart(q, x)
 
     def _before(self, q: Positions) -> Contact | None:
         """Return the contact of the step that ended at q; None if the last one known did not."""

@@ -1,5 +1,6 @@
 """Bodies that touch: they do not cross, keep their momentum, come to rest on each other; on three ranks, too."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,14 @@ from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
-from msmpetsc.contact.surface.pairs import NearPairs
+from msmpetsc.contact.surface.pairs import Contacts, NearPairs
+from msmpetsc.environment import Environment
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.integrators.implicit import ContactFaces
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
+from msmpetsc.solve.nonlinear.functional import StepProblem
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
@@ -88,7 +92,7 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     assert model.collision is not None
     start = model.lattice.nodes.copy()
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.02 + 2.5 * SIDE], 0.0)
-    contacts = NearPairs(MPI.COMM_SELF, model.collision).step(start, start, 0.0, 0.01)
+    contacts = Contacts(NearPairs(MPI.COMM_SELF, model.collision), 0.0, 0.01)
     contacts.find(start, with_points=True)
     contacts.find(end, with_points=True)
     free = 0.02 / (0.02 + 2.5 * SIDE)
@@ -121,6 +125,46 @@ def test_the_best_guess_is_taken_though_not_all_are_weighed(folder: Path, monkey
     play(fall(folder, "guesses", 1e-3, time={"step": 0.01, "duration": 0.2}))
     taken, best, without = np.array(chosen).T
     assert len(taken) > 10 and np.array_equal(taken, best) and (best != without).any()
+
+
+@pytest.fixture
+def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[bool]]:
+    """Of each solve of each step of 10 ms, whether the surface was taken to touch nothing."""
+    found: dict[int, list[bool]] = {}
+    problem = ContactFaces.problem
+
+    def seen(self: ContactFaces) -> StepProblem:
+        found.setdefault(round(self.time / 0.01), []).append(self.apart)
+        return problem(self)
+
+    monkeypatch.setattr(ContactFaces, "problem", seen)
+    return found
+
+
+def test_a_step_in_which_nothing_touches_is_solved_without_the_surface(folder: Path, solves, monkeypatch):
+    """And one that leads into it once more, as when each iterate is looked at."""
+    scene = fall(folder, "apart", 0.02, time={"step": 0.01, "duration": 0.15})
+    _, frames = play(scene, "solver.error=1e-8")
+    touching = [frame.self_contacts > 0 for frame in frames]
+    assert [solves[i][0] for i in range(1, 16)] == [not touched for touched in touching[:-1]]
+    assert [solves[i][-1] for i in range(1, 16)] == [not any(both) for both in pairwise(touching)]
+    with monkeypatch.context() as patch:
+        patch.setattr(Environment, "begin_contacts", begun_touching)
+        for one, other in zip(frames, play(scene, "solver.error=1e-8")[1], strict=True):
+            np.testing.assert_allclose(one.position, other.position, atol=1e-7 * SIDE)
+            assert one.self_contacts == other.self_contacts
+
+
+def begun_touching(self: Environment, q: np.ndarray, time: float, time_step: float) -> bool:
+    self._contacts = Contacts(self.self_contact, max(time - time_step, 0.0), time)
+    return False
+
+
+def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(folder: Path, solves: dict[int, list[bool]]):
+    """Where it ends nothing touches: the way there tells."""
+    bodies = [body("block", [0, 0, 0]), body("ball", [0.02, 0.01, SIDE + 0.02], start={"velocity": [0, 0, -50.0]})]
+    play(write(folder, "past", body=bodies, time={"step": 0.01, "duration": 0.01}))
+    assert solves[1] == [True, False]
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

@@ -16,7 +16,7 @@ from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 from stopped_runs import assert_goes_on_exactly
 
 from msmpetsc.build import Model, build_model
-from msmpetsc.contact.surface.pairs import NearPairs
+from msmpetsc.contact.surface.pairs import Contacts, NearPairs
 from msmpetsc.contact.surface.surface_friction import RubbingPairs, rubbing_pairs
 from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
@@ -49,7 +49,7 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     assert model.collision is not None
     end = q.copy()
     end[q[:, 0] < 0, 1] += slid
-    return SurfaceContact(NearPairs(COMM, model.collision).step(q, q, 0.0, T), q, T), end
+    return SurfaceContact(Contacts(NearPairs(COMM, model.collision), 0.0, T), q, T), end
 
 
 @pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])  # without friction, below the kink of friction, beyond it
@@ -103,7 +103,7 @@ def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: flo
 def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_ends_with(model):
     q = closed(model)
     came = np.where(q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0)  # the left arm, nearer to the right one and along it
-    contacts = NearPairs(COMM, model.collision).step(q - came, q, 0.0, T)
+    contacts = Contacts(NearPairs(COMM, model.collision), 0.0, T)
     now, before = (SurfaceContact(contacts, at, T).friction for at in (q, q - came))
     friction = SurfaceContact(contacts, q, T, q - came).friction
     expected = np.clip(2 * now.limit - now.values_of(before.pairs, before.limit), 0, 2 * now.limit)
@@ -116,7 +116,7 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
 
 def test_friction_goes_on_from_the_slip_that_pairs_held(model):
     q = closed(model)
-    contacts = NearPairs(COMM, model.collision).step(q, q, 0.0, T)
+    contacts = Contacts(NearPairs(COMM, model.collision), 0.0, T)
     first = SurfaceContact(contacts, q, T)
     stick, end = first.friction.stick, q.copy()
     end[q[:, 0] < 0, 1] += 0.4 * stick

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 REMEMBERED = 3  # positions whose contacts are kept, and pairs: where a line search starts, and where it tries
 FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are 4 times the pairs
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
-AHEAD = 2.0  # times the move that is expected
+AHEAD = 2.0  # times the move of a step in which nothing touched
 TINY = np.finfo(float).tiny
 
 
@@ -112,19 +112,6 @@ class NearPairs:
         self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, collision) if surface else None)
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self._known: list[Pairs] = []  # the newest first
-        self.touching = False  # where contacts were asked for last
-
-    def step(self, q: Positions, end: Positions, begin: float, time: float) -> "Contacts":
-        """Return the contacts of a step from q at ``begin`` [s] to about ``end`` at ``time`` [s].
-
-        Where nothing touches, pairs are looked for as far as the step leads, unless the known ones serve.
-        """
-        pairs = self._known[0] if self._known else None
-        if not pairs or (
-            not self.touching and max(self.moved(q, begin, pairs), self.moved(end, time, pairs)) > pairs.reach
-        ):
-            self.look(q, begin, AHEAD * self._farthest(end, q, time, begin))
-        return Contacts(self, begin, time)
 
     def around(self, q: Positions, time: float) -> Pairs:
         """Return the newest pairs; those at q if there are none yet."""
@@ -154,9 +141,9 @@ class NearPairs:
 
     def moved(self, q: Positions, time: float, pairs: Pairs) -> float:
         """Return no less than how far points at q are from where the pairs were looked for [m]."""
-        return self._farthest(q, pairs.q, time, pairs.time)
+        return self.farthest(q, pairs.q, time, pairs.time)
 
-    def _farthest(self, end: Positions, start: Positions, time: float, begin: float) -> float:
+    def farthest(self, end: Positions, start: Positions, time: float, begin: float) -> float:
         """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
         moved = end[: self.owned] - start[: self.owned]
         if self.points.obstacles.total:
@@ -169,7 +156,7 @@ class NearPairs:
 
     def forget(self) -> None:
         """Forget what earlier steps showed."""
-        self._known, self.touching = [], False
+        self._known = []
         if self.barrier:
             self.barrier.rubbed = None
 
@@ -178,15 +165,18 @@ class Contacts:
     """Contacts in a step from ``begin`` to ``time`` [s]. All methods are collective.
 
     Positions are (owned or more, 3) [m]. Obstacles are where they are at the step's end if nothing else is said: they
-    get there first. What is known of positions and ways ends with the step: a resumed run does not have it.
+    get there first.
+
+    before : contacts of the step before, whose end is known
     """
 
-    def __init__(self, near: NearPairs, begin: float, time: float):
+    def __init__(self, near: NearPairs, begin: float, time: float, before: "Contacts | None" = None):
         self.begin, self.time = begin, time
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
-        self._moments: list[ContactsAt] = []
-        self._points: list[tuple[Positions, float, Positions]] = []  # q, time and points of some positions
+        self._moments: list[ContactsAt] = before._moments if before else []
+        # q, time and points of some positions
+        self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
 
     def find(
         self, q: Positions, time: float | None = None, with_points: bool = False, base: Positions | None = None
@@ -211,9 +201,16 @@ class Contacts:
             candidates = pairs.candidates
         contacts = self.barrier.contacts(candidates, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
-        self.near.touching = count > 0
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
+
+    def stay_apart(self, q: Positions, x: Positions) -> bool:
+        """Return whether the surface touches nothing where a step ends that goes from q to x, nor on the way there."""
+        pairs, bound = self._bound(q, self.begin, x)
+        ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
+        if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:  # so that the next steps need no look
+            self.near.look(x, self.time, ahead)
+        return self.find(x, base=q).count == 0 and self.free_share(q, x, True) == 1.0
 
     def _look(self, q: Positions, time: float, points: Positions, base: Positions | None) -> Pairs:
         """Look for pairs at q, whose points are S (p, 3) [m], and on the way there from base, if that is not long."""

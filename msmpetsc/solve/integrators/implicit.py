@@ -15,6 +15,8 @@ A viscous solid has its dissipation over the step beside E (elasticity.viscosity
 Euler's difference of two positions is that of the turn half way between; BDF2's is of the step's end.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -46,10 +48,14 @@ class ContactFaces:
     They are settled before the step is solved, by the way to y. Where the way to x shows others,
     the step is solved again; from then on a node that has a face keeps it, so that this ends.
 
+    Where the surface touches nothing the step is solved without it, and again with it where the way to x shows that
+    it does: so it is looked at once, and not for each iterate.
+
     q, y       : (l, 3) [m], as a StepProblem has them
     q_before   : (l, 3) [m] one step before q, of a step that looks so far back
     sides      : (o, l) faces of the problem to solve; once settled, those of the step
     is_settled : the problem solved last was the right one
+    apart      : the surface is taken to touch nothing
     """
 
     environment: Environment
@@ -67,6 +73,7 @@ class ContactFaces:
         self.contact: Contact | None = None  # of the problem solved last
         self.end: Positions | None = None  # of a solve whose friction went by a push far from the one there
         self.sides = self._crossed(self.y)
+        self.apart = self.environment.begin_contacts(self.q, self.time, self.time_step)
 
     def _crossed(self, end: Positions) -> Indices:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
@@ -76,9 +83,19 @@ class ContactFaces:
     def problem(self) -> StepProblem:
         """Return the problem of the step with the faces as they are known now."""
         environment, time = self.environment, self.time
-        way = self.y, self.q_before
-        self.contact = environment.contact(self.q, way, time, self.time_step, self.sides, self.end)
+        before, step = self.q_before, self.time_step
+        self.contact = environment.contact(self.q, before, time, step, self.sides, self.end, self.apart)
         return StepProblem(self.q, self.y, environment.load(time), self.contact, environment.prescribed(self.q, time))
+
+    @contextmanager
+    def with_surface_if_failed(self) -> Iterator[None]:
+        """Let a solve without the surface fail: it is solved again with it."""
+        try:
+            yield
+        except StepFailed:
+            if not self.apart:
+                raise
+            self.apart = False
 
     def compare(self, x: Positions) -> None:
         """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
@@ -95,6 +112,9 @@ class ContactFaces:
                     'in by; try a smaller time.step, or safety.on_failure = "substep"',
                     "contact",
                 )
+            return
+        if self.apart and not environment.stays_apart(self.q, x):
+            self.apart = self.is_settled = False
             return
         if self.end is None and environment.friction_lags(x, self.contact):
             self.end, self.is_settled = x, False
@@ -171,8 +191,9 @@ class ImplicitEuler(Integrator):
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         while not faces.is_settled:
             problem = replace(faces.problem(), rates=rates)
-            result = self.stepper.step(problem, faces.end)
-            faces.compare(result.position)
+            with faces.with_surface_if_failed():
+                result = self.stepper.step(problem, faces.end)
+                faces.compare(result.position)
         self.environment.end_step(result.position, problem.contact)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
         result = replace(result, cost=cost, problem=problem, tau=self.damped_tau)

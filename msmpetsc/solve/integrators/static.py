@@ -111,8 +111,9 @@ class LoadPath:
         faces = ContactFaces(self.environment, q, q, self.time, time_step, self.sides, fixed)
         while not faces.is_settled:
             problem = self._problem(faces.problem(), share)
-            result = self.stepper.step(problem, self._guess(problem, share))
-            faces.compare(result.position)
+            with faces.with_surface_if_failed():
+                result = self.stepper.step(problem, self._guess(problem, share))
+                faces.compare(result.position)
         lattice = self.stepper.lattice
         count, where = worst_inverted(self.stepper.comm, lattice, result.position, corners=self.displaced)
         if steps.may_be_refused and count > self.inverted:

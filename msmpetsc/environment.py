@@ -186,9 +186,10 @@ class Environment:
         self._contacts = Contacts(self.self_contact, begin, time, self._contacts)
         return self._contacts.find(q, begin).count == 0
 
-    def stays_apart(self, q: Positions, x: Positions) -> bool:
-        """Return whether the surface touches nothing on the way of the step begun from q to x (collective)."""
-        return self._contacts is not None and self._contacts.stay_apart(q, x)
+    def after_way(self, q: Positions, x: Positions) -> tuple[bool, bool]:
+        """Return whether the way of the step begun at q to x is free, and whether the surface touches something at x
+        (collective)."""
+        return self._contacts.after_way(q, x) if self._contacts else (True, False)
 
     def _before(self, q: Positions) -> Contact | None:
         """Return the contact of the step that ended at q; None if the last one known did not."""

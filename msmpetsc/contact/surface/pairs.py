@@ -204,13 +204,14 @@ class Contacts:
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
-    def stay_apart(self, q: Positions, x: Positions) -> bool:
-        """Return whether the surface touches nothing where a step ends that goes from q to x, nor on the way there."""
+    def after_way(self, q: Positions, x: Positions) -> tuple[bool, bool]:
+        """Return whether the way of a step from q to x is free, and whether the surface touches something at x."""
         pairs, bound = self._bound(q, self.begin, x)
         ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
         if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:  # so that the next steps need no look
             self.near.look(x, self.time, ahead)
-        return self.find(x, base=q).count == 0 and self.free_share(q, x, True) == 1.0
+        touches = self.find(x, base=q).count > 0
+        return self.free_share(q, x, True) == 1.0, touches
 
     def _look(self, q: Positions, time: float, points: Positions, base: Positions | None) -> Pairs:
         """Look for pairs at q, whose points are S (p, 3) [m], and on the way there from base, if that is not long."""

@@ -71,6 +71,7 @@ class ContactFaces:
         self.solves = 0
         self.is_settled = False
         self.contact: Contact | None = None  # of the problem solved last
+        self.start: Positions | None = None  # of an earlier solve, that the next one may begin with
         self.end: Positions | None = None  # of a solve whose friction went by a push far from the one there
         self.sides = self._crossed(self.y)
         self.apart = self.environment.begin_contacts(self.q, self.time, self.time_step)
@@ -113,11 +114,15 @@ class ContactFaces:
                     "contact",
                 )
             return
-        if self.apart and not environment.stays_apart(self.q, x):
-            self.apart = self.is_settled = False
-            return
+        if self.apart:
+            free, touches = environment.after_way(self.q, x)
+            if touches or not free:
+                self.start = x if free else None
+                self.apart = self.is_settled = False
+                return
         if self.end is None and environment.friction_lags(x, self.contact):
-            self.end, self.is_settled = x, False
+            self.end = self.start = x
+            self.is_settled = False
             return
         if environment.penalties:  # what reflects goes by the way to x alone
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
@@ -192,7 +197,7 @@ class ImplicitEuler(Integrator):
         while not faces.is_settled:
             problem = replace(faces.problem(), rates=rates)
             with faces.with_surface_if_failed():
-                result = self.stepper.step(problem, faces.end)
+                result = self.stepper.step(problem, faces.start)
                 faces.compare(result.position)
         self.environment.end_step(result.position, problem.contact)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)

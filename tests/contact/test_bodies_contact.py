@@ -17,12 +17,14 @@ from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs
 from msmpetsc.environment import Environment
+from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.implicit import ContactFaces
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
@@ -165,6 +167,19 @@ def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(folder: Path,
     bodies = [body("block", [0, 0, 0]), body("ball", [0.02, 0.01, SIDE + 0.02], start={"velocity": [0, 0, -50.0]})]
     play(write(folder, "past", body=bodies, time={"step": 0.01, "duration": 0.01}))
     assert solves[1] == [True, False]
+
+
+def test_a_step_that_fails_without_the_surface_is_solved_with_it(folder: Path, solves, monkeypatch):
+    step = Stepper.step
+
+    def failing(self: Stepper, problem: StepProblem, start: np.ndarray | None = None) -> StepResult:
+        if problem.contact is None or problem.contact.surface is None:
+            raise StepFailed("fails", "iterations")
+        return step(self, problem, start)
+
+    monkeypatch.setattr(Stepper, "step", failing)
+    play(fall(folder, "failing", 0.02, time={"step": 0.01, "duration": 0.02}))
+    assert solves[1][0] and not solves[1][-1] and not solves[2][-1]
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

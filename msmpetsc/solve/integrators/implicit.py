@@ -15,8 +15,6 @@ A viscous solid has its dissipation over the step beside E (elasticity.viscosity
 Euler's difference of two positions is that of the turn half way between; BDF2's is of the step's end.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -74,7 +72,8 @@ class ContactFaces:
         self.start: Positions | None = None  # of an earlier solve, that the next one may begin with
         self.end: Positions | None = None  # of a solve whose friction went by a push far from the one there
         self.sides = self._crossed(self.y)
-        self.apart = self.environment.begin_contacts(self.q, self.time, self.time_step)
+        with CONTACT:
+            self.apart = self.environment.begin_contacts(self.q, self.time, self.time_step)
 
     def _crossed(self, end: Positions) -> Indices:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
@@ -87,16 +86,6 @@ class ContactFaces:
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end, self.apart)
         return StepProblem(self.q, self.y, environment.load(time), self.contact, environment.prescribed(self.q, time))
-
-    @contextmanager
-    def with_surface_if_failed(self) -> Iterator[None]:
-        """Let a solve without the surface fail: it is solved again with it."""
-        try:
-            yield
-        except StepFailed:
-            if not self.apart:
-                raise
-            self.apart = False
 
     def compare(self, x: Positions) -> None:
         """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
@@ -115,7 +104,8 @@ class ContactFaces:
                 )
             return
         if self.apart:
-            free, touches = environment.after_way(self.q, x)
+            with CONTACT:
+                free, touches = environment.after_way(self.q, x)
             if touches or not free:
                 self.start = x if free else None
                 self.apart = self.is_settled = False
@@ -196,8 +186,13 @@ class ImplicitEuler(Integrator):
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         while not faces.is_settled:
             problem = replace(faces.problem(), rates=rates)
-            with faces.with_surface_if_failed():
+            try:
                 result = self.stepper.step(problem, faces.start)
+            except StepFailed:
+                if not faces.apart:
+                    raise
+                faces.apart = False
+            else:
                 faces.compare(result.position)
         self.environment.end_step(result.position, problem.contact)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)

@@ -111,8 +111,13 @@ class LoadPath:
         faces = ContactFaces(self.environment, q, q, self.time, time_step, self.sides, fixed)
         while not faces.is_settled:
             problem = self._problem(faces.problem(), share)
-            with faces.with_surface_if_failed():
+            try:
                 result = self.stepper.step(problem, self._guess(problem, share))
+            except StepFailed:
+                if not faces.apart:
+                    raise
+                faces.apart = False
+            else:
                 faces.compare(result.position)
         lattice = self.stepper.lattice
         count, where = worst_inverted(self.stepper.comm, lattice, result.position, corners=self.displaced)

@@ -46,7 +46,7 @@ class FirstGuess:
     def _least(self, guesses: list[Positions], without: list[float]) -> int:
         """The guess (a number) of least g, of which ``without`` is that without self-contact.
 
-        Self-contact costs most to ask for, and takes no more away than it stores where the step begins.
+        Self-contact costs most to ask for, and takes no more away than it, or an elastic slip, stores at the start.
         """
         functional = self.functional
         problem, best, least = functional.problem, 0, np.inf

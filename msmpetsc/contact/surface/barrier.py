@@ -123,7 +123,7 @@ class Barrier:
         if moved is not None:
             rest, linear = _without_linear_part(points, moved)
             ends += [np.asfortranarray(points + rest)]
-            near += linear / (1 - linear) * (near + 2 * float(np.sqrt((rest**2).sum(axis=1).max())))
+            near += linear / (1 - linear) * (near + 2 * float(np.linalg.norm(rest, axis=1).max()))
         candidates.build(self.mesh, *ends, 0.5 * near, self.ipctk.LBVH())
         return candidates
 

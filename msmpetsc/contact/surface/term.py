@@ -102,7 +102,7 @@ class SurfaceContact:
             moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
             self.rubs = moment.count > 0
             if self.rubs:
-                points = contacts.points(start, contacts.begin)
+                points = contacts.points_at(start, contacts.begin)
                 came = None if last is None else contacts.points.moved(start - last[: len(start)])
                 friction = self._friction(moment, points, came, time_step, end is None)
                 self.friction = friction.after(before.friction, points) if friction and before else friction

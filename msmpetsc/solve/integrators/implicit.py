@@ -15,6 +15,7 @@ A viscous solid has its dissipation over the step beside E (elasticity.viscosity
 Euler's difference of two positions is that of the turn half way between; BDF2's is of the step's end.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -86,6 +87,19 @@ class ContactFaces:
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end, self.apart)
         return StepProblem(self.q, self.y, environment.load(time), self.contact, environment.prescribed(self.q, time))
+
+    def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
+        """Return the solution by ``step`` of the problem with the right faces. Raises StepFailed."""
+        while not self.is_settled:
+            try:
+                result = step(self.problem())
+            except StepFailed:
+                if not self.apart:
+                    raise
+                self.apart = False
+            else:
+                self.compare(result.position)
+        return result
 
     def compare(self, x: Positions) -> None:
         """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
@@ -184,19 +198,10 @@ class ImplicitEuler(Integrator):
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
-        while not faces.is_settled:
-            problem = replace(faces.problem(), rates=rates)
-            try:
-                result = self.stepper.step(problem, faces.start)
-            except StepFailed:
-                if not faces.apart:
-                    raise
-                faces.apart = False
-            else:
-                faces.compare(result.position)
-        self.environment.end_step(result.position, problem.contact)
+        result = faces.solve(lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start))
+        self.environment.end_step(result.position, faces.contact)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
-        result = replace(result, cost=cost, problem=problem, tau=self.damped_tau)
+        result = replace(result, cost=cost, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides
 
     def _with_viscosity(self, result: StepResult) -> StepResult:

@@ -109,23 +109,17 @@ class LoadPath:
         time_step = 0.0 if len(self.known) > 1 else self.time_step  # obstacles move in the first load step alone
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(self.environment, q, q, self.time, time_step, self.sides, fixed)
-        while not faces.is_settled:
-            problem = self._problem(faces.problem(), share)
-            try:
-                result = self.stepper.step(problem, self._guess(problem, share))
-            except StepFailed:
-                if not faces.apart:
-                    raise
-                faces.apart = False
-            else:
-                faces.compare(result.position)
+        result = faces.solve(lambda whole: self._step(self._problem(whole, share), share))
         lattice = self.stepper.lattice
         count, where = worst_inverted(self.stepper.comm, lattice, result.position, corners=self.displaced)
         if steps.may_be_refused and count > self.inverted:
             raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
         self.known = [self.known[-1], (share, result.position)]
-        self.problem, self.sides = problem, faces.sides
+        self.problem, self.sides = result.problem, faces.sides
         return result
+
+    def _step(self, problem: StepProblem, share: float) -> StepResult:
+        return self.stepper.step(problem, self._guess(problem, share))
 
     def _problem(self, whole: StepProblem, share: float) -> StepProblem:
         load, prescribed = whole.load, self.target

@@ -201,7 +201,8 @@ class Stepper:
             q = self.functional.positions(self.x)
             self.first_guess.learn(q)
             error = self.control.rounding.added_to(verdict.error, self.functional.distance(q), outcome.at_rounding)
-            return StepResult(q, problem.q, replace(self.work_so_far() - before, step_error=error))
+            cost = replace(self.work_so_far() - before, step_error=error)
+            return StepResult(q, problem.q, cost, problem=problem)
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:
         self.functional.begin(problem)

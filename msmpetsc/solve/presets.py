@@ -22,9 +22,8 @@ class Preset:
     about        : when to use it
     options      : PETSc's, without the dash
     projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
-    extrapolate  : a step starts from the best of several guesses, not from y as published
-    iterations   : a fixed number of them is the method as published; None: to the error target
-    inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
+    iterations   : a fixed number of them, from y on, is the method as published; None: to the error target, from the
+        best of several guesses, and ksp_rtol is only the tightest of a linear solve: less where the step needs less
     chooses      : pc_type is only what it begins with, where multigrid of the Hessian is not worth its while
     """
 
@@ -33,9 +32,7 @@ class Preset:
     true_hessian: bool = False  # the Jacobian is the true Hessian of g, not the constant A
     projected: int = 0
     start_from_b: bool = False  # CG starts from x = b, as in the paper's Algorithm 1
-    extrapolate: bool = True
     iterations: int | None = None
-    inexact: bool = False
     chooses: bool = False
 
 
@@ -82,7 +79,6 @@ PRESETS = {
             **JACOBI_CG,
             "ksp_rtol": "1e-1",
         },
-        inexact=True,
     ),
     "lbfgs": Preset(
         "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search: between anderson and newton",
@@ -98,33 +94,28 @@ PRESETS = {
             **JACOBI_CG,
             "ksp_rtol": "1e-1",
         },
-        inexact=True,
     ),
     "newton": Preset(
         "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error",
         NEWTON,
         true_hessian=True,
-        inexact=True,
         chooses=True,
     ),
     "newton-multigrid": Preset(
         "The same with multigrid on the lattice, what newton itself takes for all others",
         {**NEWTON, "pc_type": "mg"},
         true_hessian=True,
-        inexact=True,
     ),
     "newton-projected": Preset(
         "Newton's method, for long without the Hessian's negative parts: slower, and what a hard step falls back on",
         NEWTON,
         true_hessian=True,
         projected=100,
-        inexact=True,
         chooses=True,
     ),
     "fast-msm": Preset(
         "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a prefactored Cholesky",
         {**PLAIN, **CHOLESKY},
-        extrapolate=False,
         iterations=10,
     ),
     "paper": Preset(
@@ -138,7 +129,6 @@ PRESETS = {
             "ksp_converged_use_initial_residual_norm": "",
         },
         start_from_b=True,
-        extrapolate=False,
         iterations=10,
     ),
 }
@@ -183,7 +173,9 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
     A tolerance that is held to what a step needs stands in a comment: given, it would be held to as it is.
     """
     ours = [SolverOptions(preset, prefix, budget) for prefix, (preset, budget) in solvers.items()]
-    adapting = {f"{each.prefix}ksp_rtol" for each in ours if each.preset.inexact and each.is_default("ksp_rtol")}
+    adapting = {
+        f"{each.prefix}ksp_rtol" for each in ours if each.preset.iterations is None and each.is_default("ksp_rtol")
+    }
     lines = []
     for name, value in sorted(PETSc.Options().getAll().items()):
         quoted = f'"{value}"' if value and " " in value else value or ""

@@ -190,7 +190,8 @@ def test_a_strut_that_buckles_under_its_load():
     lattice = one_spring(m, k, r)
     load = np.array([[0.0, 0, 0], [0, 0, -k * (r - length)]])
     q = np.array([[0.0, 0, 0], [1e-3, 0, length]])
-    stepper = Stepper(COMM, lattice, T, replace(find_preset("newton"), extrapolate=False), error=1e-9)
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-9)
+    stepper.first_guess.extrapolate = False
     x = stepper.step(StepProblem(q, q, load)).position[1]
     stepper.destroy()
     stretch = np.linalg.norm(x) - r

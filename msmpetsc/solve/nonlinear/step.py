@@ -113,7 +113,7 @@ class Stepper:
         of_rank = elasticity.solid.stiffest if elasticity.solid else 0.0
         self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)  # lambda of a cell, in mu
         self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
-        self.first_guess = FirstGuess(self.functional, self.preset.extrapolate)
+        self.first_guess = FirstGuess(self.functional, self.preset.iterations is None)
         self.options = SolverOptions(self.preset, self.prefix, self.budget)
         try:
             with petsc_errors("PETSc refuses its options"):
@@ -408,7 +408,7 @@ class Stepper:
             self.friction.is_awaited = True
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
-            if self.preset.inexact and not self.options.is_given("ksp_max_it"):
+            if self.preset.iterations is None and not self.options.is_given("ksp_max_it"):
                 most = self.jacobian.preconditioner.most_iterations(self.ksp.getTolerances()[0])
                 self.ksp.setTolerances(max_it=most or self.most_its)
         if self.preset.start_from_b:  # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
@@ -479,7 +479,7 @@ class Stepper:
 
     def _adapt(self) -> None:
         """Let the next linear solve leave what the step can do with; a tolerance of the user's own is left alone."""
-        if self.preset.inexact and self.options.is_default("ksp_rtol"):
+        if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
             rtol, atol = self.control.tolerances(self.outcome)
             self.ksp.setTolerances(rtol=rtol, atol=None if self.options.is_given("ksp_atol") else atol)
 

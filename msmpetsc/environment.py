@@ -39,7 +39,7 @@ class Environment:
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.exchanges = model.penalties, model.exchanges
         self.self_contact = NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
-        self._contacts = Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None  # of the last step begun
+        self.contacts = Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None  # of the last step begun
         self.has_friction = any(p.friction > 0 for p in self.penalties) or bool(
             self.self_contact and self.self_contact.law.friction > 0
         )
@@ -162,34 +162,26 @@ class Environment:
         time_step: float,
         sides: Indices | None,
         end: Positions | None = None,
-        apart: bool = False,
     ) -> Contact | None:
         """Return what presses in the step from q, with friction; None if nothing does (collective).
 
-        last  : (l, 3) [m] positions one step before q, of a step that looks back to them
-        end   : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
-        apart : the surface that meets itself or obstacles is left out
+        last : (l, 3) [m] positions one step before q, of a step that looks back to them
+        end  : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
         """
         owned, surface, before = self.lattice.owned, None, self._before(q)
         states, held, ended = [], before.states if before else [], None if end is None else end[:owned]
         for p, side in self._pressing(time, sides):
             states.append(p.during(q[:owned], time, time_step, side[:owned], last, ended).after(held, q[:owned]))
-        if self._contacts and not apart:
-            surface = SurfaceContact(self._contacts, q, time_step, last, end, before.surface if before else None)
+        if self.contacts and not self.contacts.apart:
+            surface = SurfaceContact(self.contacts, q, time_step, last, end, before.surface if before else None)
         return Contact(states, owned, surface) if states or surface else None
 
-    def begin_contacts(self, q: Positions, time: float, time_step: float) -> bool:
-        """Begin a step at q: whether the surface touches nothing there (collective); False without one."""
-        if not self.self_contact:
-            return False
-        begin = max(time - time_step, 0.0)
-        self._contacts = Contacts(self.self_contact, begin, time, self._contacts)
-        return self._contacts.find(q, begin).count == 0
-
-    def after_way(self, q: Positions, x: Positions) -> tuple[bool, bool]:
-        """Return whether the way of the step begun at q to x is free, and whether the surface touches something at x
-        (collective)."""
-        return self._contacts.after_way(q, x) if self._contacts else (True, False)
+    def begin_contacts(self, q: Positions, time: float, time_step: float) -> None:
+        """Begin a step at q: the surface is asked about around its contacts alone, if these are few (collective)."""
+        if self.self_contact:
+            begin = max(time - time_step, 0.0)
+            self.contacts = Contacts(self.self_contact, begin, time, self.contacts)
+            self.contacts.narrow(q, begin)
 
     def _before(self, q: Positions) -> Contact | None:
         """Return the contact of the step that ended at q; None if the last one known did not."""
@@ -215,11 +207,11 @@ class Environment:
         self._ended = None
         if self.self_contact:
             self.self_contact.forget()
-            self._contacts = Contacts(self.self_contact, 0.0, 0.0)
+            self.contacts = Contacts(self.self_contact, 0.0, 0.0)
 
     def touch(self, q: Positions, time: float) -> Touch:
         """Return what contacts the surface has with itself and obstacles at q and a time [s] (collective)."""
-        return self._contacts.touch(q, time) if self._contacts else Touch()
+        return self.contacts.touch(q, time) if self.contacts else Touch()
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
         """Return what presses at a time, without friction; None if nothing does."""

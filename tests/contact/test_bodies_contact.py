@@ -13,6 +13,7 @@ from conftest import result_on
 from crossings import count_crossings
 from mpi4py import MPI
 
+import msmpetsc.contact.surface.pairs
 from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs
@@ -130,43 +131,65 @@ def test_the_best_guess_is_taken_though_not_all_are_weighed(folder: Path, monkey
 
 
 @pytest.fixture
-def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[bool]]:
-    """Of each solve of each step of 10 ms, whether the surface was taken to touch nothing."""
-    found: dict[int, list[bool]] = {}
+def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[str]]:
+    """Of each solve of each step of 10 ms, whether the surface was taken to touch nothing, or only what is known."""
+    found: dict[int, list[str]] = {}
     problem = ContactFaces.problem
 
     def seen(self: ContactFaces) -> StepProblem:
-        found.setdefault(round(self.time / 0.01), []).append(self.apart)
+        contacts = self.environment.contacts
+        assert contacts is not None
+        asked = "nothing" if contacts.apart else "known" if contacts.is_narrow else "all"
+        found.setdefault(round(self.time / 0.01), []).append(asked)
         return problem(self)
 
     monkeypatch.setattr(ContactFaces, "problem", seen)
     return found
 
 
-def test_a_step_in_which_nothing_touches_is_solved_without_the_surface(folder: Path, solves, monkeypatch):
-    """And one that leads into it once more, as when each iterate is looked at."""
+@pytest.mark.parametrize(("few", "asked"), [(0.0, "all"), (1.0, "known")])
+def test_the_surface_is_asked_about_around_what_touches_alone(folder: Path, solves, monkeypatch, few, asked):
+    """And once more where a step leads into more, as when each iterate is looked at."""
+    monkeypatch.setattr(msmpetsc.contact.surface.pairs, "FEW", few)
     scene = fall(folder, "apart", 0.02, time={"step": 0.01, "duration": 0.15})
     _, frames = play(scene, "solver.error=1e-8")
     touching = [frame.self_contacts > 0 for frame in frames]
-    assert [solves[i][0] for i in range(1, 16)] == [not touched for touched in touching[:-1]]
-    assert [solves[i][-1] for i in range(1, 16)] == [not any(both) for both in pairwise(touching)]
+    assert [solves[i][0] for i in range(1, 16)] == [asked if touched else "nothing" for touched in touching[:-1]]
+    assert [solves[i][-1] == "nothing" for i in range(1, 16)] == [not any(both) for both in pairwise(touching)]
+    assert max(map(len, solves.values())) > 1
     with monkeypatch.context() as patch:
-        patch.setattr(Environment, "begin_contacts", begun_touching)
+        patch.setattr(Environment, "begin_contacts", begun_with_all)
         for one, other in zip(frames, play(scene, "solver.error=1e-8")[1], strict=True):
             np.testing.assert_allclose(one.position, other.position, atol=1e-7 * SIDE)
             assert one.self_contacts == other.self_contacts
 
 
-def begun_touching(self: Environment, q: np.ndarray, time: float, time_step: float) -> bool:
-    self._contacts = Contacts(self.self_contact, max(time - time_step, 0.0), time)
-    return False
+def begun_with_all(self: Environment, q: np.ndarray, time: float, time_step: float) -> None:
+    assert self.self_contact is not None
+    self.contacts = Contacts(self.self_contact, max(time - time_step, 0.0), time)
 
 
-def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(folder: Path, solves: dict[int, list[bool]]):
+def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypatch):
+    monkeypatch.setattr(msmpetsc.contact.surface.pairs, "FEW", 1.0)
+    scene = fall(folder, "light", 0.002, time={"step": 0.01, "duration": 0.01})
+    model = build_model(MPI.COMM_SELF, load_scene(scene))
+    assert model.collision is not None
+    contacts, start = Contacts(NearPairs(MPI.COMM_SELF, model.collision), 0.0, 0.01), model.lattice.nodes
+    end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.002 - 0.5 * DISTANCE], 0.0)
+    energy = contacts.touch(end, 0.01).energy
+    for left_out, is_right in ((1.01, True), (0.99, False)):
+        assert contacts.narrow(start, 0.0) and contacts.apart
+        assert contacts.after_way(start, end, left_out * energy) == (True, is_right)
+        assert contacts.is_narrow != is_right and not contacts.apart
+    assert contacts.touch(end, 0.01).energy == pytest.approx(energy)
+    assert contacts.after_way(start, end, 0.0) == (True, True)
+
+
+def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(folder: Path, solves: dict[int, list[str]]):
     """Where it ends nothing touches: the way there tells."""
     bodies = [body("block", [0, 0, 0]), body("ball", [0.02, 0.01, SIDE + 0.02], start={"velocity": [0, 0, -50.0]})]
     play(write(folder, "past", body=bodies, time={"step": 0.01, "duration": 0.01}))
-    assert solves[1] == [True, False]
+    assert solves[1] == ["nothing", "all"]
 
 
 def test_a_step_that_fails_without_the_surface_is_solved_with_it(folder: Path, solves, monkeypatch):
@@ -179,7 +202,7 @@ def test_a_step_that_fails_without_the_surface_is_solved_with_it(folder: Path, s
 
     monkeypatch.setattr(Stepper, "step", failing)
     play(fall(folder, "failing", 0.02, time={"step": 0.01, "duration": 0.02}))
-    assert solves[1][0] and not solves[1][-1] and not solves[2][-1]
+    assert all(each == ["nothing"] + ["all"] * len(each[1:]) for each in solves.values()) and len(solves) == 2
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

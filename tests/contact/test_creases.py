@@ -53,12 +53,12 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     assert all(pairs.empty() for pairs in barrier.contacts(candidates, points))
     tight = DISTANCE / 4  # the upper edges are 0.14 m apart: no more than half of that, of 0.15 m over powers of 4
     level = barrier.distances.index(tight)
-    assert barrier.contacts(None, closed(points, 1.1 * tight))[level].empty()  # to walls it is less
-    assert not barrier.contacts(None, closed(points, 0.99 * tight))[level].empty()
+    assert barrier.contacts(barrier.creases, closed(points, 1.1 * tight))[level].empty()  # to walls it is less
+    assert not barrier.contacts(barrier.creases, closed(points, 0.99 * tight))[level].empty()
     through = closed(points, -2 * HALF) - points
     assert 0.3 < barrier.free_share(points, through, candidates) < 0.5  # they meet halfway
     assert 0.3 < barrier.sweep(points, through) < 0.5
-    assert 0.3 < barrier.free_share(points, through, None) < 0.5
+    assert 0.3 < barrier.free_share(points, through, barrier.creases) < 0.5
     assert barrier.free_share(points, closed(points, 0.05) - points, candidates) == 1
 
 
@@ -77,6 +77,8 @@ def test_the_derivatives_in_a_crease_are_those_of_its_energy():
     gradient = barrier.gradient(*at(0))
     assert slope == pytest.approx(np.vdot(gradient, direction), rel=1e-5) and np.abs(gradient).max() > 0
     bend = (barrier.gradient(*at(1)) - barrier.gradient(*at(-1))) / (2 * step)
+    around = barrier.around(gradient.any(axis=1), points, 0.01)
+    np.testing.assert_allclose(barrier.gradient(barrier.contacts(around, points), points), gradient, rtol=1e-12)
     product = sum(barrier.hessian(*at(0), False)) @ direction.ravel()
     np.testing.assert_allclose(product, bend.ravel(), atol=1e-5 * np.abs(product).max())
     assert 0 < barrier.least(barrier.contacts(candidates, points), points) < DISTANCE / 4
@@ -85,11 +87,11 @@ def test_the_derivatives_in_a_crease_are_those_of_its_energy():
 def test_walls_are_clear_as_long_as_they_cannot_come_near():
     barrier, points, _ = barrier_of()
     candidates, reach = barrier.candidates(points, 0.0), 0.2
-    clear, anywhere = barrier.clear_reach(candidates, points, reach)
-    assert 0 < anywhere <= clear < reach
+    clear = barrier.clear_reach(candidates, points, reach)
+    assert 0 < clear < reach
     for seed in range(10):
         way = np.random.default_rng(seed).normal(size=points.shape)
-        moved = points + 0.999 * anywhere * way / np.linalg.norm(way, axis=1)[:, None]
+        moved = points + 0.999 * clear * way / np.linalg.norm(way, axis=1)[:, None]
         assert all(pairs.empty() for pairs in barrier.contacts(candidates, moved))
 
 

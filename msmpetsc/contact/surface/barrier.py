@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.surface.creases import creases, neighbours
 from msmpetsc.contact.surface.surface_friction import RubbingPairs, SurfaceFriction, rubbing_pairs
 from msmpetsc.geometry.surface import Surface
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     import ipctk
     from scipy.sparse import csc_matrix
 
-ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # one for each distance that pairs push from
+PairSets: TypeAlias = "tuple[ipctk.Candidates, ...]"  # one for each distance that pairs push from
+ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # likewise
 
 KEPT = 0.9  # of the way to where surfaces meet
 PIECE = 2.0  # edges that points move in one piece of a way
@@ -76,7 +77,8 @@ class Barrier:
         self.edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
-        self.creases: list[ipctk.Candidates] = []  # pairs of each distance after the first
+        self.creases: PairSets = (ipctk.Candidates(),)  # no pairs of the first distance
+        self._creased: list[list[tuple[list[Any], Indices]]] = []  # these by kind, each kind with its points (k, 4)
         self.rubbed: tuple[Positions, RubbingPairs] | None = None
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
@@ -87,11 +89,15 @@ class Barrier:
     def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
         """Let pairs that are near at rest for being neighbours on the surface push from smaller distances only, points
         (p, 3) [m] at rest; how many these are, and how many do not push at all."""
-        pairs = neighbours(self.candidates(points, 0.0), self.mesh, points, self.law.distance)
+        pairs = neighbours(self.candidates(points, 0.0)[0], self.mesh, points, self.law.distance)
         if pairs:
             self.mesh.can_collide = self.mesh.can_collide & self.ipctk.make_sparse_filter(pairs, True)
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
-        self.creases = list(sets.values())
+        self.creases += tuple(sets.values())
+        for crease in self.creases[1:]:
+            kinds, parts = (crease.fv_candidates, crease.ee_candidates), (self.mesh.edges, self.mesh.faces)
+            of = [np.array([pair.vertex_ids(*parts) for pair in kind], int).reshape(-1, 4) for kind in kinds]
+            self._creased.append(list(zip(kinds, of, strict=True)))
         self.distances += sets
         self.potentials += [self._potential(distance) for distance in sets]
         return sum(map(len, self.creases)), dropped
@@ -111,9 +117,9 @@ class Barrier:
         cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
         return np.array(sorted(cut), np.int64)
 
-    def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> "ipctk.Candidates":
+    def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> PairSets:
         """Return all pairs that may be nearer than dhat once each point has moved by no more than
-        ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; but for those in creases.
+        ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; and those in creases, wherever they are.
 
         Boxes around ways hold fewer pairs without what is linear in the points x of these, m = c + G x + r. Where a
         pair is nearer than d on its way, |x - x' + t (r - r')| is less than d + |G| |x - x'|, and
@@ -125,21 +131,42 @@ class Barrier:
             ends += [np.asfortranarray(points + rest)]
             near += linear / (1 - linear) * (near + 2 * float(np.linalg.norm(rest, axis=1).max()))
         candidates.build(self.mesh, *ends, 0.5 * near, self.ipctk.LBVH())
-        return candidates
+        return candidates, *self.creases[1:]
 
-    def clear_reach(self, candidates: "ipctk.Candidates", points: Positions, reach: float) -> tuple[float, float]:
-        """Return how far [m], up to ``reach``, each point may move until one of these pairs comes
-        as near as it pushes from, and until any pair of the surface does; 0 where one is."""
-        clear = [reach]
-        for pairs, distance in zip((candidates, *self.creases), self.distances, strict=True):
+    def around(self, touched: Mask, points: Positions, reach: float) -> PairSets:
+        """Return, of points that have moved by no more than ``reach`` [m] from S (p, 3), the pairs whose edges and
+        triangles have a point in ``touched`` (p,) or next to one."""
+        ipctk, corners, near = self.ipctk, (self.mesh.edges, self.mesh.faces), touched.copy()
+        near[corners[0][touched[corners[0]].any(axis=1)]] = True
+        edges, faces = (np.flatnonzero(near[of].any(axis=1)) for of in corners)
+        phase, found = ipctk.LBVH(), ipctk.Candidates()
+        phase.can_vertices_collide = self.mesh.can_collide
+        parts = (np.asfortranarray(of[chosen]) for of, chosen in zip(corners, (edges, faces), strict=True))
+        phase.build(np.asfortranarray(points), *parts, 0.5 * self.law.distance + reach)
+        ends = [(pair.edge0_id, pair.edge1_id) for pair in phase.detect_edge_edge_candidates()]
+        found.ee_candidates = [ipctk.EdgeEdgeCandidate(edges[i], edges[j]) for i, j in ends]
+        met = [(pair.face_id, pair.vertex_id) for pair in phase.detect_face_vertex_candidates()]
+        found.fv_candidates = [ipctk.FaceVertexCandidate(faces[i], j) for i, j in met]
+        sets = [found]
+        for kinds in self._creased:
+            sets.append(ipctk.Candidates())
+            sets[-1].fv_candidates, sets[-1].ee_candidates = (
+                [pairs[i] for i in np.flatnonzero(near[of].any(axis=1))] for pairs, of in kinds
+            )
+        return tuple(sets)
+
+    def clear_reach(self, sets: PairSets, points: Positions, reach: float) -> float:
+        """Return how far [m], up to ``reach``, each point may move until one of these pairs comes as near as it pushes
+        from; 0 where one is."""
+        for pairs, distance in zip(sets, self.distances, strict=True):
             near = self._pairs(pairs, points, distance + 2 * reach)
-            clear.append(reach if near.empty() else max(0.5 * (self._least(near, points) - distance), 0.0))
-        return clear[1], min(clear)
+            if not near.empty():
+                reach = min(reach, max(0.5 * (self._least(near, points) - distance), 0.0))
+        return reach
 
-    def contacts(self, candidates: "ipctk.Candidates | None", points: Positions) -> ContactSets:
-        """Return the pairs nearer than they push from, one set for each distance; of creases only
-        without ``candidates``."""
-        kinds = zip((candidates or self.ipctk.Candidates(), *self.creases), self.distances, strict=True)
+    def contacts(self, sets: PairSets, points: Positions) -> ContactSets:
+        """Return the pairs nearer than they push from."""
+        kinds = zip(sets, self.distances, strict=True)
         return tuple(self._pairs(pairs, points, distance) for pairs, distance in kinds)
 
     def _pairs(self, candidates: Any, points: Positions, distance: float) -> "ipctk.NormalCollisions":
@@ -207,23 +234,18 @@ class Barrier:
     def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
-    def clearance(self, contacts: ContactSets, points: Positions) -> float:
-        """Return the least distance [m] of any pair at points S (p, 3), but no more than dhat.
+    def clearance(self, contacts: ContactSets, sets: PairSets, points: Positions) -> float:
+        """Return no more than the least distance [m] of these pairs, of which contacts are all at points S (p, 3)."""
+        known = zip(contacts, sets, self.distances, strict=True)
+        least = (
+            self._least(near, points) if len(near) else far for near, pairs, far in known if len(near) + len(pairs)
+        )
+        return min(least, default=self.law.distance)
 
-        contacts : there
-        """
-        distance = self.law.distance
-        near = [contacts[0], *(self._pairs(pairs, points, distance) for pairs in self.creases)]
-        return min((self._least(pairs, points) for pairs in near if not pairs.empty()), default=distance)
-
-    def free_share(self, start: Positions, moved: Rows, candidates: "ipctk.Candidates | None") -> float:
+    def free_share(self, start: Positions, moved: Rows, sets: PairSets) -> float:
         """Return the share, up to 1, of a straight way that points go from start (p, 3) by
-        ``moved`` (p, 3) [m] without any meeting.
-
-        candidates : pairs that may meet on it, besides those in creases
-        """
-        end = start + moved - moved.mean(axis=0)
-        share = self._share(start, end, *([candidates] if candidates else []), *self.creases)
+        ``moved`` (p, 3) [m] without any meeting, of pairs that may meet on it."""
+        share = self._share(start, start + moved - moved.mean(axis=0), sets)
         return share if share >= 1 else KEPT * share
 
     def sweep(self, start: Positions, moved: Rows) -> float:
@@ -232,16 +254,14 @@ class Barrier:
         whole = max(int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * self.edge))), 1)
         for piece in range(min(whole, PIECES)):
             begin, end = (start + i / whole * moved for i in (piece, piece + 1))
-            candidates = self.ipctk.Candidates()
-            candidates.build(self.mesh, np.asfortranarray(begin), np.asfortranarray(end), 0.0, self.ipctk.LBVH())
-            share = self._share(begin, end, candidates, *self.creases)
+            share = self._share(begin, end, self.candidates(begin, 0.0, end - begin))
             if share < 1:
                 return KEPT * (piece + share) / whole
         return 1.0 if whole <= PIECES else PIECES / whole
 
-    def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
+    def _share(self, start: Positions, end: Positions, sets: PairSets) -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
-        return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
+        return min((pairs.compute_collision_free_stepsize(*ways) for pairs in sets if not pairs.empty()), default=1.0)
 
 
 def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:

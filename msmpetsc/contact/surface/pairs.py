@@ -7,25 +7,24 @@ outlive a step (``NearPairs``); contacts at positions are known for as long as i
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.backend.arrays import Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets
+from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets, PairSets
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
-
-if TYPE_CHECKING:
-    import ipctk
 
 REMEMBERED = 3  # positions whose contacts are kept, and pairs: where a line search starts, and where it tries
 FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are 4 times the pairs
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 2.0  # times the move of a step in which nothing touched
+FEW = 0.01  # of all points, in contact: TODO
+
+SAME = 1e-9  # of the energy of contacts
 TINY = np.finfo(float).tiny
 
 
@@ -58,20 +57,18 @@ class Pairs:
     """Pairs that may meet while no point is farther than ``reach`` [m] from where it is at q (owned, 3), or from its
     straight way from there, but for a translation.
 
-    time               : [s], at which obstacles are there as they are
-    apart              : no more than reach [m]; none of them comes near enough to count while no point moves farther
-    clear              : no more than that [m]; nor does any pair in a crease, which is not among them
-    points, candidates : S there (p, 3) [m] and the pairs, on rank 0
-    moved              : the ways (p, 3) [m], on rank 0; None where there are none
+    time         : [s], at which obstacles are there as they are
+    clear        : no more than reach [m]; no pair comes near enough to count while no point moves farther
+    points, sets : S there (p, 3) [m] and the pairs, on rank 0
+    moved        : the ways (p, 3) [m], on rank 0; None where there are none
     """
 
     q: Positions
     time: float
     reach: float
-    apart: float
     clear: float
     points: Positions
-    candidates: "ipctk.Candidates | None"
+    sets: PairSets
     moved: Rows | None = None
 
     def serve(self, points: Positions) -> bool:
@@ -129,19 +126,13 @@ class NearPairs:
     def look(self, q: Positions, time: float, reach: float, moved: Rows | None = None) -> Pairs:
         """Look for pairs at q, or on the way of the points from there by ``moved`` (p, 3) [m]."""
         points, reach = self.points(q, time), min(max(reach, LEAST * self.edge), FARTHEST * self.edge)
-        candidates, ways = None, (0.0, 0.0)
+        sets, clear = (), 0.0
         if self.barrier:
-            candidates = self.barrier.candidates(points, reach, moved)
-            if moved is None:
-                ways = self.barrier.clear_reach(candidates, points, reach)
-        apart, clear = self.comm.bcast(ways)
-        newest = Pairs(q[: self.owned].copy(), time, reach, apart, clear, points, candidates, moved)
+            sets = self.barrier.candidates(points, reach, moved)
+            clear = self.barrier.clear_reach(sets, points, reach) if moved is None else 0.0
+        newest = Pairs(q[: self.owned].copy(), time, reach, self.comm.bcast(clear), points, sets, moved)
         self._known = [newest, *self._known[: REMEMBERED - 1]]
         return newest
-
-    def moved(self, q: Positions, time: float, pairs: Pairs) -> float:
-        """Return no less than how far points at q are from where the pairs were looked for [m]."""
-        return self.farthest(q, pairs.q, time, pairs.time)
 
     def farthest(self, end: Positions, start: Positions, time: float, begin: float) -> float:
         """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
@@ -167,14 +158,19 @@ class Contacts:
     Positions are (owned or more, 3) [m]. Obstacles are where they are at the step's end if nothing else is said: they
     get there first.
 
-    before : contacts of the step before, whose end is known
+    before    : contacts of the step before, whose end is known
+    is_narrow : pairs alone are asked for that are around those in contact somewhere; without any the surface is
+        ``apart``: it need not be asked for
     """
 
     def __init__(self, near: NearPairs, begin: float, time: float, before: "Contacts | None" = None):
         self.begin, self.time = begin, time
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
-        self._moments: list[ContactsAt] = before._moments if before else []
+        self.is_narrow = self.apart = False
+        self._around: PairSets = ()  # on rank 0, and the points (p,) in contact that these are around
+        self._touched: Mask | None = None
+        self._moments: list[ContactsAt] = before._moments if before and not before.is_narrow else []
         # q, time and points of some positions
         self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
 
@@ -191,27 +187,54 @@ class Contacts:
             if self._is_at(moment.q, moment.time, q, time):
                 return moment
         pairs = self.near.around(q, time)
-        bound = self.near.moved(q, time, pairs)
+        bound = self.near.farthest(q, pairs.q, time, pairs.time)
         if bound < pairs.clear and not with_points:
             return ContactsAt(q, time, 0, np.empty((0, 3)), ())
-        points, candidates = self.points_at(q, time), None
-        if bound >= pairs.apart:
-            if bound > pairs.reach:
-                pairs = self.near.serving(points) or self._look(q, time, points, base)
-            candidates = pairs.candidates
-        contacts = self.barrier.contacts(candidates, points) if self.barrier else ()
+        points = self.points_at(q, time)
+        if bound > pairs.reach and not self.is_narrow:
+            pairs = self.near.serving(points) or self._look(q, time, points, base)
+        sets = self._around if self.is_narrow else pairs.sets
+        contacts = self.barrier.contacts(sets, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
         self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
-    def after_way(self, q: Positions, x: Positions) -> tuple[bool, bool]:
-        """Return whether the way of a step from q to x is free, and whether the surface touches something at x."""
+    def narrow(self, q: Positions, time: float) -> bool:
+        """Ask from now on for the pairs alone that are around contacts at q and a time [s], and where it was narrow
+        before; return False, and ask for all, where that is too much of the surface."""
+        moment, touched = self.find(q, time), None
+        if self.barrier and moment.count:
+            touched = self.barrier.gradient(moment.contacts, moment.points).any(axis=1)
+            touched = touched if self._touched is None else touched | self._touched
+        self.is_narrow = self.comm.bcast(touched is None or touched.mean() < FEW)
+        self._moments, self._touched, self.apart = [moment], touched, self.is_narrow and moment.count == 0
+        points = self.points_at(q, self.time) if self.is_narrow and not self.apart else None
+        if self.barrier and points is not None and touched is not None:
+            self._around = self.barrier.around(touched, points, FARTHEST * self.near.edge)
+        return self.is_narrow
+
+    def widen(self) -> None:
+        """Ask for all pairs."""
+        self.is_narrow, self.apart, self._moments = False, False, []
+
+    def after_way(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
+        """Return whether the way of a narrow step from q to x is free, and x right: other pairs store no more than
+        ``left_out`` [J] there.
+
+        All pairs are asked for from then on; but where x is not right and the way is free, those around x too.
+        """
+        known = Touch() if self.apart else self.touch(x, self.time)
+        self.widen()
         pairs, bound = self._bound(q, self.begin, x)
         ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
         if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:  # so that the next steps need no look
             self.near.look(x, self.time, ahead)
-        touches = self.find(x, base=q).count > 0
-        return self.free_share(q, x, True) == 1.0, touches
+        self.find(x, base=q)
+        found, free = self.touch(x, self.time), self.free_share(q, x, True) == 1.0
+        is_right = free and found.energy <= (1 + SAME) * known.energy + left_out
+        if free and not is_right:
+            self.narrow(x, self.time)
+        return free, is_right
 
     def _look(self, q: Positions, time: float, points: Positions, base: Positions | None) -> Pairs:
         """Look for pairs at q, whose points are S (p, 3) [m], and on the way there from base, if that is not long."""
@@ -250,7 +273,8 @@ class Contacts:
     def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[Pairs, float]:
         """Return the newest pairs, and no less than how far points are from them on a way from q at ``begin`` [s]."""
         pairs = self.near.around(q, begin)
-        return pairs, max(self.near.moved(q, begin, pairs), self.near.moved(end, self.time, pairs))
+        places = (q, begin), (end, self.time)
+        return pairs, max(self.near.farthest(at, pairs.q, time, pairs.time) for at, time in places)
 
     def free_share(self, q: Positions, end: Positions, with_obstacles: bool = False) -> float:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on.
@@ -261,20 +285,27 @@ class Contacts:
         pairs, bound = self._bound(q, begin, end)
         if bound < pairs.clear:
             return 1.0
-        contacts, start = self.find(q, begin).contacts, self.points_at(q, begin)
-        moved, (pairs, bound) = self.points_at(end, self.time) - start, self._bound(q, begin, end)
+        start = self.points_at(q, begin)
+        moved = self.points_at(end, self.time) - start
         way = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
-        clearance = self.barrier.clearance(contacts, start) if self.barrier and contacts else 0.0
-        if 2 * way < self.comm.bcast(clearance):
+        if 2 * way < self.law.distance and 2 * way < self._clearance(q, begin):
             return 1.0
-        candidates = None
-        if bound >= pairs.apart:
+        sets = self._around
+        if not self.is_narrow:
             # pairs that serve at its end alone say nothing of what is passed on the way there
             serving = self.near.serving(start, start + moved)
             if not serving and way > PIECE * self.near.edge:
                 return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
-            candidates = (serving or self.near.look(q, begin, LEAST * self.near.edge, moved)).candidates
-        return float(self.comm.bcast(self.barrier.free_share(start, moved, candidates) if self.barrier else 1.0))
+            sets = (serving or self.near.look(q, begin, LEAST * self.near.edge, moved)).sets
+        return float(self.comm.bcast(self.barrier.free_share(start, moved, sets) if self.barrier else 1.0))
+
+    def _clearance(self, q: Positions, time: float) -> float:
+        """Return the least distance [m] of any pair at q and a time [s], but no more than dhat."""
+        moment, clearance = self.find(q, time, with_points=True), 0.0
+        if self.barrier:
+            sets = self._around if self.is_narrow else self.barrier.creases
+            clearance = self.barrier.clearance(moment.contacts, sets, moment.points)
+        return float(self.comm.bcast(clearance))
 
 
 def farthest(moved: Rows) -> float:

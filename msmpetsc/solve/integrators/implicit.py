@@ -38,6 +38,7 @@ from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
+LEFT_OUT = 1e-4  # of the energy that the error allowed is worth: what stores less moves x by a hundredth of that
 
 
 @dataclass
@@ -47,14 +48,14 @@ class ContactFaces:
     They are settled before the step is solved, by the way to y. Where the way to x shows others,
     the step is solved again; from then on a node that has a face keeps it, so that this ends.
 
-    Where the surface touches nothing the step is solved without it, and again with it where the way to x shows that
-    it does: so it is looked at once, and not for each iterate.
+    The surface is asked about around its contacts alone where the step begins, if these are few; where there are none,
+    not at all. Where the way to x or x shows others, the step is solved again: so all of it is looked at once, and not
+    for each iterate.
 
     q, y       : (l, 3) [m], as a StepProblem has them
     q_before   : (l, 3) [m] one step before q, of a step that looks so far back
     sides      : (o, l) faces of the problem to solve; once settled, those of the step
     is_settled : the problem solved last was the right one
-    apart      : the surface is taken to touch nothing
     """
 
     environment: Environment
@@ -74,7 +75,7 @@ class ContactFaces:
         self.end: Positions | None = None  # of a solve whose friction went by a push far from the one there
         self.sides = self._crossed(self.y)
         with CONTACT:
-            self.apart = self.environment.begin_contacts(self.q, self.time, self.time_step)
+            self.environment.begin_contacts(self.q, self.time, self.time_step)
 
     def _crossed(self, end: Positions) -> Indices:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
@@ -85,28 +86,30 @@ class ContactFaces:
         """Return the problem of the step with the faces as they are known now."""
         environment, time = self.environment, self.time
         before, step = self.q_before, self.time_step
-        self.contact = environment.contact(self.q, before, time, step, self.sides, self.end, self.apart)
+        self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
         return StepProblem(self.q, self.y, environment.load(time), self.contact, environment.prescribed(self.q, time))
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the solution by ``step`` of the problem with the right faces. Raises StepFailed."""
+        contacts = self.environment.contacts
         while not self.is_settled:
             try:
                 result = step(self.problem())
             except StepFailed:
-                if not self.apart:
+                if not (contacts and contacts.is_narrow):
                     raise
-                self.apart = False
+                contacts.widen()
             else:
-                self.compare(result.position)
+                self.compare(result.position, LEFT_OUT * result.slack)
         return result
 
-    def compare(self, x: Positions) -> None:
-        """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
+    def compare(self, x: Positions, left_out: float) -> None:
+        """Update the faces from the solution x (l, 3) [m], at which pairs of the surface may be left out that store no
+        more than ``left_out`` [J]. Raises StepFailed where none settle."""
         crossed, pressing = self._crossed(x), self.environment.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1
-        environment = self.environment
+        environment, contacts = self.environment, self.environment.contacts
         self.is_settled = not environment.has_sides or environment.same_push(x, self.time, self.sides, sides)
         if not self.is_settled:
             self.sides = sides
@@ -117,16 +120,18 @@ class ContactFaces:
                     "contact",
                 )
             return
-        if self.apart:
+        is_narrow = contacts and contacts.is_narrow
+        if contacts and is_narrow:
             with CONTACT:
-                free, touches = environment.after_way(self.q, x)
-            if touches or not free:
+                free, self.is_settled = contacts.after_way(self.q, x, left_out)
+            if not self.is_settled:
                 self.start = x if free else None
-                self.apart = self.is_settled = False
                 return
         if self.end is None and environment.friction_lags(x, self.contact):
             self.end = self.start = x
             self.is_settled = False
+            if contacts and is_narrow:
+                contacts.narrow(x, self.time)
             return
         if environment.penalties:  # what reflects goes by the way to x alone
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]

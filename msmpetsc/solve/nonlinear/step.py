@@ -56,6 +56,8 @@ class StepResult:
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
     problem    : that was solved, of F = M (x - y) + tau^2 (grad E - f_ext); None of explicit steps. Statics have no M
+    slack      : energy [J]: as far as g is convex, x is within the error asked for where g / tau^2 is no more above its
+        least
     viscous    : forces of viscosity (owned, 3) [N]; its work is what it took in of this rank's cells [J]
     """
 
@@ -68,6 +70,7 @@ class StepResult:
     static: bool = False  # a state of equilibrium, not a motion
     time_error: float = np.nan
     problem: StepProblem | None = None
+    slack: float = 0.0
     tau: float = np.inf  # [s]
     viscous: Rows | None = None
     viscous_work: float = 0.0
@@ -202,7 +205,8 @@ class Stepper:
             self.first_guess.learn(q)
             error = self.control.rounding.added_to(verdict.error, self.functional.distance(q), outcome.at_rounding)
             cost = replace(self.work_so_far() - before, step_error=error)
-            return StepResult(q, problem.q, cost, problem=problem)
+            slack = 0.5 * (self.control.target * self.functional.distance(q)) ** 2 / self.functional.t2
+            return StepResult(q, problem.q, cost, problem=problem, slack=slack)
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:
         self.functional.begin(problem)

@@ -3,7 +3,8 @@
 Pairs of its parts that may meet are looked for around positions, and again where a point has moved farther than was
 allowed for then; a common translation is no such move. Where none of them can come near, positions of nodes tell that
 without a single point's being computed; elsewhere points tell, for light nodes around a body swing much farther. Pairs
-outlive a step (``NearPairs``); contacts at positions are known for as long as it lasts (``Contacts``).
+outlive a step (``NearPairs``); contacts at positions are known for as long as it lasts (``Contacts``). Where few points
+touch, a step asks for the pairs around these alone, and for all of them once, where it has come to.
 """
 
 from dataclasses import dataclass
@@ -22,9 +23,8 @@ REMEMBERED = 3  # positions whose contacts are kept, and pairs: where a line sea
 FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are 4 times the pairs
 LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
 AHEAD = 2.0  # times the move of a step in which nothing touched
-FEW = 0.01  # of all points, in contact: TODO
-
-SAME = 1e-9  # of the energy of contacts
+FEW = 0.01  # of all points: where more touch, to solve once more costs as much as to look for all pairs each time
+SAME = 1e-9  # of the energy of contacts, that two sums of it may differ by
 TINY = np.finfo(float).tiny
 
 
@@ -159,8 +159,8 @@ class Contacts:
     get there first.
 
     before    : contacts of the step before, whose end is known
-    is_narrow : pairs alone are asked for that are around those in contact somewhere; without any the surface is
-        ``apart``: it need not be asked for
+    is_narrow : those pairs alone are asked for that are around some contacts
+    apart     : and there are no contacts: the surface need not be asked for
     """
 
     def __init__(self, near: NearPairs, begin: float, time: float, before: "Contacts | None" = None):
@@ -168,8 +168,8 @@ class Contacts:
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
         self.is_narrow = self.apart = False
-        self._around: PairSets = ()  # on rank 0, and the points (p,) in contact that these are around
-        self._touched: Mask | None = None
+        self._around: PairSets = ()  # on rank 0
+        self._touched: Mask | None = None  # (p,) the points that these are around
         self._moments: list[ContactsAt] = before._moments if before and not before.is_narrow else []
         # q, time and points of some positions
         self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
@@ -200,8 +200,8 @@ class Contacts:
         return self._moments[0]
 
     def narrow(self, q: Positions, time: float) -> bool:
-        """Ask from now on for the pairs alone that are around contacts at q and a time [s], and where it was narrow
-        before; return False, and ask for all, where that is too much of the surface."""
+        """Ask from now on for the pairs alone that are around contacts at q and a time [s], and around those before, or
+        for all if these touch at too many points; return which."""
         moment, touched = self.find(q, time), None
         if self.barrier and moment.count:
             touched = self.barrier.gradient(moment.contacts, moment.points).any(axis=1)
@@ -221,7 +221,7 @@ class Contacts:
         """Return whether the way of a narrow step from q to x is free, and x right: other pairs store no more than
         ``left_out`` [J] there.
 
-        All pairs are asked for from then on; but where x is not right and the way is free, those around x too.
+        From then on all pairs are asked for; where the way is free and x is not right, still those around contacts.
         """
         known = Touch() if self.apart else self.touch(x, self.time)
         self.widen()

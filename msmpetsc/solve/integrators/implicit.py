@@ -38,6 +38,7 @@ from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
+MOST_NARROW = 3  # solves of a step that are asked for the pairs around contacts alone
 LEFT_OUT = 1e-4  # of the energy that the error allowed is worth: what stores less moves x by a hundredth of that
 
 
@@ -120,18 +121,20 @@ class ContactFaces:
                     "contact",
                 )
             return
-        is_narrow = contacts and contacts.is_narrow
-        if contacts and is_narrow:
+        narrow = contacts if contacts and contacts.is_narrow else None
+        if narrow:
             with CONTACT:
-                free, self.is_settled = contacts.after_way(self.q, x, left_out)
+                free, self.is_settled = narrow.after_way(self.q, x, left_out)
             if not self.is_settled:
                 self.start = x if free else None
+                if self.solves >= MOST_NARROW:
+                    narrow.widen()
                 return
         if self.end is None and environment.friction_lags(x, self.contact):
             self.end = self.start = x
             self.is_settled = False
-            if contacts and is_narrow:
-                contacts.narrow(x, self.time)
+            if narrow:
+                narrow.narrow(x, self.time)
             return
         if environment.penalties:  # what reflects goes by the way to x alone
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]

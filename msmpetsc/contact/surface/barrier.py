@@ -94,7 +94,7 @@ class Barrier:
             self.mesh.can_collide = self.mesh.can_collide & self.ipctk.make_sparse_filter(pairs, True)
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
         self.creases += tuple(sets.values())
-        for crease in self.creases[1:]:
+        for crease in sets.values():
             kinds, parts = (crease.fv_candidates, crease.ee_candidates), (self.mesh.edges, self.mesh.faces)
             of = [np.array([pair.vertex_ids(*parts) for pair in kind], int).reshape(-1, 4) for kind in kinds]
             self._creased.append(list(zip(kinds, of, strict=True)))

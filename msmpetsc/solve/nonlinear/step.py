@@ -203,9 +203,10 @@ class Stepper:
                 verdict = self.examine(outcome)
             q = self.functional.positions(self.x)
             self.first_guess.learn(q)
-            error = self.control.rounding.added_to(verdict.error, self.functional.distance(q), outcome.at_rounding)
+            distance = self.functional.distance(q)
+            error = self.control.rounding.added_to(verdict.error, distance, outcome.at_rounding)
             cost = replace(self.work_so_far() - before, step_error=error)
-            slack = 0.5 * (self.control.target * self.functional.distance(q)) ** 2 / self.functional.t2
+            slack = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
             return StepResult(q, problem.q, cost, problem=problem, slack=slack)
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:

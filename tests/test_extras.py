@@ -111,6 +111,7 @@ BEAM = ROOT / "scenes" / "studies" / "atlas" / "beam.toml"
 NEEDED = {  # a package that is missing -> the extra that brings it, and a command that needs it
     **{name: ("run", ["run", BEAM, "-o", "y.h5"]) for name in ("mpi4py", "petsc4py", "numba", "trimesh")},
     "pydantic": ("render", ["render", "x.h5"]),
+    "scipy": ("render", ["series", "x.h5"]),
     "pyvista": ("render", ["render", "x.h5", "-o", "x.png"]),
     "manifold3d": ("mesh", ["run", BEAM, "-o", "y.h5", "--set", 'mesh.prepare=["union"]']),
     "ipctk": ("contact", ["run", BEAM, "-o", "y.h5", "--set", "self_contact.distance=1e-3"]),

@@ -26,7 +26,7 @@ from msmpetsc.app.ranks import world
 from msmpetsc.cli.command_table import COMMANDS, SAID, Shown
 from msmpetsc.errors import InputError, MsmpetscError, did_you_mean, printable
 
-DRAWING = ("render", "export", "compare")  # which the extra "render" is enough for
+READING = ("render", "export", "compare", "series")  # the extra "render" is enough for these
 OUR_SHORT = ("-o", "-h")
 
 
@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
         with ending_together(comm):
             args = parsed(words)  # --help and --version leave from here
             comm = world(started=args.command == "run")  # the other commands are for one process
-        extra = "render" if args.command in DRAWING else "run"
+        extra = "render" if args.command in READING else "run"
         level = logging.WARNING if args.quiet else logging.INFO
         with logged_on_root(comm, level, args.verbose), ending_together(comm, extra):
             return carry_out(args, comm.size)

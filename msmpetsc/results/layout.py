@@ -22,11 +22,12 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import InputError
-from msmpetsc.fields import FIELDS, FRAME_FIELDS, RANKS_SHARE, unit_of
+from msmpetsc.fields import DIMENSIONS, FIELDS, FRAME_FIELDS, LABELS, RANKS_SHARE, unit_of
 from msmpetsc.results.disk import Storage
 
 CHUNK_BYTES = 64 * 2**20
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
+LENGTH_ALONE = "This is a netCDF dimension but not a netCDF variable."  # netCDF-4's name of a scale without coordinates
 
 
 def open_to_write(storage: Storage, mode: str) -> h5py.File:
@@ -100,6 +101,8 @@ class Layout:
             file.create_group(name)
         for plan in self.plans():
             _plan_dataset(file, plan)
+            if plan.name.startswith("frames/"):
+                _name_axes(file["frames"], plan.name.removeprefix("frames/"))
         file["frames/time"][...] = np.nan
         file["checkpoint/step"][...] = -1
         if self.numbers:
@@ -136,7 +139,23 @@ def _plan_dataset(file: h5py.File, plan: Plan) -> None:
     space = h5py.h5s.create_simple(plan.shape, plan.shape)
     kind = h5py.h5t.py_create(np.dtype(plan.dtype))
     h5py.h5d.create(file.id, plan.name.encode(), kind, space, dcpl)
-    file[plan.name].attrs["unit"] = unit_of(plan.name)
+    file[plan.name].attrs["units"] = unit_of(plan.name)
+
+
+def _name_axes(frames: h5py.Group, name: str) -> None:
+    """Attach the HDF5 dimension scales to the axes of a dataset of frames, by which netCDF's readers name them."""
+    for axis, (symbol, size) in enumerate(zip(FRAME_FIELDS[name].shape, frames[name].shape, strict=True)):
+        dimension = DIMENSIONS[symbol]
+        if dimension == name:
+            frames[name].make_scale(name)
+            continue
+        if dimension in LABELS and dimension not in frames:
+            frames.create_dataset(dimension, data=LABELS[dimension], dtype=h5py.string_dtype())
+            frames[dimension].make_scale(dimension)
+        elif dimension not in frames:
+            # never written, so that it takes no room
+            frames.create_dataset(dimension, (size,), ">f4").make_scale(f"{LENGTH_ALONE}{size:10}")
+        frames[name].dims[axis].attach_scale(frames[dimension])
 
 
 def pieces(rows: Array, counts: Sequence[int]) -> Iterator[tuple[int, slice, slice]]:

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Indices, Positions
-from msmpetsc.errors import InputError, one_line, printable
+from msmpetsc.errors import InputError, missing_package, one_line, printable
 from msmpetsc.fields import FIELDS
 from msmpetsc.results.disk import refuse_no_file
 from msmpetsc.scene.toml import toml_of
@@ -56,7 +56,7 @@ class LazyArray:
         self.planned: tuple[int, ...] = dataset.shape
         self.shape: tuple[int, ...] = (len(dataset) if count is None else count, *dataset.shape[1:])
         self.dtype = dataset.dtype
-        unit = dataset.attrs.get("unit", "1")
+        unit = dataset.attrs.get("units", dataset.attrs.get("unit", "1"))  # version 0.2 and earlier wrote "unit"
         self.unit = unit if isinstance(unit, str) else "1"
 
     @property
@@ -115,6 +115,13 @@ class Arrays(dict[str, LazyArray]):
         return "\n".join([self._group, *map("  {!r}".format, self.values())])
 
 
+class Frames(Arrays):
+    """The arrays of frames by their names; its length is the number of finished frames."""
+
+    def __len__(self) -> int:
+        return len(self["time"])
+
+
 class Result:
     """A result file opened for reading, also while it is written: then up to the frames finished by now.
 
@@ -138,12 +145,14 @@ class Result:
             self.close()
             raise
         self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
-        self.frames = self._group("frames")
+        self.frames = Frames("frames", self._arrays("frames"))
 
     def _group(self, group: str) -> Arrays:
+        return Arrays(group, self._arrays(group))
+
+    def _arrays(self, group: str) -> dict[str, LazyArray]:
         start = f"{group}/"
-        arrays = {name.removeprefix(start): array for name, array in self._datasets.items() if name.startswith(start)}
-        return Arrays(group, arrays)
+        return {name.removeprefix(start): array for name, array in self._datasets.items() if name.startswith(start)}
 
     def __enter__(self) -> "Result":
         return self
@@ -158,7 +167,7 @@ class Result:
     def __repr__(self) -> str:
         if not self.file:
             return f"<closed {self.path}>"
-        counts = f"{len(self.frames.time)} frames of {len(self.lattice.nodes)} nodes"
+        counts = f"{len(self.frames)} frames of {len(self.lattice.nodes)} nodes"
         return f"<{self.path}: {counts}, {self.attributes.get('command', 'no command')}>"
 
     def __contains__(self, name: str) -> bool:
@@ -198,9 +207,14 @@ class Result:
 
     @cached_property
     def embedding(self) -> "csr_array | None":
-        """W (v, n): surface points = W @ positions; None where a scene has output.surface = false."""
-        from scipy.sparse import csr_array
+        """W (v, n): surface points = W @ positions; None where a scene has output.surface = false.
 
+        Raises InputError if scipy is not installed, or the file's numbers make no matrix.
+        """
+        try:
+            from scipy.sparse import csr_array
+        except ModuleNotFoundError as error:
+            raise missing_package("scipy", "render") from error
         if not self._embedding:
             return None
         parts = [self[f"embedding/{name}"][:] for name in ("weights", "indices", "indptr")]
@@ -230,8 +244,12 @@ def open_result(path: str | Path) -> h5py.File:
         path.open("rb").close()  # is_hdf5 does not tell why it cannot read
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is not an HDF5 file")
-        # No lock, no cache: it may be written just now. What is read is what stands in the file.
-        file = h5py.File(path, "r", locking=False, rdcc_nbytes=0)
+        # No cache: it may be written just now. What is read is what stands in the file.
+        try:
+            # by default as other readers: HDF5 opens a file but once in a process, with the same locking
+            file = h5py.File(path, "r", rdcc_nbytes=0)
+        except OSError:  # a file system without locks, or a lock of another process
+            file = h5py.File(path, "r", rdcc_nbytes=0, locking=False)
     try:
         with plain_damage(path):
             _check_is_result(path, file)

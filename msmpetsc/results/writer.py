@@ -120,7 +120,7 @@ class ResultFile:
                 if stored != shape:
                     raise InputError(f"{self.path} is damaged: {name} has shape {stored}")
             elif self._file is not None:
-                self._file.create_dataset(name, shape, dtype).attrs["unit"] = unit_of(name)
+                self._file.create_dataset(name, shape, dtype).attrs["units"] = unit_of(name)
         if self._begin is not Begin.IN_PLACE:
             self._collect(rows, dtype, counts, name)
 
@@ -276,8 +276,8 @@ class ResultFile:
             return
         with self._opened, file:
             if trim and self.finished < self._planned:
-                for dataset in file["frames"].values():
-                    dataset.resize(self.finished, axis=0)
+                for name in FRAME_FIELDS.keys() & file["frames"].keys():
+                    file["frames"][name].resize(self.finished, axis=0)
 
     # What the ranks do together
 

@@ -1,11 +1,13 @@
 """msmpetsc.open: what is in the file comes out, of running and of old files too; a bad file ends in one line."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import small_result
 from mpi4py import MPI
 from small_result import DT, FRAMES, NODES, POINTS, frame, position
 
@@ -30,6 +32,7 @@ def test_what_was_written_is_read(bar_result: Path):
         assert run.surface.triangles[1, 2] == 3
         assert np.allclose(run.embedding @ np.ones(len(NODES)), 1) and run.embedding.shape == (len(POINTS), len(NODES))
         assert "5 frames of 12 nodes" in repr(run) and "elastic" in dir(run.frames)
+        assert len(run.frames) == FRAMES and {"time", "position"} < set(run.frames)
     with pytest.raises(InputError, match="is closed"):
         run.frames.kinetic[0]
 
@@ -68,18 +71,65 @@ def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
             file.append(frame(index))
         with msmpetsc.open(tmp_path / "x.h5") as run:
             file.append(frame(3))
-            assert len(run.frames.time) == len(run.frames.kinetic) == len(list(run.frames.position)) == 3
+            assert len(run.frames) == len(run.frames.time) == len(list(run.frames.position)) == 3
             assert np.array_equal(run.frames.position[-1], position(2)) and np.isfinite(run.frames.time).all()
+
+
+DIMENSIONS = {
+    "kinetic": ("time",),
+    "momentum": ("time", "axis"),
+    "position": ("time", "node", "axis"),
+    "surface": ("time", "point", "axis"),
+    "stress": ("time", "node", "component"),
+    "cell_von_mises": ("time", "cell"),
+}
+
+
+def test_axes_of_frames_have_names_and_coordinates(tmp_path: Path):
+    stress = {"stress": np.ones((len(NODES), 6)), "cell_von_mises": np.ones(2)}
+    with h5py.File(small_result.write(tmp_path / "x.h5", [frame(k, **stress) for k in range(3)])) as file:
+        frames = file["frames"]
+        for name, dimensions in DIMENSIONS.items():
+            assert tuple(axis[0].name.removeprefix("/frames/") for axis in frames[name].dims) == dimensions
+        assert frames["axis"].asstr()[:].tolist() == ["x", "y", "z"]
+        assert frames["component"].asstr()[:].tolist() == ["xx", "yy", "zz", "xy", "yz", "xz"]
+        assert frames["node"].id.get_storage_size() == 0
+
+
+@pytest.mark.parametrize("ours_first", [True, False])
+def test_a_result_opens_beside_another_reader_of_the_process(bar_result: Path, ours_first: bool):
+    openers = [msmpetsc.open, h5py.File]
+    first, second = (opener(bar_result) for opener in (openers if ours_first else openers[::-1]))
+    with first, second:
+        assert len(first["frames/time"]) == len(second["frames/time"]) == FRAMES
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
+def test_xarray_has_names_coordinates_and_units(bar_result: Path, engine: str):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
+    with msmpetsc.open(bar_result) as run, xarray.open_dataset(bar_result, group="frames", engine=engine) as frames:
+        assert frames.position.dims == DIMENSIONS["position"] and set(frames.coords) == {"time", "axis"}
+        height = frames.position.sel(axis="z").sel(time=2 * DT, method="nearest")
+        assert np.array_equal(height, run.frames.position[2][:, 2])
+        assert frames.kinetic.attrs["units"] == "J" and frames.time.attrs["units"] == "s"
+
+
+def test_the_embedding_names_the_extra_that_it_needs(bar_result: Path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy.sparse", None)
+    with msmpetsc.open(bar_result) as run, pytest.raises(InputError, match=r"scipy .* 'msmpetsc\[render\]' brings it"):
+        _ = run.embedding
 
 
 def test_a_file_of_an_older_version_is_read_without_what_it_lacks(copy: Path):
     with h5py.File(copy, "r+") as file:
+        file["frames/kinetic"].attrs["unit"] = file["frames/kinetic"].attrs.pop("units")
         for name in ("contact", "true_error", "surface"):
             del file["frames"][name]
         for name in ("lattice/pinned", "embedding", "surface", "checkpoint"):
             del file[name]
     with msmpetsc.open(copy) as run:
-        assert "contact" not in run.frames and "points" not in run.surface
+        assert "contact" not in run.frames and "points" not in run.surface and run.frames.kinetic.unit == "J"
         assert run.embedding is None
         with pytest.raises(AttributeError, match="no frames/contact in this file, but time, position"):
             _ = run.frames.contact

@@ -25,7 +25,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile, write_model
-from msmpetsc.results.xdmf import write_xdmf
+from msmpetsc.results.xdmf import GrowingXdmf, write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import event_times
@@ -99,6 +99,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
                 numbers = count(start_output(comm, plan, file, model, simulation))
                 checkpoints = Checkpoints(comm, file, simulation, plan.request.checkpoint_every)
+                xdmf = GrowingXdmf(plan.request.path)
                 is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:
@@ -108,6 +109,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                         with cost.of_output():
                             if frame is not None and next(numbers) >= file.finished:  # a run that goes on has some
                                 file.append(frame)
+                                on_root(comm, xdmf.update)
                             stops = checkpoints.after_step(frame is not None)
                             if frame is not None:
                                 for see in observers:

@@ -1,90 +1,145 @@
 """The XDMF 3 file of a result, which lets ParaView open the frames and holds no data itself."""
 
-import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
+from time import perf_counter
+from xml.sax.saxutils import escape
 
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats
 from msmpetsc.fields import FRAME_FIELDS, STRESS
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
+SHARE = 0.05  # of a run's time that its XDMF file may take before the end
+# Length of the difference of two vectors, whose x, y and z are the arguments in pairs. VTK's
+# functions know no other name of the root, and no exponents in numbers.
+LENGTH = "sqrt(($0 - $1) * ($0 - $1) + ($2 - $3) * ($2 - $3) + ($4 - $5) * ($4 - $5))"
+HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0"><Domain>'
+
+
+class GrowingXdmf:
+    """The XDMF file beside a result that is being written."""
+
+    def __init__(self, h5_path: Path):
+        self._path, self._due = h5_path, 0.0
+
+    def update(self) -> None:
+        """Write the file for the frames finished by now, if it is due. Raises InputError."""
+        began = perf_counter()
+        if began >= self._due:
+            write_xdmf(self._path)
+            ended = perf_counter()
+            self._due = ended + (ended - began) / SHARE
 
 
 def write_xdmf(h5_path: str | Path) -> Path:
-    """Write x.xdmf beside x.h5 once that is closed, and return its path. Raises InputError.
+    """Write x.xdmf beside x.h5 for its finished frames, and return its path. Raises InputError.
 
-    Two temporal collections: the surface triangles, where the surface was stored, and the lattice
-    cells with their stress, where that was.
+    Two temporal collections: the surface triangles, if the surface was stored, and the lattice
+    cells with their stress, if that was. Both have displacement, velocity and speed.
     """
     h5_path = Path(h5_path)
-    root = ET.Element("Xdmf", Version="3.0")
-    domain = ET.SubElement(root, "Domain")
     with Result(h5_path) as run:
-        if "frames/surface" in run:
-            _collection(domain, "surface", "Triangle", run, "surface/triangles", "frames/surface")
-        grids = _collection(domain, "lattice", "Hexahedron", run, "lattice/cells", "frames/position")
-        for grid in grids:
-            kind = ET.SubElement(grid, "Attribute", Name="cell_kind", AttributeType="Scalar", Center="Cell")
-            kind.append(_data_item(run, "lattice/cell_kind"))
-        for name in filter(run.frames.__contains__, STRESS):
-            centre = "Cell" if "c" in FRAME_FIELDS[name].shape else "Node"
-            is_tensor = run.frames[name].ndim == 3  # as two vectors: XDMF's readers differ in the order of a tensor
-            parts = {f"{name}_normal": 0, f"{name}_shear": 3} if is_tensor else {name: None}
-            for index, grid in enumerate(grids):
-                for part, first in parts.items():
-                    sort = "Vector" if is_tensor else "Scalar"
-                    field = ET.SubElement(grid, "Attribute", Name=part, AttributeType=sort, Center=centre)
-                    field.append(_frame_slab(run, f"frames/{name}", index, first))
-    ET.indent(root)
+        grids: list[str] = []
+        if "surface" in run.frames:
+            grids += _collection(run, "surface", "Triangle", "surface/triangles", "surface")
+        grids += _collection(run, "lattice", "Hexahedron", "lattice/cells", "position")
     path = h5_path.with_suffix(".xdmf")
-    write_whole(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
+    text = "\n".join([HEAD, *grids, "</Domain></Xdmf>\n"])
+    write_whole(path, text.encode(errors="xmlcharrefreplace"))
     return path
 
 
-def _collection(domain: ET.Element, name: str, kind: str, run: Result, elements: str, points: str) -> list[ET.Element]:
-    """Add a grid for each finished frame, of topology `kind` on `points` (T, n, 3). Return the grids."""
-    collection = ET.SubElement(domain, "Grid", Name=name, GridType="Collection", CollectionType="Temporal")
-    grids = []
-    for index, time in enumerate(run.frames.time[:]):
-        grid = ET.SubElement(collection, "Grid", Name=f"{name} {index}", GridType="Uniform")
-        ET.SubElement(grid, "Time", Value=repr(float(time)))
-        topology = ET.SubElement(grid, "Topology", TopologyType=kind, NumberOfElements=str(len(run[elements])))
-        topology.append(_data_item(run, elements))
-        geometry = ET.SubElement(grid, "Geometry", GeometryType="XYZ")
-        geometry.append(_frame_slab(run, points, index))
-        if f"{name}/body" in run:
-            body = ET.SubElement(grid, "Attribute", Name="body", AttributeType="Scalar", Center="Node")
-            body.append(_data_item(run, f"{name}/body"))
-        grids.append(grid)
-    return grids
+def _collection(run: Result, name: str, kind: str, elements: str, points: str) -> Iterator[str]:
+    """Yield the lines of a grid for each finished frame, of topology ``kind`` on a field of points."""
+    yield f'<Grid Name="{name}" GridType="Collection" CollectionType="Temporal">'
+    topology = f'<Topology TopologyType="{kind}" NumberOfElements="{len(run[elements])}">'
+    topology += f"{_data(run, elements)}</Topology>"
+    times = run.frames.time[:]
+    centres = {"lattice/cell_kind": "Cell", f"{name}/body": "Node"}
+    same = [
+        _attribute(of.partition("/")[2], "Scalar", centre, _data(run, of))
+        for of, centre in centres.items()
+        if of.startswith(name) and of in run
+    ]
+    for index, time in enumerate(times):
+        yield f'<Grid Name="{name} {index}" GridType="Uniform">'
+        yield f'<Time Value="{float(time)!r}"/>'
+        yield topology
+        yield f'<Geometry GeometryType="XYZ">{_slab(run, points, index)}</Geometry>'
+        yield from same
+        yield from _motion(run, points, index, times)
+        if name == "lattice":
+            yield from _stress(run, index)
+        yield "</Grid>"
+    yield "</Grid>"
 
 
-def _frame_slab(run: Result, name: str, index: int, first: int | None = 0) -> ET.Element:
-    """Return a reference to frame `index` of a dataset: (T, r, k) from column ``first`` on, or (T, r) with None.
+def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str]:
+    """Yield the attributes of a frame that are differences of positions, which readers compute.
 
-    It is start, stride, count, and the dataset.
+    Velocity is that from the frame before to the frame after, as far as these are there.
     """
-    rows = run[name].shape[1]
-    columns, start = (f" {rows}", f"{index} 0") if first is None else (f" {rows} 3", f"{index} 0 {first}")
-    axes = len(columns.split())
-    item = ET.Element("DataItem", ItemType="HyperSlab", Dimensions=columns.strip(), Type="HyperSlab")
-    # VTK takes the first thing in it for its name, and caches by that
-    item.append(ET.Comment(f"frame {index} of {name}, {first}"))
-    part = ET.SubElement(item, "DataItem", Dimensions=f"3 {1 + axes}", Format="XML")
-    part.text = f"{start}  1{' 1' * axes}  1{columns}"
-    item.append(_data_item(run, name))
-    return item
+    rows, at_rest = run.frames[points].shape[1], _data(run, FRAME_FIELDS[points].at_rest)
+    moved = _function("$0 - $1", f"{rows} 3", [_slab(run, points, index), at_rest])
+    before, after = max(index - 1, 0), min(index + 1, len(times) - 1)
+    passed = float(times[after] - times[before])
+    rate = np.format_float_positional(1 / passed if passed else 0.0, trim="0")
+    ends = [_slab(run, points, end) for end in (after, before)]
+    columns = [_slab(run, points, end, axis, 1) for axis in range(3) for end in (after, before)]
+    velocity = _function(f"($0 - $1) * {rate}", f"{rows} 3", ends)
+    speed = _function(f"{LENGTH} * {rate}", f"{rows} 1", columns)
+    yield _attribute("displacement", "Vector", "Node", moved)
+    yield _attribute("velocity", "Vector", "Node", velocity)
+    yield _attribute("speed", "Scalar", "Node", speed)
 
 
-def _data_item(run: Result, name: str) -> ET.Element:
-    """Return a reference to a whole dataset by the file's name alone, so that both files can move together."""
-    array = run[name]
-    item = ET.Element(
-        "DataItem",
-        Format="HDF",
-        NumberType=NUMBER_TYPES[array.dtype.kind],
-        Precision=str(array.dtype.itemsize),
-        Dimensions=" ".join(map(str, array.planned)),
+def _stress(run: Result, index: int) -> Iterator[str]:
+    """Yield the attributes of a frame's stress.
+
+    A tensor is two vectors, since XDMF's readers differ in the order of its components.
+    """
+    for name in filter(run.frames.__contains__, STRESS):
+        centre = "Cell" if "c" in FRAME_FIELDS[name].shape else "Node"
+        if run.frames[name].ndim == 3:
+            for part, first in (("normal", 0), ("shear", 3)):
+                yield _attribute(f"{name}_{part}", "Vector", centre, _slab(run, name, index, first))
+        else:
+            yield _attribute(name, "Scalar", centre, _slab(run, name, index, 0, 0))
+
+
+def _attribute(name: str, sort: str, centre: str, item: str) -> str:
+    return f'<Attribute Name="{name}" AttributeType="{sort}" Center="{centre}">{item}</Attribute>'
+
+
+def _function(formula: str, size: str, arguments: list[str]) -> str:
+    head = f'<DataItem ItemType="Function" Function="{formula}" Dimensions="{size}">'
+    return "".join([head, *arguments, "</DataItem>"])
+
+
+def _slab(run: Result, name: str, index: int, first: int = 0, columns: int = 3) -> str:
+    """Return a reference to so many columns, from ``first`` on, of frame ``index`` of a field.
+
+    columns : 0 for a field (T, r) that has none
+
+    It is start, stride, count, and the dataset. VTK takes the comment for its name, and caches by it.
+    """
+    size, more = f"{run.frames[name].shape[1]}" + f" {columns}" * bool(columns), columns > 0
+    select = f"{index} 0{f' {first}' * more} 1 1{' 1' * more} 1 {size}"
+    return (
+        f'<DataItem ItemType="HyperSlab" Dimensions="{size}" Type="HyperSlab">'
+        f"<!-- {index}, {first} {columns} of {name} -->"
+        f'<DataItem Dimensions="3 {2 + more}" Format="XML">{select}</DataItem>'
+        f"{_data(run, f'frames/{name}')}</DataItem>"
     )
-    item.text = f"{run.path.name}:/{name}"
-    return item
+
+
+def _data(run: Result, name: str) -> str:
+    """Return a reference to a whole dataset by the file's name alone: both files can move together."""
+    array, place = run[name], escape(f"{run.path.name}:/{name}")
+    kind, shape = NUMBER_TYPES[array.dtype.kind], " ".join(map(str, array.planned))
+    head = f'<DataItem Format="HDF" NumberType="{kind}" Precision="{array.dtype.itemsize}"'
+    return f'{head} Dimensions="{shape}">{place}</DataItem>'

@@ -12,7 +12,7 @@ import small_result
 import trimesh
 import vtk
 from one_process import input_error
-from small_result import DT, FRAMES, NODES, POINTS, H, position
+from small_result import DT, FRAMES, NODES, POINTS, H, X, position
 from vtk.util.numpy_support import vtk_to_numpy
 
 from msmpetsc.cli.main import main
@@ -157,7 +157,12 @@ def test_the_xdmf_file_is_read_by_vtk_without_a_complaint(result: Path):
         }
         for name, expected in {"surface": surface(index), "lattice": position(index)}.items():
             assert np.allclose(vtk_to_numpy(named[name].GetPoints().GetData()), expected, atol=1e-6)
-        body = pyvista.wrap(named["lattice"])
+        body, skin = pyvista.wrap(named["lattice"]), pyvista.wrap(named["surface"])
+        assert np.allclose(body["displacement"], position(index) - NODES)
+        assert np.allclose(skin["displacement"], surface(index) - POINTS, atol=1e-6)
+        for grid, velocity in ((body, 0.1 / DT * NODES[:, [2]] * X), (skin, np.tile(0.01 / DT * X, (len(POINTS), 1)))):
+            assert np.allclose(grid["velocity"], velocity, atol=1e-4)
+            assert np.allclose(grid["speed"], np.linalg.norm(velocity, axis=1), atol=1e-4)
         assert body.n_cells == 2 and body["cell_kind"].tolist() == [1, 1] and body.volume == pytest.approx(2 * H**3)
     assert heard == []
 

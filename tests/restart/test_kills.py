@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import h5py
@@ -87,3 +88,14 @@ def test_killed_at_any_moment(tmp_path: Path, ranks: int, kills: int, steps: int
             assert_same(path, whole)
     print(at)
     assert ranks > 1 or len(set(at)) > 3  # spread over the frames: fewer where other work holds up the start
+
+
+def test_a_killed_run_leaves_its_xdmf_file(tmp_path: Path):
+    path = tmp_path / "x.h5"
+    command = [sys.executable, "-m", "msmpetsc", "run", hanging(tmp_path, 2000), "-o", path]
+    with subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as process:
+        assert any(line.startswith("frame 1") for line in process.stderr)
+        process.kill()
+    with h5py.File(path) as file:
+        grids = ET.parse(path.with_suffix(".xdmf")).findall(".//Time")
+        assert 1 <= len(grids) / 2 <= finished(file) < 2001

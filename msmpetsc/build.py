@@ -237,7 +237,8 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
             raise InputError(f"{whose}{error}") from error
         for warning in warnings:
             log.warning("%s%s: %s", whose, mesh.source, warning)
-        yield compact(surface.points, surface.triangles), report  # such a point may lie in no cell
+        # an unused point may lie in no cell
+        yield replace(compact(surface.points, surface.triangles), groups=surface.groups), report
 
 
 def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:

@@ -7,6 +7,7 @@ import hashlib
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,7 +40,7 @@ def prepare(
     size: float | None = None,
     base: Sequence[float] | None = None,
 ) -> Surface:
-    """Return the surface after the steps, then scaled, then moved.
+    """Return the surface after the steps, then scaled, then moved, with its groups where they lie.
 
     steps : each the name of a step, or {name: value} for one that takes a value (see STEPS)
     size  : longest side of the bounding box [m]; scaled about the origin
@@ -54,11 +55,13 @@ def prepare(
         low, high = bounds_of(compact(surface.points, surface.triangles))
         if (high - low).max() == 0:
             raise InputError("prepare: a mesh without extent cannot be given a size")
-        surface = Surface(surface.points * (size / (high - low).max()), surface.triangles)
+        factor = size / (high - low).max()
+        surface = surface.moved(lambda points: points * factor)
     if base is not None:
         low, high = bounds_of(compact(surface.points, surface.triangles))
         foot = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
-        surface = Surface(surface.points + (np.asarray(base, float) - foot), surface.triangles)
+        way = np.asarray(base, float) - foot
+        surface = surface.moved(lambda points: points + way)
     return surface
 
 
@@ -193,7 +196,7 @@ def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
 
     axis = np.asarray(turn["axis"], float)
     rotation = Rotation.from_rotvec(np.deg2rad(turn["degrees"]) * axis / np.linalg.norm(axis))
-    return Surface(rotation.apply(surface.points), surface.triangles)
+    return surface.moved(rotation.apply)
 
 
 STEPS: dict[str, Callable[..., Surface]] = {
@@ -202,7 +205,7 @@ STEPS: dict[str, Callable[..., Surface]] = {
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """Run a step; raise its failures as InputError with its name."""
+    """Run a step, which leaves groups where they lie; raise its failures as InputError with its name."""
     try:
         result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:
@@ -214,12 +217,12 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():
         raise InputError(f"prepare: '{name}' left no usable mesh")
-    return result
+    return result if result.groups else replace(result, groups=surface.groups)
 
 
 def cached(step: Callable[..., Surface], surface: Surface, *values: object) -> Surface:
     """Return the result of a step; of a large mesh it is kept in a cache on disk."""
-    if len(surface.triangles) < LARGE:
+    if len(surface.triangles) < LARGE or step is rotate:  # which moves groups, too
         return step(surface, *values)
     versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
     digest = hashlib.sha256(Path(__file__).read_bytes() + repr((step.__name__, values, versions)).encode())

@@ -3,10 +3,14 @@
 import resource
 import struct
 import warnings
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from io import BytesIO, StringIO, TextIOWrapper
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -14,20 +18,25 @@ import trimesh
 from trimesh.resolvers import FilePathResolver
 
 from msmpetsc.backend.arrays import Array, Indices, Positions
+from msmpetsc.comm import starts
 from msmpetsc.errors import InputError, one_line
-from msmpetsc.geometry.surface import Surface
+from msmpetsc.geometry.cell_meshes import MOST_LABELS, read_cells
+from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.scene.reading import lies_below
 
-Arrays = tuple[Array, Array]  # points (v, 3), faces (f, 3 or 4)
+# points (v, 3), faces (f, 3 or 4), and by name the faces of groups
+Arrays = tuple[Array, Array, Mapping[str, Array]]
+
+COLOURS = ("red", "green", "blue", "alpha")  # of a PLY's faces
 
 LEAST, MOST = 2**28, 50  # memory that reading a file may take: so many bytes, or times its own
 
 
 def read_surface(path: str | Path) -> Surface:
-    """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU or VTK as triangles, in the file's own unit.
+    """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU, VTK, MSH, INP or BDF in the file's own unit.
 
-    Polygons are cut into triangles, the parts of a GLB are joined, of tetrahedra the outer
-    surface is taken.
+    Polygons are cut into triangles, the parts of a GLB are joined, and cells that have a volume
+    give their boundary. The surface has the groups that the file names.
 
     Raises InputError, one line naming the file, if it holds no usable mesh.
     """
@@ -35,9 +44,8 @@ def read_surface(path: str | Path) -> Surface:
     kind, data = _kind(path), _content(path)
     try:
         with _silence(), _bounded_memory(max(LEAST, MOST * len(data))):
-            points, faces = _READERS[kind](path, data)
-            if faces.ndim != 2 or faces.shape[1] != 3:
-                faces = trimesh.geometry.triangulate_quads(faces)
+            points, polygons, named = _READERS[kind](path, data)
+            faces, groups = _cut(polygons), {name: _cut(own) for name, own in named.items()}
     except ModuleNotFoundError:  # a reader's package: says which extra brings it
         raise
     except MemoryError:
@@ -46,7 +54,16 @@ def read_surface(path: str | Path) -> Surface:
         reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
     _check_arrays(path, points, faces)
-    return Surface(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int64))
+    points = np.ascontiguousarray(points, np.float64)
+    marked = {name: compact(points, own) for name, own in groups.items() if len(own)}
+    return replace(compact(points, np.asarray(faces, np.int64)), groups=marked)
+
+
+def _cut(polygons: Any) -> Indices:
+    """Return polygons as triangles (f, 3)."""
+    if isinstance(polygons, np.ndarray) and polygons.ndim == 2 and polygons.shape[1] == 3:
+        return polygons
+    return np.reshape(trimesh.geometry.triangulate_quads(polygons), (-1, 3))
 
 
 def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
@@ -120,7 +137,22 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
         if len(rows) != stored.get(name, {}).get("length", 0):
             raise ValueError(f"truncated: {len(rows)} of {stored[name]['length']} {name} rows")
     faces = mesh.get("faces")
-    return mesh.get("vertices", np.zeros((0, 3))), np.zeros((0, 3)) if faces is None else faces
+    if faces is None:
+        return mesh.get("vertices", np.zeros((0, 3))), np.zeros((0, 3)), {}
+    return mesh["vertices"], faces, _labelled(faces, stored["face"]["data"])
+
+
+def _labelled(faces: Array, data: Any) -> dict[str, Array]:
+    """Return the faces (f, k) of each label of a PLY: of a whole number of faces that is no colour."""
+    names = data if isinstance(data, dict) else data.dtype.names
+    columns = {name: np.asarray(data[name]) for name in names if name not in COLOURS}
+    arrays = {name: each for name, each in columns.items() if each.dtype.kind in "iu" and each.shape == (len(faces),)}
+    groups = {}
+    for name, column in arrays.items():
+        labels = np.unique(column)
+        for label in map(int, labels[: len(labels) * (len(labels) <= MOST_LABELS)]):
+            groups[str(label) if len(arrays) == 1 else f"{name}:{label}"] = faces[column == label]
+    return groups
 
 
 def _read_mixed_ply(data: bytes) -> Arrays:
@@ -129,16 +161,18 @@ def _read_mixed_ply(data: bytes) -> Arrays:
 
     mesh = meshio.ply.read(BytesIO(data))
     polygons = [face for block in mesh.cells for face in block.data]
-    return mesh.points, trimesh.geometry.triangulate_quads(polygons)
+    return mesh.points, trimesh.geometry.triangulate_quads(polygons), {}
 
 
 def _read_obj(path: Path, data: bytes) -> Arrays:
-    """Read points and polygons of an OBJ; a negative number counts back from the newest point.
+    """Read points, polygons and groups of an OBJ; a negative number counts back from the newest point.
 
     trimesh and meshio take relative numbers as absolute and refuse tabs or comments at line ends.
     """
     points: list[list[float]] = []
     polygons: list[list[int]] = []
+    groups: dict[str, list[list[int]]] = {}
+    current: dict[str, list[str]] = {}
     text = TextIOWrapper(BytesIO(data), "utf-8-sig", "replace").read().replace("\\\n", " ")
     for line in StringIO(text):
         key, *words = line.partition("#")[0].split() or [""]
@@ -148,7 +182,13 @@ def _read_obj(path: Path, data: bytes) -> Arrays:
             corners = [int(word.partition("/")[0]) for word in words]
             # 0 is no point's number: it becomes -1, which is refused
             polygons.append([n - 1 if n >= 0 else len(points) + n for n in corners])
-    return np.array(points), np.reshape(trimesh.geometry.triangulate_quads(polygons), (-1, 3))
+            for name in {*chain.from_iterable(current.values())}:
+                groups.setdefault(name, []).append(polygons[-1])
+        elif key == "g":
+            current[key] = words
+        elif key in ("o", "usemtl"):
+            current[key] = [" ".join(words)] if words else []
+    return np.array(points), polygons, groups
 
 
 class _FolderResolver(FilePathResolver):
@@ -172,36 +212,21 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
         skip_materials=True,
         maintain_order=True,
     )
-    if not scene.geometry:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    mesh = scene.to_mesh()
-    return mesh.vertices, mesh.faces
-
-
-def _read_meshio(path: Path, data: bytes) -> Arrays:
-    """Read the outer surface of tetrahedra, or else triangles and quads, without unused points."""
-    import meshio
-
-    mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)
-    cells = mesh.cells_dict
-    if "tetra" in cells:
-        triangles = _outer_triangles(mesh.points, cells["tetra"])
-    else:
-        quads = cells.get("quad", np.zeros((0, 4), np.int64))
-        triangles = np.vstack([cells.get("triangle", np.zeros((0, 3), np.int64)), quads[:, :3], quads[:, [2, 3, 0]]])
-    used, triangles = np.unique(triangles, return_inverse=True)
-    return mesh.points[used], triangles.reshape(-1, 3)
-
-
-def _outer_triangles(points: Positions, tetrahedra: Indices) -> Indices:
-    """Return the faces (f, 3) of one tetrahedron only, wound outwards, of tetrahedra (c, 4)."""
-    a, b, c, d = points[tetrahedra].swapaxes(0, 1)
-    inverted = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) < 0
-    tetrahedra = np.where(inverted[:, None], tetrahedra[:, [0, 2, 1, 3]], tetrahedra)
-    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    outer: Indices = np.sort(first[count == 1])
-    return faces[outer]
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    first = starts(np.array([len(part.vertices) for part in parts], np.int64))
+    parents, groups = scene.graph.transforms.parents, defaultdict(list)
+    for part, start in zip(parts, first, strict=True):
+        node, left = part.metadata["node"], len(parents)
+        while node not in (None, scene.graph.base_frame) and left >= 0:  # its parents have it, too
+            groups[node].append(part.faces + start)
+            node, left = parents.get(node), left - 1
+    points, faces = ([np.zeros((0, 3)), *(getattr(part, name) for part in parts)] for name in ("vertices", "faces"))
+    triangles = [own + start for own, start in zip(faces[1:], first, strict=True)]
+    return (
+        np.concatenate(points),
+        np.concatenate([faces[0], *triangles]),
+        {k: np.concatenate(v) for k, v in groups.items()},
+    )
 
 
 def _read_mz3(path: Path, data: bytes) -> Arrays:
@@ -212,14 +237,13 @@ def _read_mz3(path: Path, data: bytes) -> Arrays:
     start = 16 + skip
     triangles = np.frombuffer(data, "<i4", 3 * faces, start)
     coordinates = np.frombuffer(data, "<f4", 3 * points, start + triangles.nbytes)
-    return coordinates.reshape(-1, 3), triangles.reshape(-1, 3)
+    return coordinates.reshape(-1, 3), triangles.reshape(-1, 3), {}
 
 
 _READERS = {
     "ply": _read_ply,
     "mz3": _read_mz3,
-    "vtu": _read_meshio,
-    "vtk": _read_meshio,
     "obj": _read_obj,
+    **dict.fromkeys(("vtu", "vtk", "msh", "inp", "bdf"), read_cells),
     **dict.fromkeys(("stl", "off", "glb", "gltf"), _read_trimesh),
 }

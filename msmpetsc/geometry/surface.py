@@ -1,7 +1,7 @@
 """Surface meshes: measured, and checked to enclose a volume."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,10 +20,17 @@ class Surface:
 
     points    : (v, 3) float64 [m]
     triangles : (f, 3) int64, corners of each triangle as rows of ``points``
+    groups    : by the names that a file gives them, surfaces that mark parts of the body
     """
 
     points: Positions
     triangles: Array
+    groups: "Mapping[str, Surface]" = field(default_factory=dict)
+
+    def moved(self, move: Callable[[Positions], Positions]) -> "Surface":
+        """Return the surface and its groups with their points moved."""
+        groups = {name: group.moved(move) for name, group in self.groups.items()}
+        return Surface(move(self.points), self.triangles, groups)
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface | None:

@@ -17,7 +17,9 @@ from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
-MESHES = (".ply", ".mz3", ".vtu", ".vtk", ".obj", ".stl", ".off", ".glb", ".gltf")  # those of geometry/readers.py
+MESHES = (  # those of geometry/readers.py
+    ".ply", ".mz3", ".vtu", ".vtk", ".msh", ".inp", ".bdf", ".obj", ".stl", ".off", ".glb", ".gltf",
+)  # fmt: skip
 Changes = Mapping[str, Any] | Iterable[str]  # {"cages.count": 3000}, or ["cages.count=3000"]
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
 

@@ -87,7 +87,7 @@ def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, poin
     points : (l, 3) of the bodies that nodes are nearest to [m]
     """
     lasting = (table for table in scene.tables("anchor") if table.table.stop is None)
-    tables = [t for t in chain(scene.tables("pin"), lasting) if t.table.region.painted is None]
+    tables = [t for t in chain(scene.tables("pin"), lasting) if not t.table.region.is_of_mesh]
     held = np.any([np.zeros(len(points), bool), *(masks[table.key] for table in tables)], axis=0)
 
     def stiffer(free: Indices, fast: Indices) -> Floats:

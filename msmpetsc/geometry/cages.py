@@ -170,7 +170,7 @@ def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
     edges = slab_edges(body.comm.size, grid.shape[axes[0]])
     slab = Slab(*edges[body.comm.rank : body.comm.rank + 2])
     corners = _slab_triangles(body, grid, axes, edges)
-    touched = _mark(corners, grid.shape[axes], slab)
+    touched = marked_cells(corners, grid.shape[axes], slab)
     if not body.report.closed:
         return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
     gaps = enclosed_gaps(body.comm, touched, slab)
@@ -226,8 +226,8 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
 
 
-def _mark(corners: Rows, shape: Indices, slab: Slab) -> Indices:
-    """Return the distinct boundary cells (b, 3) of the slab in lexicographic order."""
+def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:
+    """Return the distinct cells (b, 3) of the slab that triangles touch, in lexicographic order."""
     keys = [np.empty(0, np.int64)]
     for start in range(0, len(corners), CHUNK):
         cells = touched_cells(corners[start : start + CHUNK], *_limits(shape, slab))

@@ -33,7 +33,7 @@ def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
         distance = np.linalg.norm(points - (origin + np.array(region.sphere.center) * scale), axis=1)
         in_sphere: Mask = distance <= region.sphere.radius * length + edge
         return in_sphere
-    assert region.half_space is not None  # the schema has one of the four, and the painted ones are not asked for
+    assert region.half_space is not None  # the schema has one, and those of the mesh are not asked for
     point = origin + np.array(region.half_space.point) * scale
     beyond: Mask = (points - point) @ np.asarray(region.half_space.normal) >= -edge
     return beyond

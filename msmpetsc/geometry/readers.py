@@ -146,7 +146,10 @@ def _labelled(faces: Array, data: Any) -> dict[str, Array]:
     """Return the faces (f, k) of each label of a PLY: of a whole number of faces that is no colour."""
     names = data if isinstance(data, dict) else data.dtype.names
     columns = {name: np.asarray(data[name]) for name in names if name not in COLOURS}
-    arrays = {name: each for name, each in columns.items() if each.dtype.kind in "iu" and each.shape == (len(faces),)}
+    # of ASCII a column of one number a face is (f, 1)
+    arrays = {
+        name: each.ravel() for name, each in columns.items() if each.dtype.kind in "iu" and each.size == len(faces)
+    }
     groups = {}
     for name, column in arrays.items():
         labels = np.unique(column)
@@ -218,7 +221,8 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
     for part, start in zip(parts, first, strict=True):
         node, left = part.metadata["node"], len(parents)
         while node not in (None, scene.graph.base_frame) and left >= 0:  # its parents have it, too
-            groups[node].append(part.faces + start)
+            if not node.startswith("geometry_"):  # trimesh's name of a part without a name
+                groups[node].append(part.faces + start)
             node, left = parents.get(node), left - 1
     points, faces = ([np.zeros((0, 3)), *(getattr(part, name) for part in parts)] for name in ("vertices", "faces"))
     triangles = [own + start for own, start in zip(faces[1:], first, strict=True)]

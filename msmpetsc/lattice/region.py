@@ -7,6 +7,7 @@ nodes that lie in the region themselves those count, too, that have it half a ce
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +15,20 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_host
 from msmpetsc.comm import Route, log, on_root
-from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import BodySurface, Cages
+from msmpetsc.errors import InputError, did_you_mean, printable
+from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
-from msmpetsc.geometry.surface import is_inside
+from msmpetsc.geometry.surface import Surface, examine, is_inside
+from msmpetsc.geometry.valid_cells import Slab
 from msmpetsc.lattice.lattice import CORNERS, Lattice
 from msmpetsc.lattice.material import CellMaterial, MaterialOfCells
 from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import OfBody
+from msmpetsc.scene.schema import OfBody, Probe
 
 SAME = 1e-9  # of a cell: a point of a face lies in both cells
+MOST_LISTED = 20  # names of groups in a message [-]; more fill the screen
 
 
 def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: Indices) -> Positions:
@@ -73,14 +76,13 @@ class Finder:
         Raises InputError on all ranks if there are none.
         """
         region = table.table.region
-        if region.painted is None:
+        if region.is_of_mesh:
+            nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
+            where = around = self._of_mesh(table, nodes, lattice.nodes, lattice.body, are_nodes=True)
+        else:
             where = self.inside(table, points, lattice.body)
             around = self.inside(table, lattice.nodes, lattice.body)
             where = where | self._at_edge(table, lattice, around & ~where)
-        else:
-            keys = np.unique(encode_morton(self._painted_cells(table)[:, None, :] + CORNERS))
-            nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
-            where = around = np.isin(encode_morton(nodes), keys)
         found, near = self.comm.allreduce(np.array([mask[: lattice.owned].sum() for mask in (where, around & ~where)]))
         if found == 0:
             raise InputError(f"{table.key}.region holds no node of the lattice{self._beside(table)}")
@@ -102,22 +104,21 @@ class Finder:
         return where
 
     def inside(self, table: OfBody, points: Positions, body: Indices) -> Mask:
-        """Return which points (n, 3) [m] of bodies (n,) lie in a table's region that is not painted, (n,) bool."""
+        """Return which points (n, 3) [m] of bodies (n,) lie in a table's region of space, (n,) bool."""
         return inside_bodies(table.table.region, points, self.bounds, body, table.body)
 
     def find_cells(self, table: OfBody, ijk: Indices) -> Mask:
-        """Return which cells (c,) bool have their middles in a region, or hold a painted point (collective).
+        """Return which cells (c,) bool have their middles in a region, or are of its points or group (collective).
 
         The middle is that of what is inside. ijk : (c, 3) grid index of the cells. Raises
         InputError on all ranks if the region means none.
         """
-        region, grids = table.table.region, self.cages.grids
-        if region.painted is None:
-            share = self.cages.of_cells(ijk, self.cages.share)
-            middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
-            where = self.inside(table, middles, grids.body_of(ijk))
+        grids, share = self.cages.grids, self.cages.of_cells(ijk, self.cages.share)
+        middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
+        if table.table.region.is_of_mesh:
+            where = self._of_mesh(table, ijk, middles, grids.body_of(ijk), are_nodes=False)
         else:
-            where = np.isin(encode_morton(ijk), encode_morton(self._painted_cells(table)))
+            where = self.inside(table, middles, grids.body_of(ijk))
         if not self.comm.allreduce(bool(where.any()), MPI.LOR):
             raise InputError(f"{table.key}.region holds the centre of no cell{self._beside(table)}")
         return where
@@ -127,7 +128,34 @@ class Finder:
         bounds = self.bounds if table.body is None else self.bounds[[table.body]]
         body = _in_words(bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))
         region = table.table.region
-        return f": the body is {body}" + ("" if region.painted else f", the region {_extent(region, bounds[0])}")
+        return f": the body is {body}" + ("" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}")
+
+    def _of_mesh(self, table: OfBody, ijk: Indices, points: Positions, body: Indices, are_nodes: bool) -> Mask:
+        """Return which nodes or cells (n,) bool the points or the group of a region mean (collective).
+
+        Of a group they are the nodes nearest to a point of its triangles, or the cells that these
+        cut. What a closed group encloses is meant, too.
+
+        ijk    : (n, 3) their grid index
+        points : (n, 3) of nodes, or the middles of cells [m]
+        body   : (n,) whose they are
+        """
+        grids, region = self.cages.grids, table.table.region
+        if region.group is None:
+            cells = self._painted_cells(table)
+            keys = encode_morton((cells[:, None] + CORNERS).reshape(-1, 3) if are_nodes else cells)
+            return np.isin(encode_morton(ijk), keys)
+        where = np.zeros(len(ijk), bool)
+        for number, group in groups_named(self.bodies, table.key + ".region", region.group, table.body).items():
+            grid = grids.grids[number]
+            # a node is nearest to all points of the cell about it
+            corners = grid.to_cells(group.points)[group.triangles] + are_nodes / 2
+            marked = marked_cells(corners, grid.shape + 1, Slab(0, grid.shape[0] + 1))
+            where |= np.isin(encode_morton(ijk), encode_morton(marked + grids.first(number)))
+            if examine(group).closed:
+                own = np.flatnonzero(body == number)
+                where[own] |= is_inside(group, points[own])
+        return where
 
     def _painted_cells(self, table: OfBody) -> Indices:
         """Return the cells (k, 3) that painted points of a body's surface lie in (collective)."""
@@ -159,6 +187,54 @@ class Finder:
         return numbers
 
 
+def groups_named(bodies: Sequence[BodySurface], key: str, name: str, number: int | None = None) -> dict[int, Surface]:
+    """Return the triangles that a mesh names, by the numbers of the bodies that have them (collective).
+
+    number : of the only body that is asked; None: all
+
+    Raises InputError on all ranks if none has them.
+    """
+
+    def found() -> dict[int, Surface]:
+        asked = {n: body.surface.groups for n, body in enumerate(bodies) if body.surface and number in (None, n)}
+        named = {n: groups[name] for n, groups in asked.items() if name in groups}
+        if not named:
+            names = list(dict.fromkeys(chain.from_iterable(asked.values())))
+            has = f"it has {listed(names)}" if names else "it names none"
+            raise InputError(f"{key}.group: the mesh has no group {name!r}{did_you_mean(name, names)}: {has}")
+        return named
+
+    groups: dict[int, Surface] = bodies[0].comm.bcast(on_root(bodies[0].comm, found))
+    return groups
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in printable characters, the first of many."""
+    more = len(names) - MOST_LISTED
+    return ", ".join(printable(name, 60) for name in names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
+def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list[Sequence[float]]:
+    """Return where probes are at rest [m]: of a group the point nearest to its middle (collective).
+
+    Raises InputError on all ranks for a group that no body has.
+    """
+    points: list[Sequence[float]] = []
+    for number, probe in enumerate(probes):
+        if probe.group is None:
+            assert probe.point is not None  # the schema has one of the two
+            points.append(probe.point)
+            continue
+        import igl  # for scenes with regions or obstacles
+
+        group = next(iter(groups_named(bodies, f"output.probe.{number}", probe.group).values()))
+        corners = group.points[group.triangles]
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        middle = np.average(corners.mean(axis=1), axis=0, weights=areas)
+        points.append(igl.point_mesh_squared_distance(middle[None], group.points, group.triangles)[2][0])
+    return points
+
+
 def _middles(share: Rows) -> Rows:
     """Return the centre of mass (c, 3), in cells from the low corner, of what is inside cells by corners' shares."""
     whole = share.sum(axis=(1, 2, 3))
@@ -171,14 +247,14 @@ def _in_words(low: Floats, high: Floats) -> str:
 
 
 def _extent(region: Region, bounds: Rows) -> str:
-    """Return where a region that is not painted is [m], in words; bounds (2, 3) of its body."""
+    """Return where a region of space is [m], in words; bounds (2, 3) of its body."""
     origin, scale, length = frame_of(region, bounds)
     if region.box is not None:
         return _in_words(*(origin + np.array(region.box) * scale))
     if region.sphere is not None:
         center, reach = origin + np.array(region.sphere.center) * scale, region.sphere.radius * length
         return _in_words(center - reach, center + reach)
-    assert region.half_space is not None  # the schema has one of the four
+    assert region.half_space is not None  # the schema has one, and those of the mesh are not asked for
     point, normal = origin + np.array(region.half_space.point) * scale, region.half_space.normal
     at, along = (", ".join(f"{x:.4g}" for x in vector) for vector in (point, normal))
     return f"beyond ({at}) m towards ({along})"

@@ -10,6 +10,7 @@ from msmpetsc.scene.values import (
     Count,
     Direction,
     FileName,
+    GroupName,
     ListOf,
     NotNegative,
     Painted,
@@ -151,7 +152,7 @@ class HalfSpace(Table):
 class Region(Table):
     """A part of space at rest: its nodes are meant, or of a part the cells with their middles in it."""
 
-    one_of = ("box", "sphere", "half_space", "painted")
+    one_of = ("box", "sphere", "half_space", "painted", "group")
     box: Box | None = Field(
         None, description="two corners, each coordinate of the first the lower [m], or [-] if relative"
     )
@@ -162,14 +163,26 @@ class Region(Table):
         description="numbers, from 0, of points of the prepared surface (/surface/points of the result), or a "
         "text file beside this file that lists them: the cells they lie in are meant, or their corners [-]",
     )
+    group: GroupName | None = Field(
+        None,
+        description="name, or number, that the mesh gives to some of its surface or cells (msmpetsc inspect lists "
+        "them): the nodes nearest to its triangles are meant, of a part the cells that these cut, and "
+        "all that a closed group encloses [-]",
+    )
     relative: bool = Field(False, description="coordinates run 0..1 along each axis of the rest bounding box")
 
     @field_validator("relative")
     @classmethod
     def _has_a_use(cls, relative: bool, info: ValidationInfo) -> bool:
-        if relative and info.data.get("painted") is not None:
-            raise rule("has no meaning for painted points", "painted")
+        for key, words in (("painted", "painted points"), ("group", "a group")):
+            if relative and info.data.get(key) is not None:
+                raise rule(f"has no meaning for {words}", key)
         return relative
+
+    @property
+    def is_of_mesh(self) -> bool:
+        """Return whether it names points or triangles of the mesh, and no part of space."""
+        return self.painted is not None or self.group is not None
 
 
 class OwnMaterial(Table):

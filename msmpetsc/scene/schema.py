@@ -11,7 +11,7 @@ from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable, SelfContactTable
 from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.time import Time, one_state, unlike_the_integrator
-from msmpetsc.scene.values import Count, Direction, FileName, ListOf, NotNegative, PresetName, Table, Vector
+from msmpetsc.scene.values import Count, Direction, FileName, GroupName, ListOf, NotNegative, PresetName, Table, Vector
 
 MOST_CONTRAST = 1e6  # of parts: at 1e8 a squashed body took newton over 1,200 iterations a step
 OF_REGIONS = ("part", "pin", "anchor", "force")  # tables that take a region of one body, or of all
@@ -109,8 +109,12 @@ class Safety(Table):
 class Probe(Table):
     """A point of the body that is followed."""
 
+    one_of = ("point", "group")
     name: FileName = Field(description="of its columns in `msmpetsc series`")
-    point: Vector = Field(description="where it is at rest; it goes with the cell that it lies in [m]")
+    point: Vector | None = Field(None, description="where it is at rest; it goes with the cell that it lies in [m]")
+    group: GroupName | None = Field(
+        None, description="name that a mesh gives to triangles: the point of them nearest to their middle [-]"
+    )
 
 
 class Output(Table):

@@ -91,7 +91,13 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
     return name
 
 
+def _as_name(value: Any) -> Any:
+    """Return the name of a group that is given by its number."""
+    return str(value) if type(value) is int else value
+
+
 FileName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
+GroupName = Annotated[FileName, BeforeValidator(_as_name)]
 FunctionName = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_printable)]
 IntegratorName = Literal["implicit-euler", "bdf2", "verlet", "static"]
 PresetName = Annotated[str, AfterValidator(_known_preset)]

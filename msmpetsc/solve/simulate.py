@@ -22,7 +22,7 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.lattice.region import ProbePoints
+from msmpetsc.lattice.region import ProbePoints, probe_points
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
@@ -90,7 +90,7 @@ class TimeLoop:
         self.comm, self.model, self.true_error, self.time_step = comm, model, true_error, scene.time.step
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
-        points = [probe.point for probe in scene.output.probe]
+        points = probe_points(model.bodies, scene.output.probe)
         self.probe = ProbePoints(comm, model.lattice, points) if points else None  # may refuse: no PETSc objects yet
         self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
         swings = scene.time.integrator != "implicit-euler"

@@ -45,9 +45,9 @@ class BodiesAtRest:
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
     def find(self, table: OfBody) -> Mask:
-        """Return which nodes (n,) lie in a table's region; none if it is painted in a file."""
+        """Return which nodes (n,) lie in a table's region; none if the result does not say which."""
         region = table.table.region
-        if region.painted is not None:
+        if region.is_of_mesh:
             return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
         low, high = np.moveaxis(self.bounds[self.body_of_node], 1, 0)  # what sticks out is where its body is
         return inside_bodies(region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body)
@@ -58,16 +58,16 @@ class BodiesAtRest:
         return np.asarray(self.nodes[self.cells].mean(axis=1))
 
     def find_cells(self, table: OfBody) -> Mask:
-        """Return which cells (c,) have their centres in a table's region; none if it is painted in a file."""
+        """Return which cells (c,) have their centres in a table's region; none if the result does not say which."""
         region = table.table.region
-        if region.painted is not None:
+        if region.is_of_mesh:
             return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
         return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
 
     def _painted_cells(self, table: OfBody) -> Indices:
         """Return the numbers of the cells of a table's body around its painted points."""
         painted, number = table.table.region.painted, table.body or 0
-        if not isinstance(painted, tuple):  # listed in a file, which the result does not hold
+        if not isinstance(painted, tuple):  # a file or a group, which the result does not hold
             return np.empty(0, int)
         points = self.points[self.body_of_point == number][list(painted)]
         return self.cells_around(points, np.full(len(points), number))

@@ -1,4 +1,4 @@
-"""``msmpetsc inspect``: counts and memory of a scene on so many ranks, without running it.
+"""``msmpetsc inspect``: groups of its meshes, counts and memory of a scene on so many ranks, without running it.
 
 memory of a rank  =  PROGRAM + FACTOR (bytes of its arrays while A is assembled), or W is made if that is more
 
@@ -23,6 +23,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, choose_cell_size, fill
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.lattice.lattice import Topology, topology_of
+from msmpetsc.lattice.region import listed
 from msmpetsc.scene.body import CagesTable
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.petsc.initialise import initialise
@@ -129,10 +130,15 @@ def run(args: argparse.Namespace) -> int:
     cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
-    surfaces = [body.surface for body in bodies if body.surface is not None] if scene.output.surface else []
+    surfaces = [body.surface for body in bodies if body.surface is not None]
+    stored = surfaces if scene.output.surface else []
+    groups = {
+        mesh.source: {name: len(group.triangles) for name, group in surface.groups.items()}
+        for mesh, surface in zip(scene.meshes.values(), surfaces, strict=True)
+    }
     report = {
         "scene": str(args.scene), "ranks": args.ranks, "counted": counted, "counts": counts_of(scene, partition),
-        "memory": over_ranks(memory_of(partition, surfaces, mesh)),
+        "memory": over_ranks(memory_of(partition, stored, mesh)), "groups": groups,
     }  # fmt: skip
     if args.json:
         print(json.dumps(report, indent=1))
@@ -163,7 +169,7 @@ def over_ranks(values: Floats) -> dict[str, float]:
 
 
 def print_counts(report: dict[str, Any]) -> None:
-    """Print the counts as a table."""
+    """Print the counts as a table, then the groups of each mesh."""
     counts = report["counts"]
     how = "counted"
     if report["counted"] != counts["cells"]["all"]:
@@ -176,6 +182,9 @@ def print_counts(report: dict[str, Any]) -> None:
         else:
             columns = f"{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}"
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
+    for source, groups in report["groups"].items():
+        if groups:
+            print(f"\ngroups of {source}: {listed([f'{name} ({count} triangles)' for name, count in groups.items()])}")
 
 
 def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) -> Floats:

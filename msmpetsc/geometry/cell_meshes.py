@@ -1,12 +1,12 @@
 """Files of meshio: the boundary of their cells, and the sets of cells and points that they name."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions
 
 if TYPE_CHECKING:
     import meshio
@@ -26,40 +26,31 @@ class Kind(NamedTuple):
     """
 
     dimension: int
-    faces: tuple[tuple[int, ...], ...]
-    edges: tuple[tuple[int, int], ...] = ()
+    faces: tuple[str, ...]
+    edges: tuple[str, ...] = ()
     quadratic: tuple[int, ...] = ()
 
-    def triangles(self, cells: Indices, face: tuple[int, ...]) -> Indices:
+    def triangles(self, cells: Indices, face: str) -> Indices:
         """Return the triangles (c, t, 3) of one face of cells (c, k)."""
-        ring = [*face]
+        ring = [int(corner) for corner in face]
         if cells.shape[1] in self.quadratic:
-            first = 1 + max(map(max, self.faces))
-            ends = [{*pair} for pair in zip(face, face[1:] + face[:1], strict=True)]
-            middles = [first + [{*edge} for edge in self.edges].index(pair) for pair in ends]
-            ring = [node for pair in zip(face, middles, strict=True) for node in pair]
+            first, edges = 1 + int(max(map(max, self.faces))), [{*edge} for edge in self.edges]
+            middles = [first + edges.index({*pair}) for pair in zip(face, face[1:] + face[0], strict=True)]
+            ring = [node for pair in zip(ring, middles, strict=True) for node in pair]
         triangles: Indices = cells[:, np.array(ring)[CUTS[len(ring)]]]
         return triangles
 
 
 KINDS = {
-    "triangle": Kind(2, ((0, 1, 2),), ((0, 1), (1, 2), (2, 0)), (6, 7)),
-    "quad": Kind(2, ((0, 1, 2, 3),), ((0, 1), (1, 2), (2, 3), (3, 0)), (8, 9)),
-    "tetra": Kind(
-        3,
-        ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)),
-        ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)),
-        (10,),
-    ),
-    "pyramid": Kind(3, ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4))),
-    "wedge": Kind(3, ((0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5))),
+    "triangle": Kind(2, ("012",), ("01", "12", "20"), (6, 7)),
+    "quad": Kind(2, ("0123",), ("01", "12", "23", "30"), (8, 9)),
+    "tetra": Kind(3, ("021", "013", "123", "032"), ("01", "12", "20", "03", "13", "23"), (10,)),
+    "pyramid": Kind(3, ("0321", "014", "124", "234", "304")),
+    "wedge": Kind(3, ("021", "345", "0143", "1254", "2035")),
     "hexahedron": Kind(
         3,
-        ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
-        (
-            *((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4)),
-            *((0, 4), (1, 5), (2, 6), (3, 7)),
-        ),
+        ("0321", "4567", "0154", "1265", "2376", "3047"),
+        ("01", "12", "23", "30", "45", "56", "67", "74", "04", "15", "26", "37"),
         (20, 27),
     ),
 }
@@ -111,62 +102,56 @@ def _kind(name: str) -> Kind | None:
 
 
 def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indices]]]:
-    """Yield the sets of cells that a mesh names: their names, and the rows of each block.
-
-    A label of an array of whole numbers is a name, too: "3", or "array:3" if several arrays have labels.
-    """
+    """Yield the sets of cells that a mesh names or labels: their names, and the rows of each block."""
     for name, rows in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
             yield name, [np.asarray(own, np.int64) for own in rows]
-    arrays = {key: [np.asarray(part) for part in parts] for key, parts in mesh.cell_data.items()}
-    arrays = {
-        key: parts
-        for key, parts in arrays.items()
-        if key != "gmsh:geometrical" and all(part.dtype.kind in "iu" and part.ndim == 1 for part in parts)
-    }
-    for key, parts in arrays.items():
-        is_gmsh = key == "gmsh:physical"
+    arrays = {key: np.concatenate(parts) for key, parts in mesh.cell_data.items() if key != "gmsh:geometrical"}
+    dimensions = np.repeat([kind.dimension if kind else 0 for kind, _ in blocks], [len(cells) for _, cells in blocks])
+    ends = np.cumsum([len(cells) for _, cells in blocks])
+    for key, label, usual in labels_of({key: each for key, each in arrays.items() if each.shape == dimensions.shape}):
+        is_gmsh = key == "gmsh:physical"  # in which a name is of a label and a dimension, and 0 is no group
         names = {(int(tag), int(size)): name for name, (tag, size) in mesh.field_data.items()} if is_gmsh else {}
-        labels = np.unique(np.concatenate(parts))
+        for dimension in (2, 3) if label or not is_gmsh else ():
+            own = (arrays[key] == label) & (dimensions == dimension)
+            yield names.get((label, dimension), usual), [*map(np.flatnonzero, np.split(own, ends[:-1]))]
+
+
+def labels_of(arrays: Mapping[str, Array]) -> Iterator[tuple[str, int, str]]:
+    """Yield array, label and name of each label in arrays of whole numbers.
+
+    The name is "3", or "array:3" if there are several arrays.
+    """
+    whole = {key: values for key, values in arrays.items() if values.dtype.kind in "iu"}
+    for key, values in whole.items():
+        labels = np.unique(values)
         for label in map(int, labels[: len(labels) * (len(labels) <= MOST_LABELS)]):
-            for dimension in (2, 3):
-                rows = [
-                    np.flatnonzero((part == label) & (kind is not None and kind.dimension == dimension))
-                    for (kind, _), part in zip(blocks, parts, strict=True)
-                ]
-                if any(map(len, rows)) and not (is_gmsh and label == 0):  # gmsh's 0 is no group
-                    usual = str(label) if len(arrays) == 1 else f"{key}:{label}"
-                    yield names.get((label, dimension), usual), rows
+            yield key, label, str(label) if len(whole) == 1 else f"{key}:{label}"
 
 
 def _flat(blocks: Blocks) -> Indices:
     """Return the triangles (f, 3) of cells without volume."""
-    parts = [
-        kind.triangles(cells, kind.faces[0]).reshape(-1, 3)
-        for kind, cells in blocks
-        if kind is not None and kind.dimension == 2
-    ]
+    flat = [(kind, cells) for kind, cells in blocks if kind and kind.dimension == 2]
+    parts = [kind.triangles(cells, kind.faces[0]).reshape(-1, 3) for kind, cells in flat]
     return np.concatenate([np.zeros((0, 3), np.int64), *parts])
 
 
 def boundary(points: Positions, blocks: Blocks) -> Indices:
     """Return the faces of one cell only as triangles (f, 3), wound outwards also if the cell is not."""
-    solid = [(kind, cells) for kind, cells in blocks if kind is not None and kind.dimension == 3]
-    faces = [(kind, cells, face) for kind, cells in solid for face in kind.faces]
-    keys = np.concatenate([np.zeros((0, 4), np.int64), *(_key(cells[:, face]) for _, cells, face in faces)])
-    order = np.lexsort(keys.T)
-    same = (keys[order][1:] == keys[order][:-1]).all(axis=1)
-    outer = np.ones(len(keys), bool)
+    solid = [(kind, cells, _volumes(points, kind, cells) < 0) for kind, cells in blocks if kind and kind.dimension == 3]
+    faces = [(face, *of_kind) for of_kind in solid for face in of_kind[0].faces]
+    keys = [np.zeros((0, 4), np.int64), *(_key(cells[:, [*map(int, face)]]) for face, _, cells, _ in faces)]
+    ordered = np.concatenate(keys)[order := np.lexsort(np.concatenate(keys).T)]
+    same = (ordered[1:] == ordered[:-1]).all(axis=1)
+    outer = np.ones(len(order), bool)
     outer[order[1:][same]] = outer[order[:-1][same]] = False
-    inverted = [_volumes(points, kind, cells) < 0 for kind, cells in solid for _ in kind.faces]
-    parts, start = [np.zeros((0, 3), np.int64)], 0
-    for (kind, cells, face), wrong in zip(faces, inverted, strict=True):
-        own = outer[start : start + len(cells)]
+    parts, ends = [np.zeros((0, 3), np.int64)], np.cumsum([len(key) for key in keys])
+    for (face, kind, cells, inverted), own in zip(faces, np.split(outer, ends[:-1])[1:], strict=True):
         triangles = kind.triangles(cells[own], face)
-        turned = np.where(wrong[own][:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3)
-        parts.append(turned[(turned != np.roll(turned, 1, axis=1)).all(axis=1)])
-        start += len(cells)
-    return np.concatenate(parts)
+        parts.append(np.where(inverted[own][:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3))
+    triangles = np.concatenate(parts)
+    whole: Indices = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    return whole
 
 
 def _key(corners: Indices) -> Indices:

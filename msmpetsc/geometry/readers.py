@@ -20,12 +20,12 @@ from trimesh.resolvers import FilePathResolver
 from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.comm import starts
 from msmpetsc.errors import InputError, one_line
-from msmpetsc.geometry.cell_meshes import MOST_LABELS, read_cells
+from msmpetsc.geometry.cell_meshes import labels_of, read_cells
 from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.scene.reading import lies_below
 
-# points (v, 3), faces (f, 3 or 4), and by name the faces of groups
-Arrays = tuple[Array, Array, Mapping[str, Array]]
+# points (v, 3), faces (f, 3 or 4) or a list of polygons, and by name these of groups
+Arrays = tuple[Array, Any, Mapping[str, Any]]
 
 COLOURS = ("red", "green", "blue", "alpha")  # of a PLY's faces
 
@@ -145,17 +145,10 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 def _labelled(faces: Array, data: Any) -> dict[str, Array]:
     """Return the faces (f, k) of each label of a PLY: of a whole number of faces that is no colour."""
     names = data if isinstance(data, dict) else data.dtype.names
-    columns = {name: np.asarray(data[name]) for name in names if name not in COLOURS}
     # of ASCII a column of one number a face is (f, 1)
-    arrays = {
-        name: each.ravel() for name, each in columns.items() if each.dtype.kind in "iu" and each.size == len(faces)
-    }
-    groups = {}
-    for name, column in arrays.items():
-        labels = np.unique(column)
-        for label in map(int, labels[: len(labels) * (len(labels) <= MOST_LABELS)]):
-            groups[str(label) if len(arrays) == 1 else f"{name}:{label}"] = faces[column == label]
-    return groups
+    columns = {name: np.ravel(data[name]) for name in names if name not in COLOURS}
+    whole = {name: each for name, each in columns.items() if each.shape == faces.shape[:1]}
+    return {name: faces[whole[key] == label] for key, label, name in labels_of(whole)}
 
 
 def _read_mixed_ply(data: bytes) -> Arrays:

@@ -145,14 +145,12 @@ class Result:
             self.close()
             raise
         self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
-        self.frames = Frames("frames", self._arrays("frames"))
+        self.frames = Frames("frames", self._group("frames"))
 
     def _group(self, group: str) -> Arrays:
-        return Arrays(group, self._arrays(group))
-
-    def _arrays(self, group: str) -> dict[str, LazyArray]:
         start = f"{group}/"
-        return {name.removeprefix(start): array for name, array in self._datasets.items() if name.startswith(start)}
+        arrays = {name.removeprefix(start): array for name, array in self._datasets.items() if name.startswith(start)}
+        return Arrays(group, arrays)
 
     def __enter__(self) -> "Result":
         return self

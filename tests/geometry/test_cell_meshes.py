@@ -18,7 +18,7 @@ PARTS = {  # of a cube, by its corners in VTK's order; 8 is its middle
     "hexahedron": [range(8)],
     "wedge": [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]],
     "tetra": [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
-    "pyramid": [[*face, 8] for face in KINDS["hexahedron"].faces],
+    "pyramid": [[*map(int, face), 8] for face in KINDS["hexahedron"].faces],
 }
 INVERTED = {"hexahedron": [4, 5, 6, 7, 0, 1, 2, 3], "wedge": [3, 4, 5, 0, 1, 2], "tetra": [1, 0, 2, 3]}
 INVERTED["pyramid"] = [3, 2, 1, 0, 4]
@@ -39,7 +39,7 @@ def cells_of(kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 def quadratic(kind: str, points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mesh with a node in the middle of every edge."""
-    pairs = np.sort(cells[:, np.array(KINDS[kind].edges)].reshape(-1, 2), axis=1)
+    pairs = np.sort(cells[:, np.array([[*map(int, edge)] for edge in KINDS[kind].edges])].reshape(-1, 2), axis=1)
     edges, number = np.unique(pairs, axis=0, return_inverse=True)
     middles = points[edges].mean(axis=1)
     return np.vstack([points, middles]), np.hstack([cells, len(points) + number.reshape(len(cells), -1)])

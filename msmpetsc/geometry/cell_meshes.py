@@ -1,6 +1,7 @@
 """Files of meshio: the boundary of their cells, and the sets of cells and points that they name."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,6 +16,8 @@ Groups = dict[str, Indices]  # by name, triangles (f, 3)
 
 # distinct labels of an array [-]; one that has more numbers cells, and names no parts
 MOST_LABELS = 1000
+# lines behind a text's end [-]; a reader that comes to its end asks for few
+PATIENCE = 100
 
 
 class Kind(NamedTuple):
@@ -75,8 +78,11 @@ def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
 
     if path.suffix.lower() == ".inp" and b"*INCLUDE" in data.upper():
         raise ValueError("it includes other files, which are not read")
-    formats = {"vtu": meshio.vtu, "vtk": meshio.vtk, "msh": meshio.gmsh, "inp": meshio.abaqus}
-    mesh = formats.get(path.suffix.lower().removeprefix("."), meshio.nastran).read(path)
+    texts, binary = {".inp": meshio.abaqus, ".bdf": meshio.nastran}, {".vtu": meshio.vtu, ".vtk": meshio.vtk}
+    if reader := texts.get(path.suffix.lower()):
+        mesh = reader.read(_Lines(data.decode(errors="replace")))
+    else:
+        mesh = binary.get(path.suffix.lower(), meshio.gmsh).read(path)
     points = np.asarray(mesh.points, np.float64)
     blocks = [(_kind(block.type), np.asarray(block.data, np.int64)) for block in mesh.cells]
     for _, cells in blocks:
@@ -91,6 +97,19 @@ def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
     for name, numbers in mesh.point_sets.items():
         groups.setdefault(name, []).append(triangles[np.isin(triangles, numbers).all(axis=1)])
     return points, triangles, {name: np.concatenate(parts) for name, parts in groups.items()}
+
+
+class _Lines(StringIO):
+    """A text that is an error to readers which ask for more and more lines behind its end."""
+
+    behind = 0
+
+    def readline(self, *size: int) -> str:
+        line = super().readline(*size)
+        self.behind += not line
+        if self.behind > PATIENCE:
+            raise EOFError("it ends too early")
+        return line
 
 
 def _kind(name: str) -> Kind | None:

@@ -135,6 +135,7 @@ def test_damaged_files_are_refused_in_one_line(end: str, tmp_path: Path):
         ("inp", "*HEADING\n*INCLUDE, INPUT=/etc/passwd\n", "includes other files"),
         ("inp", "*NODE\n1, 0, 0, 0\n*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4\n", "not a readable INP"),
         ("bdf", "CTETRA,1,1,1,2,3,4\n", "BEGIN BULK"),
+        ("bdf", "BEGIN BULK\n$ only comments\n", "it ends too early"),
         ("msh", "(0 an ANSYS mesh)\n", "not a readable MSH"),
     ],
 )

@@ -96,6 +96,12 @@ SEEDS = [
     ("vtu", by_meshio("vtu", compression=None)),
     ("vtu", by_meshio("vtu", compression="zlib")),
     ("vtu", by_meshio("vtu", compression="lzma")),
+    ("msh", by_meshio("msh", file_format="gmsh", binary=False)),
+    ("msh", by_meshio("msh", file_format="gmsh")),
+    ("msh", by_meshio("msh", file_format="gmsh22", binary=False)),
+    ("msh", by_meshio("msh", file_format="gmsh22")),
+    ("inp", by_meshio("inp")),
+    ("bdf", by_meshio("bdf")),
 ]
 
 

@@ -104,8 +104,8 @@ class _Lines(StringIO):
 
     behind = 0
 
-    def readline(self, *size: int) -> str:
-        line = super().readline(*size)
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
+        line = super().readline(size)
         self.behind += not line
         if self.behind > PATIENCE:
             raise EOFError("it ends too early")

@@ -112,8 +112,8 @@ FRAME_FIELDS: dict[str, Field] = {
     if hasattr(hint, "__metadata__")
 }
 STRESS = tuple(name for name in FRAME_FIELDS if name.endswith(("stress", "von_mises", "pressure", "strain_energy")))
-# HDF5 dimension scales of frames, by letters and lengths of shapes. None has the name of a field with several axes,
-# which netCDF's readers would take for its coordinates.
+# HDF5 dimension scales of frames, by letters and lengths of shapes. None has the name of a field
+# with several axes: netCDF's readers would take that for its coordinates.
 DIMENSIONS: dict[int | str, str] = {
     "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle", "b": "body",
     "w": "probe_number", 3: "axis", 6: "component",

@@ -74,7 +74,8 @@ def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
 
     The triangles are the boundary of the cells that have a volume, or else the triangles and quads.
     """
-    import meshio  # a slow import for formats that few scenes name
+    # a slow import for formats that few scenes name
+    import meshio
 
     if path.suffix.lower() == ".inp" and b"*INCLUDE" in data.upper():
         raise ValueError("it includes other files, which are not read")
@@ -113,7 +114,10 @@ class _Lines(StringIO):
 
 
 def _kind(name: str) -> Kind | None:
-    """Return the kind of cell of meshio's name, "tetra10". Raises ValueError for one that is not read."""
+    """Return the kind of cell of meshio's name, "tetra10".
+
+    Raises ValueError if it is not read.
+    """
     base = name.rstrip("0123456789")
     if base not in KINDS and base not in ("vertex", "line"):
         raise ValueError(f"cells of kind {name} are not read")
@@ -121,7 +125,7 @@ def _kind(name: str) -> Kind | None:
 
 
 def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indices]]]:
-    """Yield the sets of cells that a mesh names or labels: their names, and the rows of each block."""
+    """Yield the name and the rows of each block of the sets of cells that a mesh names or labels."""
     for name, rows in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
             yield name, [np.asarray(own, np.int64) for own in rows]
@@ -129,7 +133,8 @@ def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indic
     dimensions = np.repeat([kind.dimension if kind else 0 for kind, _ in blocks], [len(cells) for _, cells in blocks])
     ends = np.cumsum([len(cells) for _, cells in blocks])
     for key, label, usual in labels_of({key: each for key, each in arrays.items() if each.shape == dimensions.shape}):
-        is_gmsh = key == "gmsh:physical"  # in which a name is of a label and a dimension, and 0 is no group
+        # in which a name is of a label and a dimension, and 0 is no group
+        is_gmsh = key == "gmsh:physical"
         names = {(int(tag), int(size)): name for name, (tag, size) in mesh.field_data.items()} if is_gmsh else {}
         for dimension in (2, 3) if label or not is_gmsh else ():
             own = (arrays[key] == label) & (dimensions == dimension)
@@ -156,7 +161,10 @@ def _flat(blocks: Blocks) -> Indices:
 
 
 def boundary(points: Positions, blocks: Blocks) -> Indices:
-    """Return the faces of one cell only as triangles (f, 3), wound outwards also if the cell is not."""
+    """Return the faces of one cell only as triangles (f, 3), wound outwards.
+
+    The cell itself may be inverted.
+    """
     solid = [(kind, cells, _volumes(points, kind, cells) < 0) for kind, cells in blocks if kind and kind.dimension == 3]
     faces = [(face, *of_kind) for of_kind in solid for face in of_kind[0].faces]
     keys = [np.zeros((0, 4), np.int64), *(_key(cells[:, [*map(int, face)]]) for face, _, cells, _ in faces)]
@@ -174,9 +182,10 @@ def boundary(points: Positions, blocks: Blocks) -> Indices:
 
 
 def _key(corners: Indices) -> Indices:
-    """Return corners (f, 3 or 4) of faces in order, (f, 4), each once, with -1 in front of fewer."""
+    """Return the corners of faces in order, (f, 4), each once, with -1 in front of fewer."""
     key = np.sort(corners, axis=1)
-    key[:, 1:][key[:, 1:] == key[:, :-1]] = -1  # a corner that a collapsed cell has twice
+    # a collapsed cell has a corner twice
+    key[:, 1:][key[:, 1:] == key[:, :-1]] = -1
     return np.pad(np.sort(key, axis=1), ((0, 0), (4 - key.shape[1], 0)), constant_values=-1)
 
 

@@ -205,7 +205,10 @@ STEPS: dict[str, Callable[..., Surface]] = {
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """Run a step, which leaves groups where they lie; raise its failures as InputError with its name."""
+    """Run a step, which leaves groups where they lie.
+
+    Raises InputError with the name of the step if it fails.
+    """
     try:
         result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:

@@ -143,7 +143,7 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 
 def _labelled(faces: Array, data: Any) -> dict[str, Array]:
-    """Return the faces (f, k) of each label of a PLY: of a whole number of faces that is no colour."""
+    """Return the faces (f, k) of each label of a PLY: a whole number of faces that is no colour."""
     names = data if isinstance(data, dict) else data.dtype.names
     # of ASCII a column of one number a face is (f, 1)
     columns = {name: np.ravel(data[name]) for name in names if name not in COLOURS}
@@ -161,8 +161,9 @@ def _read_mixed_ply(data: bytes) -> Arrays:
 
 
 def _read_obj(path: Path, data: bytes) -> Arrays:
-    """Read points, polygons and groups of an OBJ; a negative number counts back from the newest point.
+    """Read points, polygons and groups of an OBJ.
 
+    A negative number counts back from the newest point.
     trimesh and meshio take relative numbers as absolute and refuse tabs or comments at line ends.
     """
     points: list[list[float]] = []

@@ -108,10 +108,13 @@ class Finder:
         return inside_bodies(table.table.region, points, self.bounds, body, table.body)
 
     def find_cells(self, table: OfBody, ijk: Indices) -> Mask:
-        """Return which cells (c,) bool have their middles in a region, or are of its points or group (collective).
+        """Return which cells (c,) bool are in a region with their middles (collective).
 
-        The middle is that of what is inside. ijk : (c, 3) grid index of the cells. Raises
-        InputError on all ranks if the region means none.
+        If it has points or a group, these say which. A middle is that of what is inside.
+
+        ijk : (c, 3) grid index of the cells
+
+        Raises InputError on all ranks if the region means none.
         """
         grids, share = self.cages.grids, self.cages.of_cells(ijk, self.cages.share)
         middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
@@ -131,7 +134,7 @@ class Finder:
         return f": the body is {body}" + ("" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}")
 
     def _of_mesh(self, table: OfBody, ijk: Indices, points: Positions, body: Indices, are_nodes: bool) -> Mask:
-        """Return which nodes or cells (n,) bool the points or the group of a region mean (collective).
+        """Return which nodes or cells (n,) bool a region's points or group mean (collective).
 
         Of a group they are the nodes nearest to a point of its triangles, or the cells that these
         cut. What a closed group encloses is meant, too.
@@ -188,7 +191,7 @@ class Finder:
 
 
 def groups_named(bodies: Sequence[BodySurface], key: str, name: str, number: int | None = None) -> dict[int, Surface]:
-    """Return the triangles that a mesh names, by the numbers of the bodies that have them (collective).
+    """Return the triangles that meshes name, by the numbers of their bodies (collective).
 
     number : of the only body that is asked; None: all
 

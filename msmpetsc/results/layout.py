@@ -27,7 +27,8 @@ from msmpetsc.results.disk import Storage
 
 CHUNK_BYTES = 64 * 2**20
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
-LENGTH_ALONE = "This is a netCDF dimension but not a netCDF variable."  # netCDF-4's name of a scale without coordinates
+# netCDF-4's name of a scale without coordinates
+LENGTH_ALONE = "This is a netCDF dimension but not a netCDF variable."
 
 
 def open_to_write(storage: Storage, mode: str) -> h5py.File:
@@ -143,7 +144,10 @@ def _plan_dataset(file: h5py.File, plan: Plan) -> None:
 
 
 def _name_axes(frames: h5py.Group, name: str) -> None:
-    """Attach the HDF5 dimension scales to the axes of a dataset of frames, by which netCDF's readers name them."""
+    """Attach HDF5 dimension scales to the axes of a dataset of frames.
+
+    By these netCDF's readers name the axes.
+    """
     for axis, (symbol, size) in enumerate(zip(FRAME_FIELDS[name].shape, frames[name].shape, strict=True)):
         dimension = DIMENSIONS[symbol]
         if dimension == name:

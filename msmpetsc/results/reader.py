@@ -56,7 +56,8 @@ class LazyArray:
         self.planned: tuple[int, ...] = dataset.shape
         self.shape: tuple[int, ...] = (len(dataset) if count is None else count, *dataset.shape[1:])
         self.dtype = dataset.dtype
-        unit = dataset.attrs.get("units", dataset.attrs.get("unit", "1"))  # version 0.2 and earlier wrote "unit"
+        # version 0.2 and earlier wrote "unit"
+        unit = dataset.attrs.get("units", dataset.attrs.get("unit", "1"))
         self.unit = unit if isinstance(unit, str) else "1"
 
     @property
@@ -246,7 +247,8 @@ def open_result(path: str | Path) -> h5py.File:
         try:
             # by default as other readers: HDF5 opens a file but once in a process, with the same locking
             file = h5py.File(path, "r", rdcc_nbytes=0)
-        except OSError:  # a file system without locks, or a lock of another process
+        except OSError:
+            # a file system without locks, or a lock of another process
             file = h5py.File(path, "r", rdcc_nbytes=0, locking=False)
     try:
         with plain_damage(path):

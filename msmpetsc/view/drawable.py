@@ -58,7 +58,7 @@ class BodiesAtRest:
         return np.asarray(self.nodes[self.cells].mean(axis=1))
 
     def find_cells(self, table: OfBody) -> Mask:
-        """Return which cells (c,) have their centres in a table's region; none if the result does not say which."""
+        """Return which cells (c,) lie in a table's region; none if the result does not say which."""
         region = table.table.region
         if region.is_of_mesh:
             return np.isin(np.arange(len(self.cells)), self._painted_cells(table))

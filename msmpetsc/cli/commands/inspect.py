@@ -1,4 +1,4 @@
-"""``msmpetsc inspect``: groups of its meshes, counts and memory of a scene on so many ranks, without running it.
+"""``msmpetsc inspect``: groups of meshes, counts and memory of a scene, without a run.
 
 memory of a rank  =  PROGRAM + FACTOR (bytes of its arrays while A is assembled), or W is made if that is more
 

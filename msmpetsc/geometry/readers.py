@@ -5,7 +5,7 @@ import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from io import BytesIO, StringIO
+from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +132,25 @@ def _read_mixed_ply(data: bytes) -> Arrays:
     return mesh.points, trimesh.geometry.triangulate_quads(polygons)
 
 
+def _read_obj(path: Path, data: bytes) -> Arrays:
+    """Read points and polygons of an OBJ; a negative number counts back from the newest point.
+
+    trimesh and meshio take relative numbers as absolute and refuse tabs or comments at line ends.
+    """
+    points: list[list[float]] = []
+    polygons: list[list[int]] = []
+    text = TextIOWrapper(BytesIO(data), "utf-8-sig", "replace").read().replace("\\\n", " ")
+    for line in StringIO(text):
+        key, *words = line.partition("#")[0].split() or [""]
+        if key == "v":
+            points.append([float(word) for word in words[:3]])
+        elif key == "f":
+            corners = [int(word.partition("/")[0]) for word in words]
+            # 0 is no point's number: it becomes -1, which is refused
+            polygons.append([n - 1 if n >= 0 else len(points) + n for n in corners])
+    return np.array(points), np.reshape(trimesh.geometry.triangulate_quads(polygons), (-1, 3))
+
+
 class _FolderResolver(FilePathResolver):
     """Reads the files that a glTF names: those in its folder or below it, links followed, and no others."""
 
@@ -201,5 +220,6 @@ _READERS = {
     "mz3": _read_mz3,
     "vtu": _read_meshio,
     "vtk": _read_meshio,
-    **dict.fromkeys(("obj", "stl", "off", "glb", "gltf"), _read_trimesh),
+    "obj": _read_obj,
+    **dict.fromkeys(("stl", "off", "glb", "gltf"), _read_trimesh),
 }

@@ -174,6 +174,43 @@ def test_polygons_are_cut_into_triangles(tmp_path):
         assert report.closed and report.volume == pytest.approx(0.5), name
 
 
+def box_in_obj(line: str = "{}\n", face: str = "f {} {} {}", first: int = 1) -> str:
+    """A box as an OBJ: each of its lines as ``line`` has it, the first of its points numbered ``first``."""
+    rows = ["v {} {} {}".format(*point) for point in BOX.vertices]
+    rows += [face.format(*corners) for corners in BOX.faces + first]
+    return "".join(line.format(row) for row in rows)
+
+
+WRITTEN = {
+    "relative texture numbers": "vt 0 0\n" * 8 + box_in_obj(face="f {0}/{0} {1}/{1} {2}/{2}", first=-8),
+    "relative normal numbers": "vn 0 0 1\n" * 8 + box_in_obj(face="f {0}//{0} {1}//{1} {2}//{2}", first=-8),
+    "comments at line ends": box_in_obj("{} # f 1 2 3\n"),
+    "tabs": box_in_obj("{}\n").replace(" ", "\t"),
+    "spaces before and behind": box_in_obj(" {} \n"),
+    "lines of a Mac": box_in_obj("{}\r"),
+    "lines of Windows": "\ufeff" + box_in_obj("{}\r\n"),
+    "lines that go on": box_in_obj().replace(" ", " \\\n"),
+    "a colour a point": box_in_obj(face="f {} {} {}").replace("\nv", " 1 0 0\nv").replace("\nf", " 1 0 0\nf", 1),
+    "colours of some points": box_in_obj().replace("\nv", " 1 0 0\nv", 3),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_an_obj_is_read_as_programs_write_it(tmp_path, name):
+    (tmp_path / "box.obj").write_text(WRITTEN[name], newline="")
+    surface = read_surface(tmp_path / "box.obj")
+    report = examine(surface)
+    assert len(surface.triangles) == 12 and report.closed and report.volume == pytest.approx(6)
+
+
+def test_relative_numbers_of_an_obj_count_from_where_they_stand(tmp_path):
+    box = box_in_obj(first=-8)
+    (tmp_path / "boxes.obj").write_text(2 * box)
+    assert np.array_equal(read_surface(tmp_path / "boxes.obj").triangles, np.vstack([BOX.faces, BOX.faces + 8]))
+    (tmp_path / "early.obj").write_text(box.replace("f -8", "f -9"))
+    assert "outside 0..7: -1" in refusal(lambda: read_surface(tmp_path / "early.obj"))
+
+
 @pytest.mark.parametrize("kind", ["vtu", "vtk"])
 def test_tetrahedra_give_their_outer_surface(tmp_path, kind):
     """A box filled with tetrahedra around its middle, every other one wound the wrong way."""
@@ -201,6 +238,7 @@ REFUSED = {
     "nothing": ("ply", b"", "is empty"),
     "a page": ("vtu", b"<html><body>404</body></html>", "not a readable VTU"),
     "words": ("obj", b"hello\nworld\n", "no triangles"),
+    "point 0": ("obj", b"v 0 0 0\nv 1 0 0\nf 0 1 2\nv 0 1 0\n", "outside 0..2: -1"),
     "not a number": ("ply", ply(3, 1, "0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n"), "NaN or infinite"),
     "no such point": ("ply", ply(3, 1, TRIANGLE + "3 0 1 7\n"), "outside 0..2: 7"),
     "too few rows": ("ply", ply(3, 2, TRIANGLE + "3 0 1 2\n"), "1 of 2 face rows"),

@@ -113,3 +113,11 @@ def test_triangles_wound_against_each_other_are_told_and_cells_count_whole(caplo
     with caplog.at_level(logging.WARNING, "msmpetsc"):
         assert fill([body_of(ball)], 0.2).share is None
     assert 'wound against each other, so boundary cells count whole: prepare = ["orient"]' in caplog.text
+
+
+def test_an_open_surface_far_from_the_origin_weighs_as_near_it():
+    ball = trimesh.creation.icosphere(3, radius=0.15)
+    ball.update_faces(np.arange(len(ball.faces)) > 3)
+    near = volume(fill([body_of(ball)], 0.04))
+    ball.apply_translation([441871.6, 6329700.7, 120.3])
+    assert volume(fill([body_of(ball)], 0.04)) == pytest.approx(near, rel=1e-3)

@@ -116,6 +116,20 @@ def test_orient_turns_each_part_outwards_also_loose_and_open_ones():
     assert examine(turned).volume > 0 > examine(opened).volume
 
 
+@given(st.lists(st.booleans(), min_size=7, max_size=7), st.floats(0, 1e7))
+def test_orient_winds_cavities_inwards_and_their_cores_outwards(inwards, shift):
+    """A ball in a ball in a ball beside a box with a box in it, a second box over its edge, and one far away."""
+    balls = [surface_of(trimesh.creation.icosphere(1, radius=radius)) for radius in (1.0, 0.7, 0.4)]
+    parts = [*balls, box((5, 0, 0), 2.0), box((5.2, 0, 0)), box((6, 0, 0)), box((9, 0, 0))]
+    outwards = np.array([examine(part).volume for part in parts]) * [1, -1, 1, 1, -1, 1, 1]
+    turned = [inside_out(part) if turn else part for part, turn in zip(parts, inwards, strict=True)]
+    mesh = joined(turned)
+    mended = prepare(Surface(mesh.points + shift, mesh.triangles), ["orient"])
+    ends = np.cumsum([len(part.triangles) for part in parts])[:-1]
+    volumes = [examine(Surface(mended.points, triangles)).volume for triangles in np.split(mended.triangles, ends)]
+    assert volumes == pytest.approx(outwards, rel=1e-6)
+
+
 def test_orient_refuses_a_one_sided_surface():
     """A Möbius band of five triangles, each sharing two points with the next."""
     band = np.array([[i, (i + 1) % 5, (i + 2) % 5] for i in range(5)])
@@ -137,6 +151,17 @@ def test_size_and_base_place_the_bounding_box(size, base, sides):
     assert (high - low).max() == pytest.approx(size, rel=1e-9)
     middle = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
     assert middle == pytest.approx(base, abs=1e-9 * max(size, 10))
+
+
+@pytest.mark.parametrize("step", ["union", "repair", {"simplify": 200}, {"refine": 0.2}])
+def test_steps_are_as_exact_far_from_the_origin(step):
+    if step == "repair":
+        pytest.importorskip("pymeshfix")
+    ball = surface_of(trimesh.creation.icosphere(3, radius=0.15))
+    ball = Surface(ball.points, ball.triangles[3 * (step == "repair") :])
+    far = np.array([441871.6, 6329700.7, 120.3])
+    near, moved = (examine(prepare(Surface(ball.points + shift, ball.triangles), [step])) for shift in (0, far))
+    assert moved.volume == pytest.approx(near.volume, rel=1e-6) and moved.area == pytest.approx(near.area, rel=1e-6)
 
 
 def test_steps_run_in_the_order_given_and_leave_the_input_alone():

@@ -24,7 +24,8 @@ BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
 WHOLE = 1 - 1e-9  # a share above this is rounding away from 1
 LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
-TOLERANCE = 0.01  # of a wanted number of cells
+# share of a wanted number of cells, or of a volume, that need not be met
+TOLERANCE = 0.01
 SEARCH_LIMIT = 30  # sizes tried; a real model needs three to six
 
 
@@ -83,9 +84,14 @@ class SlabCells:
     gaps: Indices
     columns: Columns | None
 
+    @property
+    def interior(self) -> int:
+        """Number of interior cells of this rank."""
+        return int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum())
+
     def count(self, comm: MPI.Comm) -> int:
         """Return the number of valid cells on all ranks (collective)."""
-        return int(comm.allreduce(len(self.boundary) + int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum())))
+        return int(comm.allreduce(len(self.boundary) + self.interior))
 
 
 def fill(bodies: Sequence[BodySurface], cell_size: float, max_cells: int = 5_000_000, boundary: str = "fill") -> Cages:
@@ -139,6 +145,8 @@ def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
         share, squares = cells.columns.inside(cells.boundary)
+        held = np.clip(share, 0, 1).mean(axis=(1, 2, 3)).sum() + cells.interior
+        _warn_of_parts(abs(body.report.volume), body.comm.allreduce(held) * grid.cell_size**3)
         share, squares = share.transpose(0, *(1 + axes)), squares[:, axes]
     elif body.report.closed:
         log.warning('triangles are wound against each other, so boundary cells count whole: prepare = ["orient"]')
@@ -147,6 +155,18 @@ def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
         share, squares = sampled_inside(body.comm.bcast(body.surface), grid, cells.boundary[:, axes])
     counted = np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
     return counted, squares + (counted - share).mean(axis=(1, 2, 3))[:, None] / 4
+
+
+def _warn_of_parts(enclosed: float, held: float) -> None:
+    """Warn if cells hold another volume [m^3] than the mesh, in which each part counts with its sign."""
+    if abs(held - enclosed) > TOLERANCE * enclosed:
+        remedy = (
+            'some parts are wound inwards, which prepare = ["orient"] mends'
+            if held > enclosed
+            else 'parts overlap or lie in each other; prepare = ["union"] joins them, ["orient"] makes cavities of '
+            "inner parts"
+        )
+        log.warning("the mesh encloses %.4g m^3, its cells hold %.4g m^3: %s", enclosed, held, remedy)
 
 
 def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str) -> list[SlabCells]:

@@ -7,6 +7,7 @@ Enclosed cells: scipy.ndimage.label on the dense grid.
 """
 
 import os
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -21,7 +22,16 @@ from hypothesis.extra.numpy import arrays
 from surfaces import body_of, surface_of
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, choose_cell_size, fill
+from msmpetsc.geometry.cages import (
+    BOUNDARY,
+    INTERIOR,
+    BodySurface,
+    Cages,
+    choose_cell_size,
+    estimated_cells,
+    fill,
+    warn_of_thin_bodies,
+)
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
@@ -271,3 +281,16 @@ def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
 def test_more_cells_than_allowed_are_not_sought():
     with pytest.raises(InputError, match=r"cages.count: 151 is more than cages.max_cells = 150"):
         choose_cell_size([aligned_box()], 151, max_cells=150)
+
+
+def test_bodies_thinner_than_a_cell_are_told_by_their_numbers(caplog):
+    plate, cube = (body_of(trimesh.creation.box(sides)) for sides in ((1, 1, 0.02), (1, 1, 1)))
+    warn_of_thin_bodies([cube, plate], 0.1)
+    (line,) = caplog.messages
+    assert line.startswith("body.1 is 0.0192 m thick on average (2 V / A), 0.19 of a cell")
+    cells, size = (float(re.search(f"{name} = ([^ ]*)", line)[1]) for name in ("count", "cell_size"))
+    warn_of_thin_bodies([cube, plate], size)
+    assert len(caplog.messages) == 1 and estimated_cells([cube, plate], size) == pytest.approx(cells, rel=0.05)
+    warn_of_thin_bodies([cube], 0.3)
+    warn_of_thin_bodies([aligned_box(lid=False)], 0.5)
+    assert len(caplog.messages) == 1

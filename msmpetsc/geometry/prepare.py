@@ -18,7 +18,8 @@ import pooch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.backend.arrays import Indices
+from msmpetsc.backend.arrays import Floats, Indices
+from msmpetsc.comm import log
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.geometry.surface import (
     Surface,
@@ -37,6 +38,10 @@ if TYPE_CHECKING:
 # A repair that keeps less than this of the area did not mend the body but lost it: of
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
 LEAST_AREA_KEPT = 0.5
+# share of the area that a repair may change without a word
+RETOUCHED = 0.01
+# share of the mean thickness 2 V / A within which a surface counts as unchanged
+NEAR = 0.01
 FARTHEST = 1e12  # in the file's own unit
 LARGE = 20_000  # triangles
 MOST_FILES = 32  # of some megabytes each; the oldest go first
@@ -81,9 +86,15 @@ def merge(surface: Surface) -> Surface:
 def largest_part(surface: Surface) -> Surface:
     """Keep the connected part of the largest area."""
     labels = part_labels(surface)
-    a, b, c = surface.points[surface.triangles].swapaxes(0, 1)
-    areas = np.bincount(labels, np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    areas = np.bincount(labels, _doubled_areas(surface))
     return compact(surface.points, surface.triangles[labels == areas.argmax()])
+
+
+def _doubled_areas(surface: Surface) -> Floats:
+    """Return twice the area (f,) of each triangle."""
+    a, b, c = surface.points[surface.triangles].swapaxes(0, 1)
+    areas: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return areas
 
 
 def about_middle(step: Step) -> Step:
@@ -161,6 +172,28 @@ def repair(surface: Surface) -> Surface:
     if not report.closed:
         raise InputError(f"{report.boundary_edges} boundary edges could not be closed")
     return repaired
+
+
+def _warn_of_change(before: Surface, after: Surface) -> None:
+    """Warn if a repair has taken away, or has added, more of the surface than RETOUCHED."""
+    report = examine(after)
+    near = NEAR * 2 * abs(report.volume) / report.area
+    gone, new = _share_beyond(before, after, near), _share_beyond(after, before, near)
+    if max(gone, new) > RETOUCHED:
+        log.warning(
+            "prepare: 'repair' took %.0f%% of the surface's area away, and %.0f%% of the area is new: "
+            "msmpetsc render draws the scene",
+            100 * gone, 100 * new,
+        )  # fmt: skip
+
+
+def _share_beyond(surface: Surface, other: Surface, distance: float) -> float:
+    """Return the share of a surface's area that lies farther than a distance from another surface."""
+    import igl
+
+    middles, areas = surface.points[surface.triangles].mean(axis=1), _doubled_areas(surface)
+    squares = igl.point_mesh_squared_distance(middles, other.points, other.triangles)[0]
+    return float(areas[squares > distance**2].sum() / areas.sum())
 
 
 @about_middle
@@ -260,6 +293,9 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():
         raise InputError(f"prepare: '{name}' left no usable mesh")
+    # here, as a result from the cache is told, too
+    if name == repair.__name__:
+        _warn_of_change(surface, result)
     return result
 
 

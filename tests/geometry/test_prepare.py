@@ -33,6 +33,16 @@ def real(name: str) -> Surface:
     return read_surface(Path(folder) / name)
 
 
+BALL = trimesh.creation.icosphere(subdivisions=5)  # 20,480 triangles
+BODY = surface_of(BALL)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "msmpetsc" / "prepared"
+
+
 def test_merge_joins_loose_triangles_and_drops_what_is_of_no_use():
     surface = box()
     points = np.vstack([surface.points[surface.triangles].reshape(-1, 3), [[7, 7, 7]]])
@@ -74,6 +84,38 @@ def test_repair_that_loses_the_body_is_refused():
     pytest.importorskip("pymeshfix")
     with pytest.raises(InputError, match=r"'repair'.*area was left"):
         prepare(real("lung_parts.ply"), ["repair"])
+
+
+def pipe(hole: float) -> Surface:
+    """A pipe with walls of 5 cm, whose inner one lacks what lies beyond x = ``hole`` [m]."""
+    surface = surface_of(trimesh.creation.annulus(0.45, 0.5, 1.0, sections=64).subdivide().subdivide())
+    middles = surface.points[surface.triangles].mean(axis=1)
+    lacks = (np.linalg.norm(middles[:, :2], axis=1) < 0.46) & (middles[:, 0] > hole)
+    return Surface(surface.points, surface.triangles[~lacks])
+
+
+def test_repair_tells_how_much_of_the_surface_it_changed(caplog, folder):
+    pytest.importorskip("pymeshfix")
+    inner = trimesh.creation.icosphere(3, radius=0.9).apply_translation([0.15, 0, 0])
+    inner.invert()
+    crossing = joined((surface_of(trimesh.creation.icosphere(3)), surface_of(inner)))
+    small_hole = Surface(BODY.points, BODY.triangles[9:])
+    for surface, gone, new in (
+        (pipe(9.0), 0, 0),
+        (small_hole, 0, 0),
+        (pipe(0.35), 0, 10),
+        (crossing, 52, 13),
+    ):
+        caplog.clear()
+        prepare(surface, ["repair"])
+        said = [f"took {gone}% of the surface's area away, and {new}% of the area is new"] if gone + new else []
+        assert [line for line in said if line in caplog.text] == said and len(caplog.messages) == len(said)
+    large = Surface(BODY.points, BODY.triangles[450:])
+    caplog.clear()
+    # the second time from the cache
+    for _ in range(2):
+        prepare(large, ["repair"])
+    assert len(set(caplog.messages)) == 1 and len(caplog.messages) == 2 and len(list(folder.iterdir())) == 2
 
 
 def test_simplify_reduces_and_stays_closed():
@@ -186,16 +228,6 @@ def test_a_step_that_leaves_nothing_is_an_error():
         prepare(point, [], size=1.0)
     with pytest.raises(InputError, match="'rotate' failed"):
         prepare(box(), [{"rotate": {"degrees": 9}}])
-
-
-BALL = trimesh.creation.icosphere(subdivisions=5)  # 20,480 triangles
-BODY = surface_of(BALL)
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "msmpetsc" / "prepared"
 
 
 class Step:

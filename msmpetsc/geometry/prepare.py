@@ -18,7 +18,7 @@ import pooch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.backend.arrays import Floats, Indices
+from msmpetsc.backend.arrays import Indices
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.geometry.surface import (
@@ -85,16 +85,11 @@ def merge(surface: Surface) -> Surface:
 
 def largest_part(surface: Surface) -> Surface:
     """Keep the connected part of the largest area."""
+    import igl
+
     labels = part_labels(surface)
-    areas = np.bincount(labels, _doubled_areas(surface))
+    areas = np.bincount(labels, igl.doublearea(surface.points, surface.triangles))
     return compact(surface.points, surface.triangles[labels == areas.argmax()])
-
-
-def _doubled_areas(surface: Surface) -> Floats:
-    """Return twice the area (f,) of each triangle."""
-    a, b, c = surface.points[surface.triangles].swapaxes(0, 1)
-    areas: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return areas
 
 
 def about_middle(step: Step) -> Step:
@@ -191,7 +186,8 @@ def _share_beyond(surface: Surface, other: Surface, distance: float) -> float:
     """Return the share of a surface's area that lies farther than a distance from another surface."""
     import igl
 
-    middles, areas = surface.points[surface.triangles].mean(axis=1), _doubled_areas(surface)
+    middles = surface.points[surface.triangles].mean(axis=1)
+    areas = igl.doublearea(surface.points, surface.triangles)
     squares = igl.point_mesh_squared_distance(middles, other.points, other.triangles)[0]
     return float(areas[squares > distance**2].sum() / areas.sum())
 

@@ -21,7 +21,7 @@ from msmpetsc.contact.surface.collision_surface import collision_surface
 from msmpetsc.contact.surface.pairs import CollisionSurface
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
-from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
+from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill, warn_of_thin_bodies
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.prepare import prepare
@@ -263,6 +263,7 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     """Return the scene's valid cells (collective)."""
     cages = scene.cages  # which have a cell size or a count
     cell_size = cages.cell_size or choose_cell_size(bodies, cages.count or 0, cages.max_cells, cages.boundary)
+    warn_of_thin_bodies(bodies, cell_size)
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 

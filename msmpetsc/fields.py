@@ -60,7 +60,7 @@ class Frame:
     index: int
     time: Annotated[float, _number("f8", "s", "simulated time")]
     position: Annotated[Positions, Field("f8", ("T", "n", 3), "m", "node positions", "lattice/nodes")]
-    surface: Annotated[Positions | None, Field("f4", ("T", "v", 3), "m", "surface points", "surface/points")]
+    surface: Annotated[Positions | None, Field("f8", ("T", "v", 3), "m", "surface points", "surface/points")]
     step_error: Annotated[float, _number("f8", "1", "estimated relative error of a step")]
     iterations: Annotated[int, _number("i8", "1", "outer iterations")]
     ksp_its: Annotated[int, _number("i8", "1", "iterations of the linear solver")]

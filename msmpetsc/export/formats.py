@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Indices
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
@@ -34,6 +34,12 @@ def normals(points: Array, triangles: Indices) -> Array:
     vectors = np.stack(sums, axis=1)
     vectors[~vectors.any(axis=1)] = (0, 0, 1)  # a point of no triangle, or of folded ones: any direction is as good
     return np.divide(vectors, np.linalg.norm(vectors, axis=1, keepdims=True), dtype=np.float32)
+
+
+def middle_of(points: Positions) -> Floats:
+    """Return the middle (3,) [m] of the box around points (n, 3)."""
+    middle: Floats = (points.min(axis=0) + points.max(axis=0)) / 2
+    return middle
 
 
 class Chunk:
@@ -76,18 +82,21 @@ def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
     """Write frames as glTF. Raises InputError for more bytes than the format allows."""
     first, *others = frames
     triangles = run.indices("surface/triangles")
-    base = run.surface_at(first).astype(np.float32)
+    start = run.surface_at(first)
+    # single precision is exact about the body's middle, where the node puts the points
+    middle = middle_of(start)
+    base = (start - middle).astype(np.float32)
     upright = normals(base, triangles)
     chunk = Chunk()
     indices = chunk.add(triangles.astype("<u4").ravel(), TRIANGLES)
     shape = chunk.add_shape(base, upright)
     targets = []
     for frame in others:
-        points = run.surface_at(frame).astype(np.float32)
+        points = (run.surface_at(frame) - middle).astype(np.float32)
         targets.append(chunk.add_shape(points - base, normals(points, triangles) - upright))
         if chunk.size > MOST_BYTES:
             raise InputError(f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)")
-    document = _document(shape, indices, targets, run.path.stem)
+    document = _document(shape, indices, targets, run.path.stem, middle)
     if others:
         document["animations"] = [_animation(chunk, run.frames.time[:][frames], len(others))]
     document |= {"accessors": chunk.accessors, "bufferViews": chunk.views, "buffers": [{"byteLength": chunk.size}]}
@@ -99,8 +108,11 @@ def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
         file.writelines(chunk.parts)
 
 
-def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]], name: str) -> dict[str, Any]:
-    """Return the scene of glTF's JSON chunk: one node with one mesh."""
+def _document(
+    shape: dict[str, int], indices: int, targets: list[dict[str, int]], name: str, middle: Floats
+) -> dict[str, Any]:
+    """Return the scene of glTF's JSON chunk: one node at ``middle`` (3,) [m], z up, with one mesh."""
+    x, y, z = middle.tolist()
     primitive: dict[str, Any] = {"attributes": shape, "indices": indices, "material": 0}
     mesh: dict[str, Any] = {"primitives": [primitive], "name": name}
     if targets:
@@ -110,7 +122,7 @@ def _document(shape: dict[str, int], indices: int, targets: list[dict[str, int]]
         "asset": {"version": "2.0", "generator": "msmpetsc"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": Z_UP_TO_Y_UP, "name": name}],
+        "nodes": [{"mesh": 0, "translation": [x, z, -y], "rotation": Z_UP_TO_Y_UP, "name": name}],
         "meshes": [mesh],
         "materials": [CLAY],
     }

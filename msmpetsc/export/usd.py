@@ -12,7 +12,7 @@ from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import one_line
-from msmpetsc.export.formats import normals
+from msmpetsc.export.formats import middle_of, normals
 from msmpetsc.results.reader import Result
 
 CLAY = (0.8, 0.55, 0.4)
@@ -38,9 +38,12 @@ def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
         stage.SetEndTimeCode(codes[-1])
         triangles = run.indices("surface/triangles")
         of_point = run.body_of("surface")
+        # USD's points are of single precision, which is exact about the body's middle: the root puts them there
+        middle = middle_of(run.surface_at(frames[0]))
+        root.AddTranslateOp().Set(Gf.Vec3d(*middle))
         bodies = [UsdBody(stage, root.GetPath(), triangles, of_point, number) for number in np.unique(of_point)]
         for count, (frame, code) in enumerate(zip(frames, codes, strict=True), 1):
-            points = run.surface_at(frame)
+            points = run.surface_at(frame) - middle
             for body in bodies:
                 body.add(points, float(code))
             if path.suffix != ".usda" and count % SAVED == 0:
@@ -67,7 +70,7 @@ class UsdBody:
         self._mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
 
     def add(self, points: Array, code: float) -> None:
-        """Add a sample at a time code, of the points (v, 3) [m] of all bodies."""
+        """Add a sample at a time code, of the points (v, 3) [m] of all bodies from the root."""
         own = points[self._rows]
         corners = np.array([own.min(axis=0), own.max(axis=0)])
         self._mesh.CreatePointsAttr().Set(_vectors(own), code)

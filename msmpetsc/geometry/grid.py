@@ -16,7 +16,9 @@ from msmpetsc.errors import InputError
 LIMIT = 1 << 21  # cells along an axis: three times 21 bits fill 63 of a key
 PACK = np.array([LIMIT**2, LIMIT, 1])
 CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
-SAME = 1e-9  # cells: a body that is this close to a whole number of cells long has that number
+# share of the longest side, at most 1e-3 cells, within which a coordinate lies in a plane of the grid: of meshes in
+# single precision, or of six digits
+SAME, MOST_SAME = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,8 @@ class Grid:
 
         Raises InputError for a cell size too small to number the cells along an axis.
         """
-        cells = np.ceil((bounds[1] - bounds[0]) / cell_size - SAME)
+        length = (bounds[1] - bounds[0]) / cell_size
+        cells = np.ceil(length - min(SAME * length.max(), MOST_SAME))
         if not cells.max() < LIMIT - 1:
             raise InputError(
                 f"cages.cell_size: {cell_size:g} m would cut the body into {cells.max():.3g} cells along one side, "
@@ -44,7 +47,10 @@ class Grid:
     def to_cells(self, points: Positions) -> Rows:
         """Return points (..., 3) [m] in units of cells, kept within the grid: its last cells own its far faces."""
         inside = np.nextafter(self.shape.astype(float), 0)
-        return np.clip((points - self.origin) / self.cell_size, 0, inside)
+        at = (points - self.origin) / self.cell_size
+        plane = np.rint(at)
+        same = np.abs(at - plane) <= min(SAME * self.shape.max(), MOST_SAME)
+        return np.clip(np.where(same, plane, at), 0, inside)
 
     def node_positions(self, ijk: Array) -> Positions:
         """Return the positions [m] of grid nodes (..., 3)."""

@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import wraps
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +20,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Indices
+from msmpetsc.comm import log
 from msmpetsc.errors import InputError, as_expected
-from msmpetsc.geometry.surface import Surface, bounds_of, compact, edge_use, examine, first_of_equal, merged_triangles
+from msmpetsc.geometry.surface import (
+    Surface,
+    bounds_of,
+    compact,
+    edge_use,
+    examine,
+    first_of_equal,
+    is_inside,
+    merged_triangles,
+)
 
 if TYPE_CHECKING:
     import manifold3d
@@ -28,9 +39,14 @@ if TYPE_CHECKING:
 # A repair that keeps less than this of the area did not mend the body but lost it: of
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
 LEAST_AREA_KEPT = 0.5
+# share of the area that a repair may change without a word
+RETOUCHED = 0.01
+# share of the mean thickness 2 V / A within which a surface counts as unchanged
+NEAR = 0.01
 FARTHEST = 1e12  # in the file's own unit
 LARGE = 20_000  # triangles
 MOST_FILES = 32  # of some megabytes each; the oldest go first
+Step = Callable[..., Surface]
 LIBRARIES = ("fast-simplification", "manifold3d", "pymeshfix")
 
 
@@ -72,12 +88,26 @@ def merge(surface: Surface) -> Surface:
 
 def largest_part(surface: Surface) -> Surface:
     """Keep the connected part of the largest area."""
+    import igl
+
     labels = part_labels(surface)
-    a, b, c = surface.points[surface.triangles].swapaxes(0, 1)
-    areas = np.bincount(labels, np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    areas = np.bincount(labels, igl.doublearea(surface.points, surface.triangles))
     return compact(surface.points, surface.triangles[labels == areas.argmax()])
 
 
+def about_middle(step: Step) -> Step:
+    """Return a step that sees the surface about the middle of its box, where numbers round least."""
+
+    @wraps(step)
+    def centred(surface: Surface, *values: Any) -> Surface:
+        middle = bounds_of(surface).mean(axis=0)
+        result = step(Surface(surface.points - middle, surface.triangles), *values)
+        return Surface(result.points + middle, result.triangles)
+
+    return centred
+
+
+@about_middle
 def union(surface: Surface) -> Surface:
     """Join the closed parts into one solid. Each counts as solid, so a cavity is filled."""
     import manifold3d  # of the extra "mesh"
@@ -117,6 +147,7 @@ def surface_of(solid: "manifold3d.Manifold") -> Surface:
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
 
 
+@about_middle
 def repair(surface: Surface) -> Surface:
     """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
     import pymeshfix  # of the extra "repair"
@@ -141,6 +172,30 @@ def repair(surface: Surface) -> Surface:
     return repaired
 
 
+def _warn_of_change(before: Surface, after: Surface) -> None:
+    """Warn if a repair has taken away, or has added, more of the surface than RETOUCHED."""
+    report = examine(after)
+    near = NEAR * 2 * abs(report.volume) / report.area
+    gone, new = _share_beyond(before, after, near), _share_beyond(after, before, near)
+    if max(gone, new) > RETOUCHED:
+        log.warning(
+            "prepare: 'repair' took %.0f%% of the surface's area away, and %.0f%% of the area is new: "
+            "msmpetsc render draws the scene",
+            100 * gone, 100 * new,
+        )  # fmt: skip
+
+
+def _share_beyond(surface: Surface, other: Surface, distance: float) -> float:
+    """Return the share of a surface's area that lies farther than a distance from another surface."""
+    import igl
+
+    middles = surface.points[surface.triangles].mean(axis=1)
+    areas = igl.doublearea(surface.points, surface.triangles)
+    squares = igl.point_mesh_squared_distance(middles, other.points, other.triangles)[0]
+    return float(areas[squares > distance**2].sum() / areas.sum())
+
+
+@about_middle
 def simplify(surface: Surface, faces: int, haste: int = 7) -> Surface:
     """Reduce to about this many triangles (quadric decimation); a closed surface stays closed.
 
@@ -161,6 +216,7 @@ def simplify(surface: Surface, faces: int, haste: int = 7) -> Surface:
     return reduced
 
 
+@about_middle
 def refine(surface: Surface, share: float) -> Surface:
     """Split the edges of a closed surface that are longer than this share of its longest side."""
     surface = merge(surface)
@@ -172,10 +228,10 @@ def refine(surface: Surface, share: float) -> Surface:
 
 
 def orient(surface: Surface) -> Surface:
-    """Wind the triangles consistently, and each connected patch outwards (a cavity's too).
+    """Wind the triangles consistently, and each patch outwards, or inwards if it bounds a cavity.
 
-    A patch is what hangs together by edges of exactly two triangles. An open one is turned so
-    that most of it looks away from its own middle.
+    A patch hangs together by edges of exactly two triangles. It bounds a cavity if it lies in an
+    odd number of other patches. An open patch looks away from its own middle with most of its area.
     """
     import igl
 
@@ -184,10 +240,29 @@ def orient(surface: Surface) -> Surface:
     used, forward = edge_use(turned)
     if ((used == 2) & (forward != 1)).any():
         raise InputError("it has one side only, as a Möbius band: no winding is consistent")
-    outward, _ = igl.orient_outward(surface.points, turned, patch[:, None])
-    flipped = (outward != merged).any(axis=1)
+    wound, _ = igl.orient_outward(surface.points, turned, patch[:, None])
+    cavity = _depths(Surface(surface.points, wound), patch)[patch] % 2 == 1
+    wound[cavity] = wound[cavity, ::-1]
+    flipped = (wound != merged).any(axis=1)
     triangles = np.where(flipped[:, None], surface.triangles[:, [0, 2, 1]], surface.triangles)
     return Surface(surface.points, triangles)
+
+
+def _depths(surface: Surface, patch: Indices) -> Indices:
+    """Return in how many other patches (p,) each patch of triangles (f,) lies."""
+    order = np.argsort(patch, kind="stable")
+    ends = np.flatnonzero(np.diff(patch[order])) + 1
+    parts = [compact(surface.points, triangles) for triangles in np.split(surface.triangles[order], ends)]
+    low, high = np.array([bounds_of(part) for part in parts]).swapaxes(0, 1)
+    middles = surface.points[surface.triangles].mean(axis=1)
+    depths = np.zeros(len(parts), np.int64)
+    for number, part in enumerate(parts):
+        within = (low[number] < low).all(axis=1) & (high < high[number]).all(axis=1)
+        asked = within[patch]
+        if asked.any():
+            outside = np.bincount(patch[asked], ~is_inside(part, middles[asked]), len(parts))
+            depths += within & (outside == 0)
+    return depths
 
 
 def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
@@ -199,7 +274,7 @@ def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
     return surface.moved(rotation.apply)
 
 
-STEPS: dict[str, Callable[..., Surface]] = {
+STEPS: dict[str, Step] = {
     step.__name__: step for step in (merge, largest_part, union, repair, simplify, refine, orient, rotate)
 }
 
@@ -220,10 +295,13 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():
         raise InputError(f"prepare: '{name}' left no usable mesh")
+    # here, as a result from the cache is told, too
+    if name == repair.__name__:
+        _warn_of_change(surface, result)
     return result if result.groups else replace(result, groups=surface.groups)
 
 
-def cached(step: Callable[..., Surface], surface: Surface, *values: object) -> Surface:
+def cached(step: Step, surface: Surface, *values: object) -> Surface:
     """Return the result of a step; of a large mesh it is kept in a cache on disk."""
     if len(surface.triangles) < LARGE or step is rotate:  # which moves groups, too
         return step(surface, *values)

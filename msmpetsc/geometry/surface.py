@@ -125,9 +125,13 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
 
 def is_inside(surface: Surface, points: Positions) -> Mask:
     """Return which points (n, 3) are inside: their winding number is above 1/2 in size (Jacobson et al. 2013)."""
-    import igl  # for open surfaces, and scenes with obstacles
+    # for open surfaces, and scenes with obstacles
+    import igl
 
-    inside: Mask = np.abs(igl.fast_winding_number(surface.points, surface.triangles, points)) > 0.5
+    low, high = bounds_of(surface)
+    # libigl sums in single precision: lengths are measured from the middle, in longest sides
+    own, asked = ((rows - (low + high) / 2) / (high - low).max() for rows in (surface.points, points))
+    inside: Mask = np.abs(igl.fast_winding_number(own, surface.triangles, asked)) > 0.5
     return inside
 
 

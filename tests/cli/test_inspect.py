@@ -1,6 +1,7 @@
 """What inspect says of R ranks and of bytes, against what R ranks hold; and where integers end."""
 
 import json
+import re
 import shutil
 import tracemalloc
 from pathlib import Path
@@ -12,7 +13,7 @@ from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
 
 from msmpetsc.build import Geometry, build_model, fill_cages, read_bodies
-from msmpetsc.cli.commands.inspect import BYTES, Partition, count_partition
+from msmpetsc.cli.commands.inspect import BYTES, MOST_BUILT, Partition, count_partition
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
@@ -103,6 +104,29 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
     (cells,) = [line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cells")]
     volume = 4 / 3 * np.pi * 0.98  # of 320 triangles inside the sphere
     assert int(cells) == pytest.approx(volume / 0.02**3, rel=0.1)
+
+
+@pytest.mark.parametrize("most", [MOST_BUILT, 100])
+@pytest.mark.parametrize(
+    ("cages", "of_a_cell"), [({"count": 300}, 0.33), ({"cell_size": 2e-3}, 0.47), ({"count": 8000}, 0)]
+)
+def test_a_body_thinner_than_a_cell_is_told_with_the_cells_that_would_do(
+    tmp_path: Path, capsys, caplog, monkeypatch, cages: dict[str, float], of_a_cell: float, most: int
+):
+    """A strip of 100 x 20 x 1 mm, whose tip sinks by 0.08 to 0.66 of beam theory; whether counted or scaled."""
+    monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", most)
+    strip = block_scene(tmp_path, np.array([0.1, 0.02, 0.001]), cages=cages, time={"step": 0.01, "duration": 0.1})
+    assert main(["inspect", str(strip)]) == 0
+    said = capsys.readouterr().err
+    words = re.search(r"m thick on average .2 V / A., (.*) of a cell.* cages.count = (\d+) or (.*) puts 2", said)
+    assert (words is not None) == (of_a_cell > 0)
+    if words:
+        assert float(words[1]) == pytest.approx(of_a_cell, rel=0.2) and words[2] == "33000"
+        assert words[3] == "cages.cell_size = 0.00047"
+    # as in the first lines of a run
+    with caplog.at_level("WARNING", "msmpetsc"):
+        fill_cages(read_bodies(SELF, load_scene(strip)), load_scene(strip))
+    assert ("m thick on average" in caplog.text) == (of_a_cell > 0)
 
 
 def test_memory_is_that_of_the_process_not_of_its_parent():

@@ -15,9 +15,11 @@ from one_process import input_error
 from small_result import DT, FRAMES, NODES, POINTS, H, X, position
 from vtk.util.numpy_support import vtk_to_numpy
 
+import msmpetsc
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export, normals
+from msmpetsc.fields import Frame
 from msmpetsc.results.xdmf import write_xdmf
 
 PINNED = [0, 3]
@@ -31,6 +33,14 @@ def result(tmp_path: Path) -> Path:
 
 def surface(index: float) -> np.ndarray:
     return POINTS + 0.01 * index * small_result.X
+
+
+# [m], a place in UTM coordinates
+FAR = np.array([441871.6, 6329700.7, 120.3])
+
+
+def far_frames() -> list[Frame]:
+    return [small_result.frame(k, surface=surface(k) + FAR) for k in range(FRAMES)]
 
 
 def complaints(reader: vtk.vtkAlgorithm) -> list[str]:
@@ -96,6 +106,22 @@ def test_normals_are_those_of_a_ball():
 def test_one_frame_of_the_surface(result: Path, tmp_path: Path, ending: str):
     mesh = trimesh.load(export(result, tmp_path / f"x{ending}"), process=False)
     assert np.allclose(mesh.triangles, surface(FRAMES - 1)[[[0, 1, 2], [1, 2, 3]]], atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", [".glb", ".obj", ".ply", ".stl"])
+def test_a_surface_far_from_the_origin_is_exact(tmp_path: Path, ending: str):
+    result = small_result.write(tmp_path / "x.h5", far_frames())
+    with msmpetsc.open(result) as run:
+        assert np.array_equal(run.frames.surface[2], surface(2) + FAR)
+    path, expected = export(result, tmp_path / f"y{ending}", frames=[2]), surface(2) + FAR
+    if ending == ".glb":
+        (mesh,) = trimesh.load(path).dump()
+        found, expected = mesh.vertices, expected[:, [0, 2, 1]] * [1, 1, -1]
+    else:
+        mesh = meshio.read(path)
+        found = mesh.points[np.unique(mesh.cells_dict["triangle"], return_index=True)[0]]
+    gaps = np.linalg.norm(found[:, None] - expected, axis=2)
+    assert gaps.min(axis=0).max() < 1e-7 and gaps.min(axis=1).max() < 1e-7
 
 
 def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tmp_path: Path):
@@ -165,6 +191,14 @@ def test_the_xdmf_file_is_read_by_vtk_without_a_complaint(result: Path):
             assert np.allclose(grid["speed"], np.linalg.norm(velocity, axis=1), atol=1e-4)
         assert body.n_cells == 2 and body["cell_kind"].tolist() == [1, 1] and body.volume == pytest.approx(2 * H**3)
     assert heard == []
+
+
+def test_xdmf_is_exact_far_from_the_origin(tmp_path: Path):
+    reader = vtk.vtkXdmfReader()
+    reader.SetFileName(str(write_xdmf(small_result.write(tmp_path / "x.h5", far_frames()))))
+    reader.UpdateTimeStep(DT * 2)
+    points = vtk_to_numpy(reader.GetOutputDataObject(0).GetBlock(0).GetPoints().GetData())
+    assert np.array_equal(points, surface(2) + FAR)
 
 
 def stressed(index: int) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import small_result
 from small_result import DT, FRAMES, POINTS
-from test_export import surface
+from test_export import FAR, far_frames, surface
 
 from msmpetsc.export.formats import export
 
@@ -30,6 +30,12 @@ def opened(path: Path) -> tuple[Usd.Stage, list[UsdGeom.Mesh]]:
     return stage, [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
 
 
+def points_of(mesh: UsdGeom.Mesh, code: float) -> np.ndarray:
+    """Points (v, 3) in the stage."""
+    x, y, z = UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()).ExtractTranslation()
+    return np.array(mesh.GetPointsAttr().Get(code)) + np.array([x, y, z])
+
+
 @pytest.mark.parametrize("ending", [".usd", ".usda", ".usdc"])
 def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Path, ending: str):
     path = export(result, tmp_path / f"y{ending}")
@@ -43,11 +49,18 @@ def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Pa
     for index in (0, 1, 2.5, 4):  # between frames it goes straight
         code = Usd.TimeCode(index * DT * rate)
         points = np.array(mesh.GetPointsAttr().Get(code))
-        assert points == pytest.approx(surface(index), abs=1e-6)
+        assert points_of(mesh, code) == pytest.approx(surface(index), abs=1e-6)
         assert np.array(mesh.GetExtentAttr().Get(code)) == pytest.approx(
             np.array([points.min(axis=0), points.max(axis=0)]), abs=1e-6
         )
         assert np.linalg.norm(np.array(mesh.GetNormalsAttr().Get(0)), axis=1) == pytest.approx(1, abs=1e-6)
+
+
+def test_points_far_from_the_origin_are_exact(tmp_path: Path):
+    result = small_result.write(tmp_path / "x.h5", far_frames())
+    _stage, (mesh,) = opened(export(result, tmp_path / "y.usdc"))
+    for index in (0, 3):
+        assert points_of(mesh, index) == pytest.approx(surface(index) + FAR, rel=0, abs=1e-7)
 
 
 def test_the_mesh_is_what_usd_asks_for(result: Path, tmp_path: Path):
@@ -71,8 +84,8 @@ def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):
         file["frames/surface"] = np.concatenate([moved, 5 + 2 * POINTS - moved], axis=1)
     _stage, (first, second) = opened(export(result, tmp_path / "y.usda"))
     assert (first.GetPrim().GetName(), second.GetPrim().GetName()) == ("body_0", "body_1")
-    assert np.array(first.GetPointsAttr().Get(3)) == pytest.approx(surface(3), abs=1e-6)
-    assert np.array(second.GetPointsAttr().Get(3)) == pytest.approx(5 + surface(-3), abs=1e-6)
+    assert points_of(first, 3) == pytest.approx(surface(3), abs=1e-6)
+    assert points_of(second, 3) == pytest.approx(5 + surface(-3), abs=1e-6)
     assert list(second.GetFaceVertexIndicesAttr().Get()) == [0, 1, 2]  # of its own points
 
 
@@ -80,7 +93,7 @@ def test_chosen_frames_keep_their_times(result: Path, tmp_path: Path):
     stage, (mesh,) = opened(export(result, tmp_path / "y.usda", frames=[1, 3, 4]))
     rate = stage.GetTimeCodesPerSecond()
     assert np.array(mesh.GetPointsAttr().GetTimeSamples()) / rate == pytest.approx([0.01, 0.03, 0.04])
-    assert np.array(mesh.GetPointsAttr().Get(0.03 * rate)) == pytest.approx(surface(3), abs=1e-6)
+    assert points_of(mesh, 0.03 * rate) == pytest.approx(surface(3), abs=1e-6)
     assert frames_a_second(np.array([0.5])) == 1  # of one frame
 
 

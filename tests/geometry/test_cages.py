@@ -7,6 +7,7 @@ Enclosed cells: scipy.ndimage.label on the dense grid.
 """
 
 import os
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -18,12 +19,25 @@ from conftest import WORKERS, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from surfaces import body_of
+from surfaces import body_of, surface_of
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, choose_cell_size, fill
+from msmpetsc.geometry.cages import (
+    BOUNDARY,
+    INTERIOR,
+    BodySurface,
+    Cages,
+    choose_cell_size,
+    estimated_cells,
+    fill,
+    warn_of_thin_bodies,
+)
+from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface
 from msmpetsc.geometry.valid_cells import touched_cells
+from msmpetsc.lattice.lattice import topology_of
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
@@ -158,6 +172,47 @@ def test_an_aligned_box_is_filled_with_its_own_cells():
     assert np.array_equal(dense(cages, BOUNDARY), ~np.pad(np.ones((8, 3, 1), bool), 1))
 
 
+def single(surface: Surface) -> Surface:
+    """As a file of single precision has it."""
+    return Surface(surface.points.astype(np.float32).astype(float), surface.triangles)
+
+
+def l_shape() -> Surface:
+    """A square of 3 x 3 cells of 0.1 m, one high, less its upper 2 x 2."""
+    corners = np.array([[0, 0], [0.3, 0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.3], [0, 0.3]])
+    cuts = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    low, high = (np.column_stack([corners, np.full(6, height)]) for height in (0, 0.1))
+    sides = [[a, (a + 1) % 6, 6 + a] for a in range(6)] + [[(a + 1) % 6, 6 + (a + 1) % 6, 6 + a] for a in range(6)]
+    return Surface(np.vstack([low, high]), np.vstack([cuts[:, ::-1], cuts + 6, sides]))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.7, 3.0])
+@pytest.mark.parametrize("shape", ["box", "l"])
+def test_a_size_that_divides_a_body_divides_its_copies_in_single_precision(shape, shift):
+    """Scaled, turned and moved, as in double precision."""
+    mesh = surface_of(trimesh.creation.box(bounds=[[0, 0, 0], [0.3, 0.2, 0.1]])) if shape == "box" else l_shape()
+    moved = single(Surface(mesh.points + shift, mesh.triangles))
+    quarter = [{"rotate": {"axis": [0, 1, 0], "degrees": 90}}]
+    eighths = [{"rotate": {"axis": [0, 0, 1], "degrees": degrees}} for degrees in (30, -30)]
+    for steps, size, base in (
+        ([], None, None),
+        ([], 0.6, None),
+        ([], None, (0, 0, 5)),
+        (quarter, None, None),
+        (eighths, None, None),
+        (eighths, 1.0, (7, 8, 9)),
+    ):
+        expected = fill([body_of(prepare(mesh, steps, size))], (size or 0.3) / 3)
+        surface = prepare(moved, steps, size, base)
+        cages = fill([body_of(surface)], (size or 0.3) / 3)
+        assert np.array_equal(cages.ijk, expected.ijk)
+        assert embed([surface.points], cages, topology_of(cages).table, "affine").shape[0] == len(surface.points)
+
+
+def test_a_body_that_ends_beyond_a_plane_has_cells_there():
+    assert len(fill([body_of(trimesh.creation.box((0.3, 0.3, 0.3 + 1e-5)))], 0.1).kind) == 36
+
+
 def test_without_its_lid_the_winding_number_fills_the_box():
     body = aligned_box(lid=False)
     assert not body.report.closed
@@ -226,3 +281,16 @@ def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
 def test_more_cells_than_allowed_are_not_sought():
     with pytest.raises(InputError, match=r"cages.count: 151 is more than cages.max_cells = 150"):
         choose_cell_size([aligned_box()], 151, max_cells=150)
+
+
+def test_bodies_thinner_than_a_cell_are_told_by_their_numbers(caplog):
+    plate, cube = (body_of(trimesh.creation.box(sides)) for sides in ((1, 1, 0.02), (1, 1, 1)))
+    warn_of_thin_bodies([cube, plate], 0.1)
+    (line,) = caplog.messages
+    assert line.startswith("body.1 is 0.0192 m thick on average (2 V / A), 0.19 of a cell")
+    cells, size = (float(re.search(f"{name} = ([^ ]*)", line)[1]) for name in ("count", "cell_size"))
+    warn_of_thin_bodies([cube, plate], size)
+    assert len(caplog.messages) == 1 and estimated_cells([cube, plate], size) == pytest.approx(cells, rel=0.05)
+    warn_of_thin_bodies([cube], 0.3)
+    warn_of_thin_bodies([aligned_box(lid=False)], 0.5)
+    assert len(caplog.messages) == 1

@@ -113,3 +113,36 @@ def test_triangles_wound_against_each_other_are_told_and_cells_count_whole(caplo
     with caplog.at_level(logging.WARNING, "msmpetsc"):
         assert fill([body_of(ball)], 0.2).share is None
     assert 'wound against each other, so boundary cells count whole: prepare = ["orient"]' in caplog.text
+
+
+def test_an_open_surface_far_from_the_origin_weighs_as_near_it():
+    ball = trimesh.creation.icosphere(3, radius=0.15)
+    ball.update_faces(np.arange(len(ball.faces)) > 3)
+    near = volume(fill([body_of(ball)], 0.04))
+    ball.apply_translation([441871.6, 6329700.7, 120.3])
+    assert volume(fill([body_of(ball)], 0.04)) == pytest.approx(near, rel=1e-3)
+
+
+def moved(mesh: trimesh.Trimesh, by: float, inwards: bool = False) -> trimesh.Trimesh:
+    mesh = mesh.copy().apply_translation([by, 0, 0])
+    mesh.faces = mesh.faces[:, ::-1] if inwards else mesh.faces
+    return mesh
+
+
+BALL, CORE = BODIES["ball"], trimesh.creation.icosphere(2, radius=0.6)
+PARTS = {
+    "apart": ([BALL, moved(BALL, 3)], ""),
+    "with a cavity": ([BALL, moved(CORE, 0.1, inwards=True)], ""),
+    "all inwards": ([moved(BALL, 0, inwards=True), moved(BALL, 3, inwards=True)], ""),
+    "of two windings": ([BALL, moved(BALL, 3), moved(BALL, 6, inwards=True)], "some parts are wound inwards"),
+    "in each other": ([BALL, moved(CORE, 0.1)], "parts overlap or lie in each other"),
+    "over each other": ([BALL, moved(BALL, 1)], "parts overlap or lie in each other"),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_parts_that_weigh_otherwise_than_the_mesh_are_told(name: str, caplog: pytest.LogCaptureFixture):
+    parts, words = PARTS[name]
+    with caplog.at_level(logging.WARNING, "msmpetsc"):
+        fill([body_of(trimesh.util.concatenate(parts))], 0.1)
+    assert words in caplog.text and bool(words) == bool(caplog.text)

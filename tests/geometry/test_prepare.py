@@ -33,6 +33,16 @@ def real(name: str) -> Surface:
     return read_surface(Path(folder) / name)
 
 
+BALL = trimesh.creation.icosphere(subdivisions=5)  # 20,480 triangles
+BODY = surface_of(BALL)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "msmpetsc" / "prepared"
+
+
 def test_merge_joins_loose_triangles_and_drops_what_is_of_no_use():
     surface = box()
     points = np.vstack([surface.points[surface.triangles].reshape(-1, 3), [[7, 7, 7]]])
@@ -76,6 +86,38 @@ def test_repair_that_loses_the_body_is_refused():
         prepare(real("lung_parts.ply"), ["repair"])
 
 
+def pipe(hole: float) -> Surface:
+    """A pipe with walls of 5 cm, whose inner one lacks what lies beyond x = ``hole`` [m]."""
+    surface = surface_of(trimesh.creation.annulus(0.45, 0.5, 1.0, sections=64).subdivide().subdivide())
+    middles = surface.points[surface.triangles].mean(axis=1)
+    lacks = (np.linalg.norm(middles[:, :2], axis=1) < 0.46) & (middles[:, 0] > hole)
+    return Surface(surface.points, surface.triangles[~lacks])
+
+
+def test_repair_tells_how_much_of_the_surface_it_changed(caplog, folder):
+    pytest.importorskip("pymeshfix")
+    inner = trimesh.creation.icosphere(3, radius=0.9).apply_translation([0.15, 0, 0])
+    inner.invert()
+    crossing = joined((surface_of(trimesh.creation.icosphere(3)), surface_of(inner)))
+    small_hole = Surface(BODY.points, BODY.triangles[9:])
+    for surface, gone, new in (
+        (pipe(9.0), 0, 0),
+        (small_hole, 0, 0),
+        (pipe(0.35), 0, 10),
+        (crossing, 52, 13),
+    ):
+        caplog.clear()
+        prepare(surface, ["repair"])
+        said = [f"took {gone}% of the surface's area away, and {new}% of the area is new"] if gone + new else []
+        assert [line for line in said if line in caplog.text] == said and len(caplog.messages) == len(said)
+    large = Surface(BODY.points, BODY.triangles[450:])
+    caplog.clear()
+    # the second time from the cache
+    for _ in range(2):
+        prepare(large, ["repair"])
+    assert len(set(caplog.messages)) == 1 and len(caplog.messages) == 2 and len(list(folder.iterdir())) == 2
+
+
 def test_simplify_reduces_and_stays_closed():
     ball = surface_of(trimesh.creation.icosphere(4))
     reduced = prepare(ball, [{"simplify": 1000}])
@@ -116,6 +158,20 @@ def test_orient_turns_each_part_outwards_also_loose_and_open_ones():
     assert examine(turned).volume > 0 > examine(opened).volume
 
 
+@given(st.lists(st.booleans(), min_size=7, max_size=7), st.floats(0, 1e7))
+def test_orient_winds_cavities_inwards_and_their_cores_outwards(inwards, shift):
+    """A ball in a ball in a ball beside a box with a box in it, a second box over its edge, and one far away."""
+    balls = [surface_of(trimesh.creation.icosphere(1, radius=radius)) for radius in (1.0, 0.7, 0.4)]
+    parts = [*balls, box((5, 0, 0), 2.0), box((5.2, 0, 0)), box((6, 0, 0)), box((9, 0, 0))]
+    outwards = np.array([examine(part).volume for part in parts]) * [1, -1, 1, 1, -1, 1, 1]
+    turned = [inside_out(part) if turn else part for part, turn in zip(parts, inwards, strict=True)]
+    mesh = joined(turned)
+    mended = prepare(Surface(mesh.points + shift, mesh.triangles), ["orient"])
+    ends = np.cumsum([len(part.triangles) for part in parts])[:-1]
+    volumes = [examine(Surface(mended.points, triangles)).volume for triangles in np.split(mended.triangles, ends)]
+    assert volumes == pytest.approx(outwards, rel=1e-6)
+
+
 def test_orient_refuses_a_one_sided_surface():
     """A Möbius band of five triangles, each sharing two points with the next."""
     band = np.array([[i, (i + 1) % 5, (i + 2) % 5] for i in range(5)])
@@ -137,6 +193,17 @@ def test_size_and_base_place_the_bounding_box(size, base, sides):
     assert (high - low).max() == pytest.approx(size, rel=1e-9)
     middle = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
     assert middle == pytest.approx(base, abs=1e-9 * max(size, 10))
+
+
+@pytest.mark.parametrize("step", ["union", "repair", {"simplify": 200}, {"refine": 0.2}])
+def test_steps_are_as_exact_far_from_the_origin(step):
+    if step == "repair":
+        pytest.importorskip("pymeshfix")
+    ball = surface_of(trimesh.creation.icosphere(3, radius=0.15))
+    ball = Surface(ball.points, ball.triangles[3 * (step == "repair") :])
+    far = np.array([441871.6, 6329700.7, 120.3])
+    near, moved = (examine(prepare(Surface(ball.points + shift, ball.triangles), [step])) for shift in (0, far))
+    assert moved.volume == pytest.approx(near.volume, rel=1e-6) and moved.area == pytest.approx(near.area, rel=1e-6)
 
 
 def test_steps_run_in_the_order_given_and_leave_the_input_alone():
@@ -161,16 +228,6 @@ def test_a_step_that_leaves_nothing_is_an_error():
         prepare(point, [], size=1.0)
     with pytest.raises(InputError, match="'rotate' failed"):
         prepare(box(), [{"rotate": {"degrees": 9}}])
-
-
-BALL = trimesh.creation.icosphere(subdivisions=5)  # 20,480 triangles
-BODY = surface_of(BALL)
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "msmpetsc" / "prepared"
 
 
 class Step:

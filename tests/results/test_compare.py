@@ -96,7 +96,7 @@ def test_rounding_is_no_difference(tmp_path: Path):
     still = dict(kinetic=0.0, elastic=1e-30, potential=0.0, momentum=np.zeros(3))
 
     def written(sign: int, **other) -> Path:
-        places = dict(position=NODES * (1 + sign * 1e-15), surface=POINTS * (1 + sign * 2e-8))
+        places = dict(position=NODES * (1 + sign * 1e-15), surface=POINTS * (1 + sign * 1e-15))
         return small_result.write(tmp_path / f"{sign}.h5", [frame(i, **places | still | other) for i in (0, 1)])
 
     with Result(written(1, elastic=2e-30, momentum=np.full(3, 1e-20))) as a, Result(written(-1)) as b:

@@ -34,7 +34,7 @@ def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
             file.append(frame(index))
 
 
-def assert_holds(file: h5py.File, count: int, surface: str | None = "f4") -> None:
+def assert_holds(file: h5py.File, count: int, surface: str | None = "f8") -> None:
     """The first `count` frames are those of frames_worker, bit for bit."""
     expected = [frame(index) for index in range(count)]
     fields = {name: FRAME_FIELDS[name].dtype for name in FRAME_FIELDS.keys() & file["frames"] if name != "surface"}
@@ -63,7 +63,7 @@ def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
         assert_holds(file, STEPS + 1)
         assert {**file.attrs} == {"format": "msmpetsc", "format_version": 1, "scene": "title = 'a test'", "ranks": 3}
         assert file["frames/position"].shape == (STEPS + 1, NODES, 3) and file["frames/position"].dtype == "f8"
-        assert file["frames/surface"].shape == (STEPS + 1, POINTS, 3) and file["frames/surface"].dtype == "f4"
+        assert file["frames/surface"].shape == (STEPS + 1, POINTS, 3) and file["frames/surface"].dtype == "f8"
         assert np.array_equal(file["lattice/nodes"], positions(0, NODES))
         assert np.array_equal(file["lattice/springs"], np.arange(2 * NODES).reshape(-1, 2))
         assert file["lattice/pinned"].shape == (0,)

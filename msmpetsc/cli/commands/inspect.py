@@ -20,7 +20,14 @@ from msmpetsc.backend.machine import peak_memory
 from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import BodySurface, choose_cell_size, fill
+from msmpetsc.geometry.cages import (
+    BodySurface,
+    choose_cell_size,
+    estimated_cells,
+    estimated_size,
+    fill,
+    warn_of_thin_bodies,
+)
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.lattice.lattice import Topology, topology_of
 from msmpetsc.lattice.region import listed
@@ -92,13 +99,13 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int) 
 
     That lattice has about MOST_BUILT cells where more are wanted, and its numbers are scaled.
     """
-    h, cells = wanted.cell_size, float(wanted.count or 0)
-    if h is not None:  # inside the surface, and sticking out of it, as choose_cell_size has it
-        area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
-        cells = enclosed / h**3 + 3 / 4 * area / h**2
-    if h is None or cells > MOST_BUILT:
-        h = choose_cell_size(bodies, int(min(cells, MOST_BUILT)), NO_LIMIT, wanted.boundary)
-    cages = fill(bodies, h, NO_LIMIT, wanted.boundary)
+    h = wanted.cell_size or estimated_size(bodies, wanted.count or 0)
+    cells = float(wanted.count or estimated_cells(bodies, h))
+    built = h
+    if wanted.count or cells > MOST_BUILT:
+        built = choose_cell_size(bodies, int(min(cells, MOST_BUILT)), NO_LIMIT, wanted.boundary)
+    warn_of_thin_bodies(bodies, h if cells > MOST_BUILT else built)
+    cages = fill(bodies, built, NO_LIMIT, wanted.boundary)
     partition = count_partition(topology_of(cages), ranks)
     counted = int(partition.cells.sum())
     return partition.scaled(round(cells)) if cells > MOST_BUILT else partition, counted

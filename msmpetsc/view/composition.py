@@ -106,4 +106,4 @@ def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Co
     gravity = subject.scene.gravity
     pull = gravity.acceleration if gravity else None
     camera = camera_facing(everywhere, pull, style.eye or subject.scene.picture.eye)
-    return Composition(subject, style, everywhere, camera, scaled(colouring, distinct))
+    return Composition(subject, style, everywhere, camera, scaled(colouring, subject, distinct))

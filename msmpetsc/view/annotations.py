@@ -33,7 +33,7 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 
 
 LINE, GAP, LETTERS = 34, 36, 15  # [px]: a line's height, between entries, of type
-WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30}  # [px]: of what stands in front of a text
+WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30, "note": 0}  # [px]: of what stands in front of a text
 BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)  # [px]: rows of a bar, of a tick; middle and size of a tick's number
 FINE = 3  # a legend is drawn so many times larger, and shrunk
 
@@ -42,7 +42,7 @@ FINE = 3  # a legend is drawn so many times larger, and shrunk
 class Entry:
     """A legend entry: a bar of colours, a swatch, or an arrow in front of a text.
 
-    kind  : "bar", "swatch", "glass" or "arrow"
+    kind  : "bar", "swatch", "glass", "arrow" or, for a text alone, "note"
     ticks : of a bar, shares of its width and the numbers there
     """
 
@@ -70,6 +70,8 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
         entries.append(Entry("arrow", "force", ARROW))
     if entries and any(len(still.overlays.obstacles) for still in stills):
         entries.append(Entry("glass", "obstacle", GLASS))
+    if composition.note:
+        entries.append(Entry("note", composition.note))
     return entries
 
 
@@ -118,7 +120,7 @@ def _entry_picture(entry: Entry) -> Image.Image:
         draw.rectangle(box, entry.colour)
     elif entry.kind == "glass":
         draw.rectangle(box, "#e3e9ed", GLASS_EDGE, FINE)
-    else:
+    elif entry.kind == "arrow":
         draw.line((left, middle, right - half, middle), entry.colour, 2 * FINE)
         draw.polygon(
             [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)], entry.colour

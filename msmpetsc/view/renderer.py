@@ -115,7 +115,7 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     disk["look"] = np.column_stack([np.tile(pv.Color(GROUND).int_rgb, (disk.n_points, 1)), opacity]).astype(np.uint8)
     plotter.add_mesh(disk, scalars="look", rgb=True, lighting=False)
     shadow = body.copy()
-    lift = 2e-3 * np.ptp(body.points, axis=0).max()  # or the two surfaces would flicker into each other
+    lift = 1e-3 * radius  # or the two surfaces would flicker into each other
     shadow.points = ground.below(body.points) + lift * ground.normal
     plotter.add_mesh(shadow, color=SHADOW, lighting=False)
 

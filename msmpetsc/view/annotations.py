@@ -33,8 +33,10 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 
 
 LINE, GAP, LETTERS = 34, 36, 15  # [px]: a line's height, between entries, of type
-WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30, "note": 0}  # [px]: of what stands in front of a text
-BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)  # [px]: rows of a bar, of a tick; middle and size of a tick's number
+# Widths of the signs in front of a text [px]
+WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30, "note": 0}
+# Rows of a bar, rows of a tick, middle and size of a tick's number [px]
+BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)
 FINE = 3  # a legend is drawn so many times larger, and shrunk
 
 

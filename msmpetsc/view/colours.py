@@ -15,20 +15,11 @@ FIXED, ARROW, INK = "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"
 GLASS, GLASS_EDGE = "#a3b6c4", "#667e90"
 BOUNDARY_CELL, INTERIOR_CELL = "#c8372d", "#2f5fb3"  # Figure 2 of the paper: red and blue
-# ColorBrewer's YlGnBu, which gets darker all along, from a neutral grey: nothing at zero is tinted
+# ColorBrewer's YlGnBu from a neutral grey, so that nothing at zero is tinted
 SCALE = ("#dcdcdc", "#b9ddb9", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
-CLASSES = (
-    "#8fabc6",
-    "#e0a13a",
-    "#5aa469",
-    "#b56aa8",
-    "#c9625a",
-    "#6f7fc4",
-    "#9c8b5e",
-    "#4fa3a5",
-    "#d98cb3",
-    "#7d6b5d",
-)  # of bodies and of a body's parts
+CLASSES = (  # of bodies and of a body's parts
+    "#8fabc6", "#e0a13a", "#5aa469", "#b56aa8", "#c9625a", "#6f7fc4", "#9c8b5e", "#4fa3a5", "#d98cb3", "#7d6b5d",
+)  # fmt: skip
 # red, green and blue (256, 3), 0 to 255: along the scale, and of classes over and over
 ALONG_SCALE = LinearSegmentedColormap.from_list("", SCALE)(np.arange(256))[:, :3]
 SCALE_TABLE: Array = np.rint(255 * ALONG_SCALE).astype(np.uint8)
@@ -37,8 +28,9 @@ CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256
 
 # Fields on the surface
 
-BELOW, BEYOND = 0.99, 1.25  # a scale ends at most so many times above the values on this share of the area
-ROUNDING = 1e-12  # of a field's natural size: below it nothing is told from zero
+# A scale ends at most at BEYOND times the value that this share of the area stays below.
+BELOW, BEYOND = 0.99, 1.25
+ROUNDING = 1e-12  # share of a field's natural size; a smaller field is rounding error
 PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
 
@@ -50,7 +42,7 @@ class Colouring:
     unit    : "m", "Pa", "%"; "" for numbers of classes
     values  : number of a frame -> (v,)
     high    : end of the scale, which begins at 0
-    classes : names of the classes that the numbers mean; a class without a name is not in the legend
+    classes : names of the classes that the numbers mean; the legend has those that are not ""
     most    : greatest value, 0 if unknown; above `high` if the scale is clipped
     natural : size that the field takes if a body moves as far as it is large; 0 if there is none
     """
@@ -75,7 +67,7 @@ class Colouring:
 
     @property
     def label(self) -> str:
-        """Title with the unit of the ticks, and both ends if clipped: "stress [kPa], clipped at 80, most 210"."""
+        """Title with the unit of the ticks: "stress [kPa]", or "..., clipped at 80, most 210"."""
         prefix = "" if self.unit == "%" else PREFIXES.get(self._size, "")
         label = f"{self.title} [{prefix}{self.unit}]"
         high, most = (f"{float(f'{end / self._size:.3g}'):g}" for end in (self.high, self.most))
@@ -83,7 +75,7 @@ class Colouring:
 
     @property
     def ticks(self) -> tuple[tuple[float, str], ...]:
-        """Shares of the scale in [0, 1] at round numbers, and these numbers in the unit of the label."""
+        """Shares of the scale in [0, 1] at round numbers, with the numbers of the label's unit."""
         if self.high == 0:
             return ((0.0, "0"),)
         high = self.high / self._size
@@ -110,9 +102,11 @@ def colouring_of(subject: Drawable, name: str | None) -> Colouring:
 def _displacement(subject: Drawable) -> Colouring:
     """Return the field of distances from the points at rest."""
     rest = subject.rest.points
-    far = abs(rest).max()
     return Colouring(
-        "displacement", "m", lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1), natural=far
+        "displacement",
+        "m",
+        lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1),
+        natural=abs(rest).max(),
     )
 
 
@@ -177,7 +171,7 @@ COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {
 
 
 def scaled(colouring: Colouring, subject: Drawable, frames: Iterable[int]) -> Colouring:
-    """Return a field with the scale for these frames, which values on little of the area do not stretch."""
+    """Return a field with a scale for these frames that few points do not stretch."""
     a, b, c = subject.rest.points[subject.triangles].swapaxes(0, 1)
     area = np.repeat(np.linalg.norm(np.cross(b - a, c - a), axis=1), 3)
     weight = np.bincount(subject.triangles.ravel(), area, len(subject.rest.points))

@@ -18,7 +18,7 @@ from msmpetsc.view.drawable import FARTHEST, Drawable
 from msmpetsc.view.mesh import Cut, cut_open
 from msmpetsc.view.overlays import MARGIN, Overlays, overlays_at
 
-LEAST_MARGIN = 0.01  # of the longer side of what is seen; else MARGIN of each side
+LEAST_MARGIN = 0.01  # share of the longer side in view; else MARGIN of each side
 
 
 @dataclass(frozen=True)
@@ -142,10 +142,12 @@ def parts_of(subject: Drawable) -> list[Indices]:
 
 
 def staying(boxes: Positions) -> Mask:
-    """Return which parts (p,) stay where pictures show them; boxes: (T, p, 2, 3) around parts at each frame [m].
+    """Return which parts (p,) stay in view.
 
-    The nearest half stays, of the parts by how far they go from the box in which all begin. A part flies off if it
-    goes farther from that half, and from its own begin, than they reach.
+    Half of the parts stay: the parts that go least far from the box in which all begin. A part
+    leaves the view if it goes farther from that box and from that half than both reach.
+
+    boxes : (T, p, 2, 3) around each part at each frame [m]
     """
     begin = around(boxes[0].reshape(-1, 3))
     way = np.maximum(begin[0] - boxes[:, :, 0], boxes[:, :, 1] - begin[1]).max(axis=(0, 2))

@@ -21,8 +21,10 @@ from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
 
-LONGEST, SHORTEST = 960, np.array([240, 96])  # [px]: sides of what a film shows above its caption by itself
-USUAL, SMALLEST = np.array([480, 720]), 0.5  # [px]: sides with letters of the usual size; least share of that size
+# Sides of a film above its caption, if none are given [px]; the shortest have legible captions
+LONGEST, SHORTEST = 960, np.array([240, 96])
+# Sides from which on letters have their usual size [px], and the least share of that size
+USUAL, SMALLEST = np.array([480, 720]), 0.5
 FASTEST = 30.0  # pictures a second
 LENGTHS = 3.0, 8.0  # [s] that a film lasts, where nothing is said
 STEPS = (1, 2, 5)  # times powers of ten: how much slower or faster
@@ -78,13 +80,7 @@ def playback_of(times: Floats, speed: float | None = None) -> Playback:
     return Playback(abs(shown[:, None] - times).argmin(axis=1), fps, speed)
 
 
-def write_film(
-    subject: Drawable,
-    path: Path,
-    frames: Sequence[int],
-    style: Style,
-    playback: Playback,
-) -> None:
+def write_film(subject: Drawable, path: Path, frames: Sequence[int], style: Style, playback: Playback) -> None:
     """Write a film of some frames. Raises InputError where it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
     composition = composition_of(drawn(subject), played, style)
@@ -97,7 +93,7 @@ def write_film(
 
 
 def _usual_size(composition: Composition, stills: list[Still]) -> tuple[int, int]:
-    """Return the even width and height [px] that what is seen fills, with its caption and legend below it."""
+    """Return the even width and height [px] that the view fills, above caption and legend."""
     low, high, _ = composition.room(stills)
     width, height = np.maximum((high - low) * LONGEST / (high - low).max(), SHORTEST)
     letters = _letters(width, height)

@@ -150,7 +150,7 @@ def _box(box: Positions, bodies: Positions) -> list[Positions]:
 
 
 def _is_near(box: Positions, bodies: Positions) -> bool:
-    """Return whether a box (2, 3) is as near to the bodies as what is shown beside them."""
+    """Return whether a box (2, 3) is near enough to the bodies to be shown beside them."""
     gap = np.maximum(box[0] - bodies.max(axis=0), bodies.min(axis=0) - box[1]).max()
     return bool(gap <= NEAR * _reach(bodies))
 

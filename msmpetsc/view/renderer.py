@@ -74,7 +74,8 @@ class Renderer(AbstractContextManager["Renderer"]):
             _draw_ground(self._plotter, ground, surface)
         shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
         shading["opacity"] = THROUGH if still.cut else 1.0
-        # The border crosses triangles: it is as smooth as the share is. (Clipped as PolyData, sharp edges are merged.)
+        # The border crosses triangles, so it is as smooth as the share that is fixed.
+        # A clip of PolyData would merge the points along sharp edges.
         free, held = surface.cast_to_unstructured_grid().clip_scalar(scalars="fixed", value=HELD, both=True)
         for part, paint in (free, dict(scalars="colours", rgb=True)), (held, dict(color=FIXED)):
             if part.n_cells:

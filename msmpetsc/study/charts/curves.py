@@ -91,7 +91,7 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
 
 
 def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFrame:
-    """Return the cheapest of the rows with errors of at most ``level``, then the rows whose range overlaps its own."""
+    """Return the cheapest row below an error, then the rows whose range overlaps its own."""
     reached = measured(rows, *measure.columns)
     reached = reached[reached[measure.error] <= level].sort_values(measure.cost, kind="stable")
     reached = reached.assign(**spread(reached, measure.cost))
@@ -151,7 +151,7 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
 
 
 def cheapest_line(measure: ErrorMeasure, level: float, best: DataFrame) -> str:
-    """Return a sentence that names the cheapest case below an error, and the labels within its noise."""
+    """Return a sentence that names the cheapest case, and the methods within its noise."""
     start = f"{formatting.error(level)} or less:"
     if best.empty:
         return f"{start} nothing measured reaches it."

@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import chain, cycle, repeat
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,8 @@ COLORS = (
 X = "M-1,-.6L-.6,-1L0,-.4L.6,-1L1,-.6L.4,0L1,.6L.6,1L0,.4L-.6,1L-1,.6L-.4,0Z"
 STAR = "M0,-1.2L.35,-.4L1.15,-.37L.52,.15L.7,.97L0,.5L-.7,.97L-.52,.15L-1.15,-.37L-.35,-.4Z"
 SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross", X, STAR)
-DASHES = ((1, 0), (6, 3), (2, 2))  # of lines, by rounds of the colours
+# Dashes of lines, one for each round through the colours.
+DASHES = ((1, 0), (6, 3), (2, 2))
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
 WIDTH, HEIGHT = 1080, 280  # [px] of all panels of a chart, and of one
 MARKER = 50  # [px^2]
@@ -71,8 +71,12 @@ Columns = tuple[str, str]  # of both axes
 
 def curve_styles(labels: Iterable[str]) -> Styles:
     """Return a style for each label, assigned in order of first appearance."""
-    looks = zip(cycle(COLORS), cycle(SHAPES), chain.from_iterable(repeat(dash, len(COLORS)) for dash in cycle(DASHES)))
-    return {label: CurveStyle(*look) for label, look in zip(dict.fromkeys(labels), looks, strict=False)}
+
+    def style(n: int) -> CurveStyle:
+        rounds = n // len(COLORS)
+        return CurveStyle(COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)], DASHES[rounds % len(DASHES)])
+
+    return {label: style(n) for n, label in enumerate(dict.fromkeys(labels))}
 
 
 def tips(rows: DataFrame, names: Iterable[str], curve: str = "label") -> list[str]:

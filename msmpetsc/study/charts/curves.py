@@ -92,11 +92,12 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
 
 def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFrame:
     """Return the cheapest row below an error, then the rows whose range overlaps its own."""
-    reached = measured(rows, *measure.columns)
-    reached = reached[reached[measure.error] <= level].sort_values(measure.cost, kind="stable")
-    reached = reached.assign(**spread(reached, measure.cost))
+    rows = measured(rows, *measure.columns)
+    rows = rows[rows[measure.error] <= level].sort_values(measure.cost, kind="stable")
+    reached = rows.assign(**spread(rows, measure.cost))
     least, greatest = (reached[end].fillna(reached[measure.cost]) for end in ("least", "greatest"))
-    return reached[least <= greatest.head(1).max()]
+    overlapping: DataFrame = reached[least <= greatest.head(1).max()]
+    return overlapping
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:

@@ -33,7 +33,10 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 
 
 LINE, GAP, LETTERS = 34, 36, 15  # [px]: a line's height, between entries, of type
-WIDTHS = {"bar": 150, "swatch": 22, "glass": 22, "arrow": 30}  # [px]: of what stands in front of a text
+# Widths of the signs in front of a text [px]
+WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30, "note": 0}
+# Rows of a bar, rows of a tick, middle and size of a tick's number [px]
+BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)
 FINE = 3  # a legend is drawn so many times larger, and shrunk
 
 
@@ -41,15 +44,14 @@ FINE = 3  # a legend is drawn so many times larger, and shrunk
 class Entry:
     """A legend entry: a bar of colours, a swatch, or an arrow in front of a text.
 
-    kind  : "bar", "swatch", "glass" or "arrow"
-    low, high : numbers at the ends of a bar
+    kind  : "bar", "swatch", "glass", "arrow" or, for a text alone, "note"
+    ticks : of a bar, shares of its width and the numbers there
     """
 
     kind: str
     text: str
     colour: str = INK
-    low: str = ""
-    high: str = ""
+    ticks: tuple[tuple[float, str], ...] = ()
 
 
 def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]:
@@ -60,8 +62,7 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
         pairs = enumerate(colouring.classes)
         entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
     else:
-        low, title, high = colouring.ends
-        entries.append(Entry("bar", title, low=low, high=high))
+        entries.append(Entry("bar", colouring.label, ticks=colouring.ticks))
     kinds = {kind for still in stills if still.cut for kind in still.cut}
     entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
     if any(composition.subject.fixed(still.index).any() for still in (stills[0], stills[-1])):
@@ -71,6 +72,8 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
         entries.append(Entry("arrow", "force", ARROW))
     if entries and any(len(still.overlays.obstacles) for still in stills):
         entries.append(Entry("glass", "obstacle", GLASS))
+    if composition.note:
+        entries.append(Entry("note", composition.note))
     return entries
 
 
@@ -99,31 +102,30 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 def _entry_picture(entry: Entry) -> Image.Image:
     """Return the picture of a legend entry in fine pixels, with half a gap on either side."""
     font, middle, left = typeface(FINE * LETTERS), FINE * LINE / 2, FINE * GAP / 2
-    gap = half = 8 * FINE
+    half, gap = 8 * FINE, (18 if entry.ticks else 8) * FINE  # beside the number of the last tick
     width = FINE * WIDTHS[entry.kind]
-    texts = sum(font.getlength(text) + gap for text in (entry.low, entry.high, entry.text) if text)
-    picture = Image.new("RGB", (round(2 * left + width + texts), FINE * LINE), "white")
-    draw = ImageDraw.Draw(picture)
-    if entry.low:
-        draw.text((left, middle), entry.low, INK, font, anchor="lm")
-        left += font.getlength(entry.low) + gap
     right = left + width
+    picture = Image.new("RGB", (round(right + gap + font.getlength(entry.text) + left), FINE * LINE), "white")
+    draw = ImageDraw.Draw(picture)
     box = (left, middle - half, right, middle + half)
     if entry.kind == "bar":
+        top, bottom = (FINE * row for row in BAR)
         for pixel in range(round(left), round(right)):
             colour = tuple(SCALE_TABLE[int(255 * (pixel - left) / width)].tolist())
-            draw.line((pixel, middle - half, pixel, middle + half), colour)
+            draw.line((pixel, top, pixel, bottom), colour)
+        row, size = (FINE * number for number in NUMBER)
+        for share, number in entry.ticks:
+            at = left + share * width
+            draw.line((at, FINE * TICK[0], at, FINE * TICK[1]), INK, FINE)
+            draw.text((at, row), number, INK, typeface(size), anchor="mm")
     elif entry.kind == "swatch":
         draw.rectangle(box, entry.colour)
     elif entry.kind == "glass":
         draw.rectangle(box, "#e3e9ed", GLASS_EDGE, FINE)
-    else:
+    elif entry.kind == "arrow":
         draw.line((left, middle, right - half, middle), entry.colour, 2 * FINE)
         draw.polygon(
             [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)], entry.colour
         )
-    for text in filter(None, (entry.high, entry.text)):
-        right += gap
-        draw.text((right, middle), text, INK, font, anchor="lm")
-        right += font.getlength(text)
+    draw.text((right + gap, middle), entry.text, INK, font, anchor="lm")
     return picture

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
+from matplotlib.ticker import MaxNLocator
 
 from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError, did_you_mean
@@ -14,20 +15,11 @@ FIXED, ARROW, INK = "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"
 GLASS, GLASS_EDGE = "#a3b6c4", "#667e90"
 BOUNDARY_CELL, INTERIOR_CELL = "#c8372d", "#2f5fb3"  # Figure 2 of the paper: red and blue
-# ColorBrewer's YlGnBu without its palest: the least is light, for dark is what is pinned
-SCALE = ("#edf8b1", "#c7e9b4", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
-CLASSES = (
-    "#8fabc6",
-    "#e0a13a",
-    "#5aa469",
-    "#b56aa8",
-    "#c9625a",
-    "#6f7fc4",
-    "#9c8b5e",
-    "#4fa3a5",
-    "#d98cb3",
-    "#7d6b5d",
-)  # of bodies and of a body's parts
+# ColorBrewer's YlGnBu from a neutral grey, so that nothing at zero is tinted
+SCALE = ("#dcdcdc", "#b9ddb9", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
+CLASSES = (  # of bodies and of a body's parts
+    "#8fabc6", "#e0a13a", "#5aa469", "#b56aa8", "#c9625a", "#6f7fc4", "#9c8b5e", "#4fa3a5", "#d98cb3", "#7d6b5d",
+)  # fmt: skip
 # red, green and blue (256, 3), 0 to 255: along the scale, and of classes over and over
 ALONG_SCALE = LinearSegmentedColormap.from_list("", SCALE)(np.arange(256))[:, :3]
 SCALE_TABLE: Array = np.rint(255 * ALONG_SCALE).astype(np.uint8)
@@ -36,7 +28,9 @@ CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256
 
 # Fields on the surface
 
-
+# A scale ends at most at BEYOND times the value that this share of the area stays below.
+BELOW, BEYOND = 0.99, 1.25
+ROUNDING = 1e-12  # share of a field's natural size; a smaller field is rounding error
 PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
 
@@ -44,11 +38,13 @@ PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: 
 class Colouring:
     """A scalar field on the surface points, with its colour scale.
 
-    title   : what it is
-    unit    : "m", "Pa", "%"; "" where the numbers are those of classes
+    title   : name of the field
+    unit    : "m", "Pa", "%"; "" for numbers of classes
     values  : number of a frame -> (v,)
     high    : end of the scale, which begins at 0
-    classes : names, where the field is a number of a class; those without a name are not in the legend
+    classes : names of the classes that the numbers mean; the legend has those that are not ""
+    most    : greatest value, 0 if unknown; above `high` if the scale is clipped
+    natural : size that the field takes if a body moves as far as it is large; 0 if there is none
     """
 
     title: str
@@ -56,6 +52,8 @@ class Colouring:
     values: Callable[[int], Floats]
     high: float = 1.0
     classes: tuple[str, ...] = ()
+    most: float = 0.0
+    natural: float = 0.0
 
     @property
     def table(self) -> Array:
@@ -68,12 +66,26 @@ class Colouring:
         return np.clip(np.rint(np.nan_to_num(self.values(index) / step)), 0, 255).astype(np.uint8)
 
     @property
-    def ends(self) -> tuple[str, str, str]:
-        """Both ends of the scale, in the unit that the title names: ("0", "displacement [mm]", "12.5")."""
-        if self.unit == "%":
-            return "0", f"{self.title} [%]", f"{100 * self.high:.3g}"
-        size = next((size for size in PREFIXES if self.high >= size), 1.0)
-        return "0", f"{self.title} [{PREFIXES[size]}{self.unit}]", f"{self.high / size:.3g}"
+    def label(self) -> str:
+        """Title with the unit of the ticks: "stress [kPa]", or "..., clipped at 80, most 210"."""
+        prefix = "" if self.unit == "%" else PREFIXES.get(self._size, "")
+        label = f"{self.title} [{prefix}{self.unit}]"
+        high, most = (f"{float(f'{end / self._size:.3g}'):g}" for end in (self.high, self.most))
+        return f"{label}, clipped at {high}, most {most}" if self.most > self.high else label
+
+    @property
+    def ticks(self) -> tuple[tuple[float, str], ...]:
+        """Shares of the scale in [0, 1] at round numbers, with the numbers of the label's unit."""
+        if self.high == 0:
+            return ((0.0, "0"),)
+        high = self.high / self._size
+        numbers = MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(0, high)
+        return tuple((number / high, f"{number:.3g}") for number in numbers if 0 <= number <= high)
+
+    @property
+    def _size(self) -> float:
+        """One unit of the ticks, in the unit of the values."""
+        return 0.01 if self.unit == "%" else next((size for size in PREFIXES if self.high >= size), 1.0)
 
 
 def colouring_of(subject: Drawable, name: str | None) -> Colouring:
@@ -90,7 +102,12 @@ def colouring_of(subject: Drawable, name: str | None) -> Colouring:
 def _displacement(subject: Drawable) -> Colouring:
     """Return the field of distances from the points at rest."""
     rest = subject.rest.points
-    return Colouring("displacement", "m", lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1))
+    return Colouring(
+        "displacement",
+        "m",
+        lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1),
+        natural=abs(rest).max(),
+    )
 
 
 def _speed(subject: Drawable) -> Colouring:
@@ -104,7 +121,7 @@ def _speed(subject: Drawable) -> Colouring:
         velocity = (subject.surface(after) - subject.surface(before)) / (subject.times[after] - subject.times[before])
         return np.asarray(np.linalg.norm(velocity, axis=1))
 
-    return Colouring("speed", "m/s", values)
+    return Colouring("speed", "m/s", values, natural=abs(subject.rest.points).max() / (np.ptp(subject.times) or 1.0))
 
 
 def _strain(subject: Drawable) -> Colouring:
@@ -118,7 +135,7 @@ def _strain(subject: Drawable) -> Colouring:
         squares = np.repeat((length / rest_length - 1) ** 2, 2)
         return subject.on_surface(np.sqrt(np.bincount(springs.ravel(), squares, len(nodes)) / count))
 
-    return Colouring("strain of the springs", "%", values)
+    return Colouring("strain of the springs", "%", values, natural=1.0)
 
 
 def _stress(subject: Drawable) -> Colouring:
@@ -128,7 +145,8 @@ def _stress(subject: Drawable) -> Colouring:
         if subject.scene.material.poisson is None:
             raise InputError(f"--colour stress: {subject.name} is of springs, whose law has no stress")
         raise InputError(f"--colour stress: {subject.name} has no stress: run its scene with output.stress = true")
-    return Colouring("von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)))
+    young = subject.scene.material.young_modulus or 0.0
+    return Colouring("von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)), natural=young)
 
 
 def _part(subject: Drawable) -> Colouring:
@@ -152,6 +170,18 @@ COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {
 }
 
 
-def scaled(colouring: Colouring, frames: Iterable[int]) -> Colouring:
-    """Return a field whose colour scale ends at the greatest value in these frames."""
-    return replace(colouring, high=max(float(colouring.values(index).max(initial=0)) for index in frames))
+def scaled(colouring: Colouring, subject: Drawable, frames: Iterable[int]) -> Colouring:
+    """Return a field with a scale for these frames that few points do not stretch."""
+    a, b, c = subject.rest.points[subject.triangles].swapaxes(0, 1)
+    area = np.repeat(np.linalg.norm(np.cross(b - a, c - a), axis=1), 3)
+    weight = np.bincount(subject.triangles.ravel(), area, len(subject.rest.points))
+    high = most = 0.0
+    for index in frames:
+        values = np.nan_to_num(colouring.values(index))
+        order = np.argsort(values)
+        below = np.cumsum(weight[order])
+        usual = float(values[order[np.searchsorted(below, BELOW * below[-1])]])
+        most, high = max(most, float(values.max())), max(high, BEYOND * usual)
+    if most <= ROUNDING * colouring.natural:
+        return replace(colouring, high=0.0)
+    return replace(colouring, high=min(most, high) or most, most=most)

@@ -6,14 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 import pyvista as pv
 
-from msmpetsc.backend.arrays import Floats, Positions
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions
+from msmpetsc.comm import log
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.prepare import part_labels
+from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.view.camera import Camera, camera_facing
 from msmpetsc.view.colours import Colouring, colouring_of, scaled
 from msmpetsc.view.drawable import FARTHEST, Drawable
 from msmpetsc.view.mesh import Cut, cut_open
 from msmpetsc.view.overlays import MARGIN, Overlays, overlays_at
+
+LEAST_MARGIN = 0.01  # share of the longer side in view; else MARGIN of each side
 
 
 @dataclass(frozen=True)
@@ -46,21 +51,25 @@ class Still:
 class Composition:
     """All frames to be drawn of a subject, with the camera, colours and extent that they share.
 
-    extremes  : (e, 3) points that reach farthest in some direction at some frame [m]
+    extremes  : (e, 3) points in view that reach farthest in some direction at some frame [m]
+    bounds    : corners (2, 3) of the box around all frames, with parts that have left the view [m]
     camera    : of all stills
     colouring : with its scale
+    note      : says which parts fly out of the picture; "" if none do
     """
 
     subject: Drawable
     style: Style
     extremes: Positions
+    bounds: Positions
     camera: Camera
     colouring: Colouring
+    note: str = ""
 
     @property
     def box(self) -> Positions:
-        """Corners (2, 3) of the box around all frames [m]."""
-        return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
+        """Corners (2, 3) of the box around all that stays in view [m]."""
+        return around(self.extremes)
 
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
         """Return the still of each frame, with its time and `words` in the caption."""
@@ -76,7 +85,8 @@ class Composition:
 
         With a margin. Of a ground only the shadows of the bodies count.
         """
-        margin = MARGIN * np.ptp(self.box, axis=0).max()
+        sides = np.ptp(self.camera.flat(self.extremes), axis=0)
+        margin = np.maximum(MARGIN * sides, LEAST_MARGIN * sides.max())
         ends, corners = [], [self.extremes]
         for still in stills:
             shown = still.overlays
@@ -91,19 +101,57 @@ class Composition:
 def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Composition:
     """Return the composition of frames, which are read one at a time. Raises InputError."""
     colouring = colouring_of(subject, style.colour)
-    # the points farthest out in these directions stand for all of a frame
-    directions = np.concatenate([np.eye(3), -np.eye(3), pv.Icosphere(nsub=1).points])
-    extremes = []
+    # The points farthest out in these directions stand for all of a part.
+    directions = np.concatenate([np.eye(3), -np.eye(3), pv.Icosphere(nsub=1).points]).T
+    parts = parts_of(subject)
+    extremes: list[list[Positions]] = []
     distinct = sorted(set(frames))
     for index in counted(distinct, "frames read"):
         points = subject.surface(index)
         if not (np.abs(points) < FARTHEST).all():
             raise InputError(f"{subject.name}: frame {index} has points that cannot be drawn")
-        extremes.append(points[np.unique((points @ directions.T).argmax(axis=0))])
-    everywhere = np.concatenate(extremes)
-    if np.ptp(everywhere, axis=0).max() == 0:
+        of_parts = (points[own] for own in parts)
+        extremes.append([own[np.unique((own @ directions).argmax(axis=0))] for own in of_parts])
+    boxes = np.array([[around(own) for own in of_frame] for of_frame in extremes])
+    bounds = around(boxes.reshape(-1, 3))
+    if np.ptp(bounds, axis=0).max() == 0:
         raise InputError(f"{subject.name}: the surface at these frames has no extent")
+    stays = staying(boxes)
+    note = "" if stays.all() else f"{(~stays).sum()} of {len(parts)} parts leave the picture"
+    if note:
+        log.info("%s: %s", subject.name, note)
+    kept = (own for of_frame in extremes for own, stay in zip(of_frame, stays, strict=True) if stay)
+    shown = np.concatenate([*extremes[0], *kept])
     gravity = subject.scene.gravity
     pull = gravity.acceleration if gravity else None
-    camera = camera_facing(everywhere, pull, style.eye or subject.scene.picture.eye)
-    return Composition(subject, style, everywhere, camera, scaled(colouring, distinct))
+    camera = camera_facing(shown, pull, style.eye or subject.scene.picture.eye)
+    return Composition(subject, style, shown, bounds, camera, scaled(colouring, subject, distinct), note)
+
+
+def around(points: Positions) -> Positions:
+    """Return the corners (2, 3) of the box around points (n, 3)."""
+    return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def parts_of(subject: Drawable) -> list[Indices]:
+    """Return the numbers of the surface points of each connected part of each body."""
+    rest, triangles = subject.rest, subject.triangles
+    labels = part_labels(Surface(rest.points, triangles)) * (rest.body_of_point.max() + 1)
+    labels += rest.body_of_point[triangles[:, 0]]
+    return [np.unique(triangles[labels == label]) for label in np.unique(labels)]
+
+
+def staying(boxes: Positions) -> Mask:
+    """Return which parts (p,) stay in view.
+
+    Half of the parts stay: the parts that go least far from the box in which all begin. A part
+    leaves the view if it goes farther from that box and from that half than both reach.
+
+    boxes : (T, p, 2, 3) around each part at each frame [m]
+    """
+    begin = around(boxes[0].reshape(-1, 3))
+    way = np.maximum(begin[0] - boxes[:, :, 0], boxes[:, :, 1] - begin[1]).max(axis=(0, 2))
+    nearest = np.argsort(way, kind="stable")[: max(1, len(way) // 2)]
+    home = around(np.concatenate([begin, boxes[:, nearest].reshape(-1, 3)]))
+    reach = np.ptp(home, axis=0).max()
+    return np.asarray(((boxes[:, :, 0] >= home[0] - reach) & (boxes[:, :, 1] <= home[1] + reach)).all(axis=(0, 2)))

@@ -21,8 +21,10 @@ from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
 
-LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
-USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
+# Sides of a film above its caption, if none are given [px]; the shortest have legible captions
+LONGEST, SHORTEST = 960, np.array([240, 96])
+# Sides from which on letters have their usual size [px], and the least share of that size
+USUAL, SMALLEST = np.array([480, 720]), 0.5
 FASTEST = 30.0  # pictures a second
 LENGTHS = 3.0, 8.0  # [s] that a film lasts, where nothing is said
 STEPS = (1, 2, 5)  # times powers of ten: how much slower or faster
@@ -78,13 +80,7 @@ def playback_of(times: Floats, speed: float | None = None) -> Playback:
     return Playback(abs(shown[:, None] - times).argmin(axis=1), fps, speed)
 
 
-def write_film(
-    subject: Drawable,
-    path: Path,
-    frames: Sequence[int],
-    style: Style,
-    playback: Playback,
-) -> None:
+def write_film(subject: Drawable, path: Path, frames: Sequence[int], style: Style, playback: Playback) -> None:
     """Write a film of some frames. Raises InputError where it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
     composition = composition_of(drawn(subject), played, style)
@@ -92,20 +88,29 @@ def write_film(
     if playback.speed:
         seconds = len(played) / playback.fps
         log.info("the film lasts %.2g s, %s", seconds, playback.words or "in real time")
-    size = style.size
-    if size is None:  # what is seen fills it; both sides are even
-        low, high, _ = composition.room(stills)
-        width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
-        size = 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
+    size = style.size or _usual_size(composition, stills)
     write_pictures(path, _pictures(composition, stills, size), size, playback.fps)
+
+
+def _usual_size(composition: Composition, stills: list[Still]) -> tuple[int, int]:
+    """Return the even width and height [px] that the view fills, above caption and legend."""
+    low, high, _ = composition.room(stills)
+    width, height = np.maximum((high - low) * LONGEST / (high - low).max(), SHORTEST)
+    letters = _letters(width, height)
+    below = letters * CAPTION + len(legend_picture(entries_of(composition, stills), round(width), letters))
+    return 2 * round(width / 2), 2 * round((height + below) / 2)
+
+
+def _letters(width: float, height: float) -> float:
+    """Return the size of letters in a film of some width and height [px], 1 in a sheet."""
+    return float(np.clip(((width, height) / USUAL).min(), SMALLEST, 1.0))
 
 
 def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[Array]:
     """Yield the picture (height, width, 3) of each still; a frame that stays is drawn once."""
     width, height = size
-    letters = min(1.0, max(height / USUAL, SMALLEST))
-    entries = entries_of(composition, stills)
-    legend = legend_picture(entries, width, letters)
+    letters = _letters(width, height)
+    legend = legend_picture(entries_of(composition, stills), width, letters)
     room = height - round(letters * CAPTION) - len(legend)
     if room < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")

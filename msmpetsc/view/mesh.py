@@ -18,7 +18,7 @@ from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
 SHARP = 30.0  # [degrees] between the normals of two triangles: beyond it their edge is sharp
-HELD = 0.5  # share of a point that is fixed: a triangle is whose corners all have more
+HELD = 0.5  # pinned or led share of the surface beyond which it is painted as fixed
 MOST = 30_000  # triangles, roughly: however small the cells, edges are not divided into more
 CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])  # of a cell, VTK's order
 

@@ -87,7 +87,7 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
     bodies : (b, 3) surface points of all pictures [m], which say how much of an obstacle is worth showing
     """
     time, solids = float(subject.times[index]), subject.solids
-    shown = Overlays(arrows=_arrows(subject, index))
+    shown = Overlays(arrows=[arrow for arrow in _arrows(subject, index) if _is_near(arrow[[0, 0]], bodies)])
     for number, obstacle in enumerate(subject.scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):
             continue
@@ -144,10 +144,15 @@ def _box(box: Positions, bodies: Positions) -> list[Positions]:
     margin = (CUT - 1) / 2 * extent
     long = box[1] - box[0] > CUT * extent
     box = np.where(long, np.clip(box, low - margin, high + margin), box)
-    gap = np.maximum(box[0] - high, low - box[1]).max()
-    if gap > NEAR * _reach(bodies) or (box[0] >= box[1]).any():
+    if not _is_near(box, bodies) or (box[0] >= box[1]).any():
         return []
     return [np.array([*product(*box.T)])]
+
+
+def _is_near(box: Positions, bodies: Positions) -> bool:
+    """Return whether a box (2, 3) is near enough to the bodies to be shown beside them."""
+    gap = np.maximum(box[0] - bodies.max(axis=0), bodies.min(axis=0) - box[1]).max()
+    return bool(gap <= NEAR * _reach(bodies))
 
 
 def _arrows(subject: Drawable, index: int) -> list[Positions]:

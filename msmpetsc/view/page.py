@@ -26,7 +26,7 @@ from msmpetsc.view.annotations import entries_of
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.film import usual_speed
-from msmpetsc.view.mesh import HELD, drawn
+from msmpetsc.view.mesh import drawn
 from msmpetsc.view.overlays import Overlays
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
@@ -51,8 +51,8 @@ def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Styl
         chosen = [*chosen[:-1:step], chosen[-1]]
     if len(chosen) < len(frames):
         log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
-    states: dict[bytes, int] = {}  # which points are pinned or led (255, or 0), each state once
-    fixed = (np.where(composition.subject.fixed(index) > HELD, 255, 0).astype(np.uint8) for index in chosen)
+    states: dict[bytes, int] = {}  # pinned or led shares of the points times 255, each state once
+    fixed = (np.rint(255 * composition.subject.fixed(index)).astype(np.uint8) for index in chosen)
     numbers = [states.setdefault(mask.tobytes(), len(states)) for mask in fixed]
     streams["fixed"] = zlib.compress(b"".join(states))
     facts = page_facts(composition, composition.stills(chosen)) | {"fixed": numbers}
@@ -64,7 +64,7 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
     subject = composition.subject
     bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     return {
-        "positions": deflated(residuals(quantised(subject.surface, frames, composition.box))),
+        "positions": deflated(residuals(quantised(subject.surface, frames, composition.bounds))),
         "colours": deflated(changes(map(composition.colouring.numbers, frames))),
         "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
     }
@@ -111,7 +111,8 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
-        "box": composition.box,
+        "box": composition.bounds,
+        "view": composition.box,
         "times": subject.times[frames],
         "speed": usual_speed(float(np.ptp(subject.times[[frames[0], frames[-1]]]))),
         "camera": asdict(composition.camera),

@@ -20,7 +20,7 @@ precision mediump float;
 in vec3 facing; in vec3 paint; in float held; uniform vec3 fixedColour; out vec4 pixel;
 ${LIGHT}
 void main() {
-  vec3 colour = held > 0.99 ? fixedColour : paint; // a face is held whose corners all are
+  vec3 colour = held > 0.5 ? fixedColour : paint; // as renderer.py clips
   pixel = vec4(colour * light(normalize(facing)), 1.0);
 }`];
 const FLAT = [`#version 300 es
@@ -249,7 +249,7 @@ function drawArrow(camera, [tail, tip], eye) { // flat, as wide seen from every 
   drawFlat(camera, [at(0.64, 0.13), at(0.64, -0.13), tip], gl.TRIANGLES, [...colour("#cf5a3c"), 1]);
 }
 
-const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [n >> 2 & 1, n >> 1 & 1, n & 1].map((bit, k) => box[bit][k]));
+const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [n >> 2 & 1, n >> 1 & 1, n & 1].map((bit, k) => seen[bit][k]));
 
 function draw() {
   const density = Math.min(window.devicePixelRatio || 1, 2);

@@ -16,14 +16,19 @@ function showState() {
   bar.lastChild.textContent = `${+(length / scale).toPrecision(3)} ${name}`;
 }
 
-function legendEntry({ kind, text, colour: paint, low, high }) {
+function legendEntry({ kind, text, colour: paint, ticks }) {
   const entry = document.createElement("span"), mark = document.createElement(kind === "arrow" ? "b" : "i");
   mark.className = kind;
   if (kind === "arrow") { mark.textContent = "➞"; mark.style.color = paint; }
   else if (kind === "bar") mark.style.background = `linear-gradient(to right, ${data.scale.filter((_, k) => k % 15 === 0).map((rgb) => `rgb(${rgb})`)})`;
   else mark.style.background = paint;
-  const words = [high, text].filter((part) => part).join("\u2002");
-  entry.append(low, mark, words);
+  for (const [share, number] of ticks) {
+    const tick = document.createElement("small");
+    tick.textContent = number;
+    tick.style.left = `${100 * share}%`;
+    mark.append(tick);
+  }
+  entry.append(mark, text);
   return entry;
 }
 

@@ -69,15 +69,17 @@ class Renderer(AbstractContextManager["Renderer"]):
         subject, colouring = self._composition.subject, self._composition.colouring
         surface = surface_of(subject.surface(still.index), subject.triangles)
         surface["colours"] = colouring.table[colouring.numbers(still.index)]
+        surface["fixed"] = subject.fixed(still.index)
         for ground in still.overlays.grounds:
             _draw_ground(self._plotter, ground, surface)
         shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
         shading["opacity"] = THROUGH if still.cut else 1.0
-        fixed = (subject.fixed(still.index) > HELD)[subject.triangles].all(axis=1)
-        if fixed.any():
-            self._plotter.add_mesh(surface.extract_cells(fixed), color=FIXED, **shading)
-        if not fixed.all():
-            self._plotter.add_mesh(surface.extract_cells(~fixed), scalars="colours", rgb=True, **shading)
+        # The border crosses triangles, so it is as smooth as the share that is fixed.
+        # A clip of PolyData would merge the points along sharp edges.
+        free, held = surface.cast_to_unstructured_grid().clip_scalar(scalars="fixed", value=HELD, both=True)
+        for part, paint in (free, dict(scalars="colours", rgb=True)), (held, dict(color=FIXED)):
+            if part.n_cells:
+                self._plotter.add_mesh(part, **paint, **shading)
         for kind, cells in (still.cut or {}).items():
             grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, subject.nodes(still.index)).shrink(SHRUNK)
             self._plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
@@ -114,7 +116,7 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     disk["look"] = np.column_stack([np.tile(pv.Color(GROUND).int_rgb, (disk.n_points, 1)), opacity]).astype(np.uint8)
     plotter.add_mesh(disk, scalars="look", rgb=True, lighting=False)
     shadow = body.copy()
-    lift = 2e-3 * np.ptp(body.points, axis=0).max()  # or the two surfaces would flicker into each other
+    lift = 1e-3 * radius  # or the two surfaces would flicker into each other
     shadow.points = ground.below(body.points) + lift * ground.normal
     plotter.add_mesh(shadow, color=SHADOW, lighting=False)
 

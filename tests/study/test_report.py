@@ -13,7 +13,7 @@ from study_files import Balance, row_of, spaced, svgs, tooltips, write_rows
 from msmpetsc.study.charts.curves import (
     STEP,
     TRAJECTORY,
-    cheapest,
+    contenders,
     front,
     front_rows,
     growth_charts,
@@ -78,11 +78,12 @@ def test_errors_that_read_alike_are_no_reason_to_pay_more():
 
 def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
     rows = succeeded(typed(ERRORS))
-    assert [(row["label"], row["error"]) for row in (cheapest(rows, STEP, e) for e in (1e-1, 5e-3, 1e-4))] == [
-        ("anderson", 1e-2), ("newton", 1e-2), ("newton", 1e-4),
+    best = [contenders(rows, STEP, error) for error in (1e-1, 5e-3, 1e-4)]
+    assert [[*row[["label", "error"]].itertuples(index=False, name=None)] for row in best] == [
+        [("anderson", 1e-2)], [("newton", 1e-2)], [("newton", 1e-4)],
     ]  # fmt: skip
-    assert cheapest(rows, STEP, 1e-6) is None
-    assert cheapest(rows, TRAJECTORY, 0.2)["label"] == "verlet", "0.02 s for 0.01 s: 2 s a simulated second"
+    assert contenders(rows, STEP, 1e-6).empty
+    assert [*contenders(rows, TRAJECTORY, 0.2)["label"]] == ["verlet"], "0.02 s for 0.01 s: 2 s a simulated second"
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
     assert "anderson, 30 ms a frame" in step[0] and "verlet, 2 s a simulated second" in trajectory[2]
@@ -100,6 +101,43 @@ NOISY = [
     repeated("anderson", 0.014, 0.029, 0.037, error=1e-4, true_error=1e-4, trajectory_error=0.05),
     repeated("lbfgs", 0.022, 0.030, 0.031, true_error=1e-4, trajectory_error=0.05),
 ]
+
+
+def test_no_winner_is_told_within_its_noise():
+    rows = succeeded(typed(NOISY))
+    assert [*contenders(rows, STEP, 1e-2)["label"]] == ["newton", "pipecg", "anderson", "anderson"]
+    assert [*contenders(rows, STEP, 1e-3)["label"]] == ["anderson", "lbfgs"]
+    assert [*contenders(rows[:1], STEP, 1e-2)["label"]] == ["newton"], "nothing else was measured"
+    once = typed(
+        [NOISY[0], row_of("cg", time_frame=0.02, true_error=4e-3), row_of("mg", time_frame=0.03, true_error=4e-3)]
+    )
+    assert [*contenders(once, STEP, 1e-2)["label"]] == ["newton", "cg"], "a time within the range of the cheapest"
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
+    step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
+    assert "newton, 10 ms [9 ms to 21 ms] a frame" in step[1] and "noise" in step[1]
+    assert re.findall(r"(\w+) [\d.]+ ms (\[.*?\])", step[1].partition("noise")[2]) == [
+        ("pipecg", "[9 ms to 22 ms]"), ("anderson", "[20 ms to 37 ms]"),
+    ]  # fmt: skip
+    assert "newton, 1 s [900 ms to 2.1 s] a simulated second" in trajectory[0] and "pipecg" in trajectory[0]
+    (rings,) = [layer for layer in chart.panels[0].layers if layer["mark"].get("shape") == RING]
+    assert sorted(ring["y"] for ring in rings["data"]["values"]) == [0.01, 0.012, 0.028, 0.029, 0.03], "lbfgs is slower"
+
+
+def test_twenty_options_are_told_apart_by_colour_mark_and_dashes():
+    styles = curve_styles(f"option {number}" for number in range(20))
+    looks = list(styles.values())
+    assert len({(look.color, *look.dash) for look in looks}) == 20, "lines alone, between their marks"
+    triangles = {"triangle-up", "triangle-down", "triangle-left", "triangle-right"}
+    for one, other in zip(looks, looks[11:], strict=False):
+        assert one.color == other.color and one.shape != other.shape and not {one.shape, other.shape} <= triangles
+    rows = typed(
+        row_of(label, cells=cells, error=error, time_frame=1, true_error=error)
+        for label in styles for error in (1e-1, 1e-2, 1e-3, 1e-4) for cells in (1000, 2000)
+    )  # fmt: skip
+    (chart,) = growth_charts(rows, styles)
+    assert len({(look.color, look.shape, *look.dash) for look in chart.styles.values()}) == 80
+    lines = [layer for layer in chart.panels[0].layers if layer["mark"]["type"] == "line"]
+    assert all(layer["encoding"]["strokeDash"]["scale"]["range"][-1] == (6, 3) for layer in lines)
 
 
 def values(panel: Axes, column: str) -> list:

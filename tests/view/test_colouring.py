@@ -39,9 +39,10 @@ def test_speed_is_the_way_over_the_time_around_a_frame(subject):
 def test_stress_is_von_mises_at_the_nodes_in_a_unit_of_its_size(subject):
     nodes = len(subject.rest.nodes)
     stressed = replace(subject, von_mises=lambda index: np.full(nodes, 2e6 * index))
-    shown = scaled(colouring_of(stressed, "stress"), [0, 1])
+    shown = scaled(colouring_of(stressed, "stress"), subject, [0, 1])
     assert shown.values(1) == pytest.approx(np.full(len(subject.rest.points), 2e6))
-    assert shown.ends == ("0", "von Mises' stress [MPa]", "2")
+    assert shown.label == "von Mises' stress [MPa]" and shown.high == 2e6
+    assert shown.ticks == ((0, "0"), (0.25, "0.5"), (0.5, "1"), (0.75, "1.5"), (1, "2"))
     with pytest.raises(InputError, match="is of springs"):
         colouring_of(subject, "stress")
     text = BARE.replace("stiffness = 1.0", 'young_modulus = 1.0, law = "neo-hookean"')
@@ -77,10 +78,56 @@ def test_parts_are_those_of_the_nearest_cell(subject):
 
 
 @pytest.mark.parametrize(
-    ("high", "end"), [(0.0125, ("0", "way [mm]", "12.5")), (3.0, ("0", "way [m]", "3")), (0.0, ("0", "way [m]", "0"))]
+    ("high", "unit", "label", "ticks"),
+    [
+        (0.0125, "m", "way [mm]", ["0", "5", "10"]),
+        (3.0, "m", "way [m]", ["0", "1", "2", "3"]),
+        (0.0, "m", "way [m]", ["0"]),
+        (0.4, "%", "way [%]", ["0", "10", "20", "30", "40"]),
+    ],
 )
-def test_ends_of_the_scale_have_a_fitting_unit(high, end):
-    assert Colouring("way", "m", lambda _: np.zeros(1), high).ends == end
+def test_the_scale_has_ticks_at_round_numbers_of_a_fitting_unit(high, unit, label, ticks):
+    shown = Colouring("way", unit, lambda _: np.zeros(1), high)
+    assert shown.label == label and [number for _, number in shown.ticks] == ticks
+    size = {"[mm]": 1e-3, "[m]": 1.0, "[%]": 0.01}[label.split()[1]]
+    assert [share * high for share, _ in shown.ticks] == pytest.approx([size * float(number) for number in ticks])
+
+
+def test_few_points_at_a_clamp_do_not_rule_the_scale_and_it_says_so():
+    """A grid of 51 x 51 points: stress to 100 kPa along it, and 5 MPa at two points of its clamped edge."""
+    x, y = np.mgrid[0:51, 0:51].reshape(2, -1)
+    first = np.flatnonzero((x < 50) & (y < 50))
+    triangles = np.concatenate([first[:, None] + [0, 51, 52], first[:, None] + [0, 52, 1]])
+    subject = drawable_of(np.stack([x, y, 0 * x], axis=1) / 50.0, triangles)
+    stress = 1e5 * x / 50.0
+    smooth = scaled(Colouring("stress", "Pa", lambda _: stress), subject, [0])
+    assert smooth.high == 1e5 and smooth.label == "stress [kPa]", "nothing is clipped that is not far above all else"
+    peaked = np.where((x == 50) & (y < 2), 5e6, stress)
+    clipped = scaled(Colouring("stress", "Pa", lambda _: peaked), subject, [0])
+    assert (
+        1e5 < clipped.high < 1.3e5 and clipped.label == f"stress [kPa], clipped at {clipped.high / 1e3:.3g}, most 5000"
+    )
+    numbers = clipped.numbers(0)
+    assert numbers[peaked == 5e6].tolist() == [255, 255] and numbers[x == 25].min() > 90, "two of 255 if they ruled it"
+    alone = np.where((x == 50) & (y < 2), 5e6, 0)
+    assert scaled(Colouring("stress", "Pa", lambda _: alone), subject, [0]).high == 5e6, "nothing else is stressed"
+
+
+@pytest.mark.parametrize("name", ["displacement", "speed", "stress"])
+def test_a_body_at_rest_is_not_tinted_though_its_field_is_rounded(subject, name):
+    """Shares of 1e-16 of its size, its age and its stiffness are no motion and no stress."""
+    noise = np.random.default_rng(0).uniform(-1e-16, 1e-16, (3, *subject.rest.nodes.shape))
+    text = BARE.replace("stiffness = 1.0", 'young_modulus = 1e6, law = "neo-hookean"')
+    still = replace(
+        subject,
+        scene=SceneFile.model_validate(toml_of(text)),
+        nodes=lambda index: subject.rest.nodes + noise[index],
+        times=np.arange(3) / 10,
+        von_mises=lambda index: 1e6 * abs(noise[index, :, 0]),
+    )
+    shown = scaled(colouring_of(still, name), still, [0, 1, 2])
+    red, green, blue = shown.table[shown.numbers(1)].astype(int).T
+    assert (red == green).all() and (green == blue).all() and shown.ticks == ((0, "0"),)
 
 
 def test_the_scale_ends_where_its_colours_do():

@@ -1,18 +1,22 @@
 """Films: their playback, their pictures as they come out of the file, and what cannot be filmed."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from ball_result import HEIGHTS
 from one_process import input_error
 from PIL import Image, ImageSequence
+from surface_alone import drawable_of
 
 from msmpetsc.cli.commands import render as command
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
-from msmpetsc.view.film import playback_of, usual_speed
+from msmpetsc.view.composition import Style
+from msmpetsc.view.film import playback_of, usual_speed, write_film
 
 TIMES = np.arange(11) / 10  # of the ball's frames [s]
 
@@ -105,13 +109,13 @@ def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, ca
 
 
 def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
-    """The bar of colours goes from the palest to the darkest, and without colours there is none."""
+    """The bar of colours goes from the neutral grey to the darkest, and without colours there is none."""
     for name, words in {"plain": [], "coloured": ["--colour", "displacement"]}.items():
         render(falling_ball, "-o", tmp_path / f"{name}.png", "--frames", "0,5", *words)
     plain, coloured = (np.array(Image.open(tmp_path / f"{name}.png")).astype(int) for name in ("plain", "coloured"))
     assert len(coloured) == len(plain) + 34
-    for end in ([0xED, 0xF8, 0xB1], [8, 0x1D, 0x58]):
-        assert (abs(coloured[-17] - end).max(axis=1) < 12).any()
+    for end in ([0xDC, 0xDC, 0xDC], [8, 0x1D, 0x58]):
+        assert (abs(coloured[-24] - end).max(axis=1) < 12).any()
 
 
 @pytest.mark.parametrize(
@@ -137,3 +141,20 @@ def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
 )
 def test_what_cannot_be_drawn_ends_in_one_line(falling_ball, words, line):
     assert re.search(line, input_error(lambda: render(falling_ball, *words)))
+
+
+@pytest.mark.parametrize("sides", [(1.0, 0.1, 0.1), (0.1, 0.1, 1.0), (0.3, 0.3, 0.3)], ids=["long", "high", "cube"])
+def test_no_third_of_a_film_is_empty(sides, tmp_path):
+    """A box that sways by a tenth of its longest side: in each third of the picture it is seen at some time."""
+    box = trimesh.creation.box(sides).subdivide().subdivide()
+    sway = 0.1 * max(sides) * np.array([1.0, 0, 0])
+    points = np.array(box.vertices)
+    subject = drawable_of(points, np.array(box.faces))
+    swaying = replace(subject, times=np.arange(3.0), nodes=lambda index: points + index % 2 * sway)
+    write_film(swaying, tmp_path / "x.gif", [0, 1, 2], Style(eye=(0, -1, 0)), playback_of(swaying.times))
+    pictures = np.array(pictures_of(tmp_path / "x.gif"))
+    body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
+    height = np.flatnonzero(body.any(axis=1))[-1] + np.flatnonzero(body.any(axis=1))[0]  # without the caption
+    for thirds in (np.array_split(body[:height], 3, axis=0), np.array_split(body[:height], 3, axis=1)):
+        assert all(third.any() for third in thirds)
+    assert body[:height].mean() > 0.25

@@ -82,6 +82,7 @@ def test_colours_come_out_as_shares_of_the_scale(tmp_path):
     shares = np.cumsum(stream(data, "colours").reshape(len(HEIGHTS), -1).astype(int), axis=0) % 256
     assert (shares[0] == 0).all() and shares.max() == 255
     assert data["legend"][0]["kind"] == "bar" and data["legend"][0]["text"] == "displacement [mm]"
+    assert [number for _, number in data["legend"][0]["ticks"]] == ["0", "100", "200", "300", "400", "500"]
 
 
 def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, caplog):

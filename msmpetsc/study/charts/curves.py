@@ -6,6 +6,7 @@ lattice: explicit and implicit runs of any time step can be compared by it.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,13 +31,13 @@ from msmpetsc.study.table import ONCE_NOTE, Row, grouped, is_repeated, measured,
 
 KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
-FRONT = "Pareto front"
+FRONT = "Pareto front, or within its noise"
 CAPTION = (
     "Lower is faster, further left is more exact. A line joins a method's own best points; its other measurements are "
-    "small and hollow. Whiskers reach from the least to the greatest of the repeats, whose median is the point. Ringed "
-    "points on the grey stair are the Pareto front: nothing measured is both cheaper and more exact, errors taken to "
-    "two digits. The step error is that of solving a step; the trajectory error is that of the "
-    "whole motion, time step included."
+    "small and hollow. Whiskers reach from the least to the greatest of the repeats, whose median is the point. The "
+    "grey stair is the Pareto front: nothing measured is both cheaper and more exact, errors taken to two digits. "
+    "Ringed are its points, and points whose ranges overlap its own: the repeats do not tell which is cheaper. The "
+    "step error is that of solving a step; the trajectory error is that of the whole motion, time step included."
 )
 STEPPING = ("time_step", "substep")
 TIP = ("least", "greatest", *STEPPING, "error", "max_iterations", "iterations", "ranks")
@@ -89,11 +90,14 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
     return rows.iloc[front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))]
 
 
-def cheapest(rows: DataFrame, measure: ErrorMeasure, level: float) -> Row | None:
-    """Return the row of the least cost whose error is at most ``level``, or None."""
-    reached = measured(rows, *measure.columns)
-    reached = reached[reached[measure.error] <= level]
-    return next(iter(records(reached.sort_values(measure.cost, kind="stable"))), None)
+def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFrame:
+    """Return the cheapest row below an error, then the rows whose range overlaps its own."""
+    rows = measured(rows, *measure.columns)
+    rows = rows[rows[measure.error] <= level].sort_values(measure.cost, kind="stable")
+    reached = rows.assign(**spread(rows, measure.cost))
+    least, greatest = (reached[end].fillna(reached[measure.cost]) for end in ("least", "greatest"))
+    overlapping: DataFrame = reached[least <= greatest.head(1).max()]
+    return overlapping
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -121,7 +125,7 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
     chart = Chart(name, KIND, title, CAPTION, legend)
     for measure, shown in panels:
         draw_panel(chart, shown, measure)
-        lines = [cheapest_line(measure, level, cheapest(shown, measure, level)) for level in LEVELS]
+        lines = [cheapest_line(measure, level, contenders(shown, measure, level)) for level in LEVELS]
         chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_repeated(shown) else [ONCE_NOTE])
     return chart
 
@@ -143,18 +147,28 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel.whiskers(rows, measure.columns)
     panel.mark(points(rows.drop(best.index), measure.columns, columns), hollow=True)
     panel.curves(best, measure.columns, columns)
-    panel.rings(front, measure.columns)
+    tied = [index for index, error in rows[measure.error].items() if index in contenders(rows, measure, error).index]
+    panel.rings(rows.loc[front.index.union(tied)], measure.columns)
 
 
-def cheapest_line(measure: ErrorMeasure, level: float, row: Row | None) -> str:
-    """Return a sentence that names the cheapest case below an error."""
+def cheapest_line(measure: ErrorMeasure, level: float, best: DataFrame) -> str:
+    """Return a sentence that names the cheapest case, and the methods within its noise."""
     start = f"{formatting.error(level)} or less:"
-    if row is None:
+    if best.empty:
         return f"{start} nothing measured reaches it."
     unit = measure.y_label.removeprefix("computing time ")
+    row, *rivals = records(best.drop_duplicates("label"))
+    near = ", ".join(f"{rival['label']} {cost_of(rival, measure)}" for rival in rivals)
     names = (measure.error, "error", *STEPPING)
     numbers = ", ".join(filter(None, (formatting.entry(row, name) for name in names)))
-    return f"{start} {row['label']}, {formatting.seconds(row[measure.cost])} {unit} ({numbers})."
+    noise = f"; within its noise, so none is known to be the cheapest: {near}" if near else ""
+    return f"{start} {row['label']}, {cost_of(row, measure)} {unit} ({numbers}){noise}."
+
+
+def cost_of(row: Row, measure: ErrorMeasure) -> str:
+    """Return the cost of a row, with its range over the repeats if known: 10 ms [9 ms to 21 ms]."""
+    ends = [formatting.seconds(row[name]) for name in ("least", "greatest") if row[name] is not None]
+    return formatting.seconds(row[measure.cost]) + (f" [{' to '.join(ends)}]" if ends else "")
 
 
 # ---- the error of the surface over what it costs
@@ -261,7 +275,7 @@ def styles_of(curves: DataFrame, styles: Styles) -> Styles:
     number = curves.groupby("label").cumcount()
     for curve, label, more in zip(curves["curve"], curves["label"], number, strict=True):
         shape = SHAPES[(SHAPES.index(styles[label].shape) + more) % len(SHAPES)]
-        found[curve] = CurveStyle(styles[label].color, shape)
+        found[curve] = replace(styles[label], shape=shape)
     return found
 
 

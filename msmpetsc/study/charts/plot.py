@@ -25,9 +25,11 @@ COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
     "#882255", "#999933", "#332288", "#8c6239",
 )  # fmt: skip
-SHAPES = (  # eight, and eleven colours: a pair is back after 88
-    "circle", "square", "triangle-up", "diamond", "triangle-down", "cross", "triangle-left", "triangle-right",
-)  # fmt: skip
+X = "M-1,-.6L-.6,-1L0,-.4L.6,-1L1,-.6L.4,0L1,.6L.6,1L0,.4L-.6,1L-1,.6L-.4,0Z"
+STAR = "M0,-1.2L.35,-.4L1.15,-.37L.52,.15L.7,.97L0,.5L-.7,.97L-.52,.15L-1.15,-.37L-.35,-.4Z"
+SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross", X, STAR)
+# Dashes of lines, one for each round through the colours.
+DASHES = ((1, 0), (6, 3), (2, 2))
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
 WIDTH, HEIGHT = 1080, 280  # [px] of all panels of a chart, and of one
 MARKER = 50  # [px^2]
@@ -56,10 +58,11 @@ SECONDS, BYTES = UNIT.format("s"), UNIT.format("B")
 
 @dataclass(frozen=True)
 class CurveStyle:
-    """Colour and marker of one method, the same in all charts."""
+    """Colour, marker and dashes of one method, the same in all charts."""
 
     color: str
     shape: str
+    dash: tuple[int, int] = DASHES[0]
 
 
 Styles = dict[str, CurveStyle]  # by label
@@ -68,8 +71,12 @@ Columns = tuple[str, str]  # of both axes
 
 def curve_styles(labels: Iterable[str]) -> Styles:
     """Return a style for each label, assigned in order of first appearance."""
-    numbers = enumerate(dict.fromkeys(labels))
-    return {label: CurveStyle(COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)]) for n, label in numbers}
+
+    def style(n: int) -> CurveStyle:
+        rounds = n // len(COLORS)
+        return CurveStyle(COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)], DASHES[rounds % len(DASHES)])
+
+    return {label: style(n) for n, label in enumerate(dict.fromkeys(labels))}
 
 
 def tips(rows: DataFrame, names: Iterable[str], curve: str = "label") -> list[str]:
@@ -129,8 +136,8 @@ class Axes:
     def curves(self, rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label") -> None:
         """Draw the rows of each curve, in their order, as a line with a marker at each point."""
         values = points(rows, columns, names, curve)
-        color = {"color": nominal(self.styles, "color")}
-        self.draw(values, {"type": "line", "strokeWidth": 1.6}, order={"field": "n"}, **color)
+        own = {"color": nominal(self.styles, "color"), "strokeDash": nominal(self.styles, "dash")}
+        self.draw(values, {"type": "line", "strokeWidth": 1.6}, order={"field": "n"}, **own)
         self.mark(values)
 
     def mark(self, values: list[dict[str, Any]], hollow: bool = False) -> None:
@@ -206,7 +213,7 @@ def legend(styles: Styles) -> dict[str, Any]:
 
 
 def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return the channel that gives each curve its "color" or its "shape"."""
+    """Return the channel that gives each curve its "color", its "shape" or its "dash"."""
     scale = {"domain": list(styles), "range": [getattr(style, name) for style in styles.values()]}
     return {"field": "curve", "type": "nominal", "scale": scale, "legend": legend}
 

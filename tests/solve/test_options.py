@@ -16,7 +16,7 @@ from msmpetsc.cli.main import option_names
 from msmpetsc.errors import InputError
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.initialise import _check_files
+from msmpetsc.solve.petsc.initialise import _check_words
 from msmpetsc.solve.presets import PRESETS, find_preset, shown_options
 from msmpetsc.solve.refused_options import refuse_early, refuse_unused
 
@@ -72,13 +72,13 @@ def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
     file = tmp_path / "options"
     file.write_text(f"-pc_type jacobi\n{line}\n")
     with nullcontext() if LINES[line] else pytest.raises(InputError, match="line 2"):
-        _check_files(["-options_file", str(file)])
+        _check_words(["-options_file", str(file)])
 
 
 @pytest.mark.parametrize("words", [["-options_file"], ["-options_file", "-ksp_view"], ["-options_file", "/dev/null"]])
 def test_an_options_file_is_a_file(words: list[str]):
     with pytest.raises(InputError, match="-options_file"):
-        _check_files(words)
+        _check_words(words)
 
 
 BEFORE_THE_MESH = {

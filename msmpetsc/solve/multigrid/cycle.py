@@ -297,6 +297,13 @@ class ProjectedHessian:
                 self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
 
+    def by_blocks(self, x: Rows, y: Rows) -> Rows:
+        """Write D^-1 x (3, m) into y, and return it; D the 3 x 3 diagonal blocks of H."""
+        apply_blocks(self.unknowns.size, x, self.inverse, y)
+        if self.smoother:
+            self.smoother.correct(y)
+        return y
+
 
 class DiagonalBlocks:
     """Inverse of the 3 x 3 diagonal blocks of the finest level (a context of PCPYTHON)."""
@@ -306,10 +313,7 @@ class DiagonalBlocks:
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         unknowns = self.hessian.unknowns
-        moved = unknowns.columns_to_write(y)
-        apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, moved)
-        if self.hessian.smoother:
-            self.hessian.smoother.correct(moved)
+        self.hessian.by_blocks(unknowns.columns(x), unknowns.columns_to_write(y))
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")

@@ -215,6 +215,7 @@ class Stepper:
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:
         self.functional.begin(problem)
+        self.control.rounding.refuse_loads()
         self.base[:] = problem.fixed
         self.friction.begin(problem.contact)
         self.control.estimate.convexity = 1.0

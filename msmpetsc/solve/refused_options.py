@@ -50,23 +50,24 @@ def refuse_early(comm: MPI.Comm) -> None:
     lines = []
     for name, value in PETSc.Options().getAll().items():
         given = f"{OF_STEPPERS.sub('', name)} {value or ''}"
-        lines += [f"-{name}: {instead}" for option, instead in NO_USE.items() if re.fullmatch(option, given)]
-        lines += [f"-{name} {value}: {bound}" for bound in _bounds_passed(name, value or "")]
+        told = [instead for option, instead in NO_USE.items() if re.fullmatch(option, given)]
+        told += _bounds_passed(name, value or "")
+        lines += [f"-{name}: {reason}" for reason in told[:1]]
     _refuse(comm, lines)
 
 
 def _bounds_passed(name: str, value: str) -> Iterator[str]:
     """Yield the bound that the value of an option passes, if it is a number and passes any."""
     if re.search(r"(^|,)[-+]?nan\b", value, re.IGNORECASE):
-        yield "this is not a number"
+        yield f"{value} is not a number"
     try:
         number = float(value)
     except ValueError:  # PETSc says whether it is none
         return
     if COUNT.fullmatch(name) and (number < 1 or number > MOST_ITERATIONS):
-        yield f"a number of iterations or parts is from 1 to {MOST_ITERATIONS}"
+        yield f"a number of iterations or parts is from 1 to {MOST_ITERATIONS}, not {value}"
     if POSITIVE.fullmatch(name) and number <= 0:
-        yield "it must be above 0"
+        yield f"it must be above 0, not {value}"
 
 
 def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:

@@ -31,6 +31,8 @@ NO_USE = {  # what PETSc would take, but not do here, or crash by; a name and it
     r"snes_type (newtontr(dc)?|aspin|nasm|patch|ms)": "a step goes by its energy, on no DM of PETSc's; newtonls can",
     r"snes_type ksp(transpose)?only": "a linear solve is no step; newtonls makes as many as it takes",
     r"(.*_)?ksp_type fetidp": "it is for a PC of type bddc, which the operator does not have; cg can",
+    r"mg_\w*ksp_type pipelcg": "within a cycle it does not end; cg can",
+    r"(.*_)?mat_ordering_type wbm": "PETSc aborts by it; qmd can",
     r"(.*_)?(snes|ksp|mg_\w*pc)_python_type .*": "no object of Python's can stand here",
     r"(snes_(mf|fd|lag|adapt|grid_sequence)\w*|ksp_reuse_preconditioner) .*": "solver.preset chooses the Jacobian",
     r"(.*_)?(snes|ksp)_error_if_not_converged .*": "a step that does not converge ends the run, with exit status 3",

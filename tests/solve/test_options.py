@@ -47,6 +47,8 @@ NO_USE = {
     "snes_linesearch_damping": ("NaN", "not a number"),
     "mg_levels_ksp_chebyshev_eigenvalues": ("1,nan", "not a number"),
     "mg_levels_1_pc_python_type": ("abc", "Python"),
+    "mg_coarse_ksp_type": ("pipelcg", "does not end"),
+    "ksp_type": ("fetidp", "bddc"),
     "three_columns_pc_type": ("bjacobi", "-pc_"),
     "mg_coarse_ksp_error_if_not_converged": ("", "status 3"),
     "ksp_monitor": ("binary:f.dat", "ascii:FILE"),

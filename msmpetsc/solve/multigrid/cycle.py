@@ -204,6 +204,13 @@ class Multigrid:
 
     def _read_options(self) -> None:
         """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG."""
+        options = PETSc.Options(self.prefix)
+        for name in ("mg_levels_pc_type", f"mg_levels_{len(self.levels)}_pc_type"):
+            if options.hasName(name):
+                kind = options.getString(name)
+                raise InputError(
+                    f"-{self.prefix}{name} {kind}: the finest level has no matrix, but 3 x 3 blocks of its own"
+                )
         with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):
             self.pc.setFromOptions()
             self.pc.setUp()

@@ -203,8 +203,8 @@ class Rounding:
         most, moved = np.max(self.comm.allgather(local), axis=0)
         if moved > FARTHEST * functional.extent:
             raise InputError(
-                f"loads of up to {most:.2g} N on a node would move it by {moved:.2g} m in a step, of a body that reaches "
-                f"{functional.extent:.2g} m: check gravity, force and their units"
+                f"loads of up to {most:.2g} N on a node would move it by {moved:.2g} m in a step, of a body that "
+                f"reaches {functional.extent:.2g} m: check gravity, force and their units"
             )
 
     def is_all_of(self, f: PETSc.Vec) -> bool:

@@ -25,7 +25,8 @@ def kernel(body: Callable[..., None]) -> Callable[..., None]:
     numba.njit and takes its roots from ``math``; no two indices write to the same place. The loop
     stands in the body, and not here, so that numba finds what it has compiled before.
     """
-    compiled = numba.njit(cache=True)(body)
+    # A division by zero is infinite, as on a GPU: the step then tells of a number that is not finite.
+    compiled = numba.njit(cache=True, error_model="numpy")(body)
 
     @wraps(body)
     def everywhere(count: int, *arguments: Any) -> None:

@@ -36,6 +36,8 @@ class Preset:
     chooses: bool = False
 
 
+# Iterations of CG in a step, and the most of any option that counts; so each step ends.
+MOST_ITERATIONS = 100_000
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
 NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search

@@ -5,14 +5,14 @@ PETSc keeps no list of the options that it knows: what no object has looked at i
 
 import ctypes
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.solve.petsc.library import Integer, petsc_library
-from msmpetsc.solve.presets import PRESETS, in_use
+from msmpetsc.solve.presets import MOST_ITERATIONS, PRESETS, in_use
 
 READ_AT_THE_END = re.compile(
     r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$"
@@ -28,7 +28,12 @@ BY_ERROR = "a step ends when its error is below solver.error (--error), or by so
 NO_USE = {  # what PETSc would take, but not do here, or crash by; a name and its value -> what is so instead
     r"snes_(rtol|atol|divergence_tolerance|max_funcs|convergence_test|norm_schedule|force_iteration) .*": BY_ERROR,
     r"snes_stol (?!0+\.?0*$).*": BY_ERROR,  # 0 is what presets set
-    r"snes_type (newtontr(dc)?|aspin|nasm|patch)": "a step goes by its energy, on no DM of PETSc's; newtonls can",
+    r"snes_type (newtontr(dc)?|aspin|nasm|patch|ms)": "a step goes by its energy, on no DM of PETSc's; newtonls can",
+    r"snes_type ksp(transpose)?only": "a linear solve is no step; newtonls makes as many as it takes",
+    r"(.*_)?ksp_type fetidp": "it is for a PC of type bddc, which the operator does not have; cg can",
+    r"mg_\w*ksp_type pipelcg": "within a cycle it does not end; cg can",
+    r"(.*_)?mat_ordering_type wbm": "PETSc aborts by it; qmd can",
+    r"(.*_)?(snes|ksp|mg_\w*pc)_python_type .*": "no object of Python's can stand here",
     r"(snes_(mf|fd|lag|adapt|grid_sequence)\w*|ksp_reuse_preconditioner) .*": "solver.preset chooses the Jacobian",
     r"(.*_)?(snes|ksp)_error_if_not_converged .*": "a step that does not converge ends the run, with exit status 3",
     r"(three_columns|estimate)_.*": "the preconditioner of A, and of all that needs one, has the bare -pc_ options",
@@ -37,14 +42,34 @@ NO_USE = {  # what PETSc would take, but not do here, or crash by; a name and it
     r"(.*_)?ksp_monitor\w* (binary|hdf5|vtk|socket|string|saws)\b.*": "what it shows is text: ascii:FILE",
 }
 
+# names of options by their last words: counts, and sizes
+COUNT = re.compile(r"(.*_)?(max_it|its|lits|cycles|levels|(jacobi|asm)_(local_)?blocks|restart|steps|anderson_m|qn_m)")
+POSITIVE = re.compile(r"(.*_)?(rtol|divtol|damping|maxstep|minlambda|alpha|omega)")
+
 
 def refuse_early(comm: MPI.Comm) -> None:
     """Raise InputError for options that are of no use in any scene (collective)."""
     lines = []
     for name, value in PETSc.Options().getAll().items():
         given = f"{OF_STEPPERS.sub('', name)} {value or ''}"
-        lines += [f"-{name}: {instead}" for option, instead in NO_USE.items() if re.fullmatch(option, given)]
+        told = [instead for option, instead in NO_USE.items() if re.fullmatch(option, given)]
+        told += _bounds_passed(name, value or "")
+        lines += [f"-{name}: {reason}" for reason in told[:1]]
     _refuse(comm, lines)
+
+
+def _bounds_passed(name: str, value: str) -> Iterator[str]:
+    """Yield the bound that the value of an option passes, if it is a number and passes any."""
+    if re.search(r"(^|,)[-+]?nan\b", value, re.IGNORECASE):
+        yield f"{value} is not a number"
+    try:
+        number = float(value)
+    except ValueError:  # PETSc says whether it is none
+        return
+    if COUNT.fullmatch(name) and (number < 1 or number > MOST_ITERATIONS):
+        yield f"a number of iterations or parts is from 1 to {MOST_ITERATIONS}, not {value}"
+    if POSITIVE.fullmatch(name) and number <= 0:
+        yield f"it must be above 0, not {value}"
 
 
 def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:

@@ -111,6 +111,7 @@ class TimeLoop:
         q, velocity = model.start
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
+        self.awaits_solve = False  # a step that reads what options are left
         self.saved = Checkpoint()
 
     def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
@@ -156,6 +157,8 @@ class TimeLoop:
             self.monitors.work += Work(true_error=true, energy_error=energy)
         self.monitors.gain(index, time, self.state.budget, self.balance.remedy(result.explicit))
         self.step = index
+        if self.awaits_solve and (result.explicit or result.cost.ksp_its):
+            self.refuse_unused_options()
         frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
         if index % REMEMBERED == 0:
             self.saved = self._save()
@@ -184,9 +187,14 @@ class TimeLoop:
         self.saved = self._save()
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
-        """Raise InputError for PETSc options of the user that nothing has used (collective)."""
+        """Raise InputError for PETSc options of the user that nothing has used (collective).
+
+        Called before the first step, it does so once more after the first that solves anything.
+        """
+        self.awaits_solve = self.step == 0 and not at_end
         awaited = {FALLBACK: self.recovery.on_failure == "fallback", REFERENCE_PREFIX: self.true_error and not at_end}
-        refuse_unused(self.comm, at_end, tuple(prefix for prefix, may_come in awaited.items() if may_come))
+        prefixes = tuple(prefix for prefix, may_come in awaited.items() if may_come)
+        refuse_unused(self.comm, not self.awaits_solve, prefixes)
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""

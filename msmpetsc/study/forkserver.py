@@ -127,8 +127,9 @@ def leave(status: int) -> NoReturn:
     """End such a process, its PETSc and its MPI."""
     from mpi4py import MPI
 
-    if "petsc4py.PETSc" in sys.modules:
-        sys.modules["petsc4py.PETSc"]._finalize()
+    from msmpetsc.solve.petsc.initialise import finalise
+
+    finalise()
     MPI.Finalize()
     sys.exit(status)
 

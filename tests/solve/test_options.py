@@ -6,18 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import block_scene
-from conftest import run
+from conftest import ENVIRONMENT, python, run
 from lattices import beam, swing, weight
 from mpi4py import MPI
 from one_process import assert_one_line, command_error, input_error
 
+from msmpetsc.app.ranks import ALONE
 from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.main import option_names
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.initialise import _check_files
-from msmpetsc.solve.presets import PRESETS, find_preset, shown_options
+from msmpetsc.solve.petsc.initialise import _check_words
+from msmpetsc.solve.presets import MOST_ITERATIONS, PRESETS, find_preset, shown_options
 from msmpetsc.solve.refused_options import refuse_early, refuse_unused
 
 T = 1 / 60
@@ -38,6 +39,16 @@ NO_USE = {
     "snes_lag_jacobian": ("2", "solver.preset"),
     "snes_mf": ("", "solver.preset"),
     "snes_type": ("newtontr", "newtonls"),
+    "fallback_snes_type": ("ksponly", "newtonls"),
+    "ksp_max_it": ("0", "from 1 to"),
+    "mg_levels_ksp_max_it": ("-1", "from 1 to"),
+    "snes_max_it": ("1000000000", "from 1 to"),
+    "ksp_rtol": ("0", "above 0"),
+    "snes_linesearch_damping": ("NaN", "not a number"),
+    "mg_levels_ksp_chebyshev_eigenvalues": ("1,nan", "not a number"),
+    "mg_levels_1_pc_python_type": ("abc", "Python"),
+    "mg_coarse_ksp_type": ("pipelcg", "does not end"),
+    "ksp_type": ("fetidp", "bddc"),
     "three_columns_pc_type": ("bjacobi", "-pc_"),
     "mg_coarse_ksp_error_if_not_converged": ("", "status 3"),
     "ksp_monitor": ("binary:f.dat", "ascii:FILE"),
@@ -63,7 +74,7 @@ def test_a_misspelt_option_is_told_with_the_nearest(petsc_options, name: str):
 
 
 LINES = dict.fromkeys(("-ksp_type cg", "", '-log_view "a b"', "-shift -0.5", "alias -a -b"), True)  # PETSc can read it
-LINES |= dict.fromkeys(("ksp_type cg", "-ksp_type cg -pc_type none", "-ksp_type cg jacobi"), False)
+LINES |= dict.fromkeys(("ksp_type cg", "-ksp_type cg -pc_type none", "-ksp_type cg jacobi", "-fp_trap"), False)
 
 
 @pytest.mark.parametrize("line", LINES)
@@ -72,19 +83,21 @@ def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
     file = tmp_path / "options"
     file.write_text(f"-pc_type jacobi\n{line}\n")
     with nullcontext() if LINES[line] else pytest.raises(InputError, match="line 2"):
-        _check_files(["-options_file", str(file)])
+        _check_words(["-options_file", str(file)])
 
 
 @pytest.mark.parametrize("words", [["-options_file"], ["-options_file", "-ksp_view"], ["-options_file", "/dev/null"]])
 def test_an_options_file_is_a_file(words: list[str]):
     with pytest.raises(InputError, match="-options_file"):
-        _check_files(words)
+        _check_words(words)
 
 
 BEFORE_THE_MESH = {
     "-snes_rtol 1e-3": "solver.error",
     "-options_file gone": "gone",
     "-malloc_debug abc": "abc",
+    "-python": "-python",
+    "-fp_trap": "not finite",
 }
 WITH_THE_SOLVERS = {
     "-ts_dt 1": "-ts_dt",
@@ -123,6 +136,67 @@ def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(tm
     scene = block_scene(tmp_path, **SCENE)
     done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split())
     assert_one_line(done, 2, WITH_THE_SOLVERS[options])
+
+
+FRAMES = "import sys, msmpetsc; list(msmpetsc.frames(sys.argv[1], petsc_options=sys.argv[2]))"
+
+
+@pytest.mark.parametrize("options", ["-pc_type jacobbi", "-pc_type hypre -pc_hypre_type foo"])
+def test_a_process_ends_with_its_error_though_python_has_left_petsc_an_object(tmp_path: Path, options: str):
+    """The traceback holds a PC of type python, which PETSc destroyed once Python was no more."""
+    scene = block_scene(tmp_path, **SCENE)
+    done = python("-m", "msmpetsc", "run", scene, "-o", tmp_path / "o.h5", *options.split(), env=ENVIRONMENT | ALONE)
+    assert_one_line(done, 2, "PETSc")
+    done = python("-c", FRAMES, scene, options, env=ENVIRONMENT | ALONE)
+    assert done.returncode == 1 and "PETSC ERROR" not in done.stderr, done.stderr
+    assert done.stderr.splitlines()[-1].startswith("msmpetsc.errors.InputError: PETSc")
+
+
+def test_an_option_that_no_object_has_is_told_before_the_last_frame(tmp_path: Path):
+    scene = block_scene(tmp_path, **SCENE | {"time": {"step": 0.01, "duration": 1.0}})
+    done = run(1, *COMMAND, scene, "-o", tmp_path / "o.h5", "-ts_monitor")
+    assert_one_line(done, 2, "-ts_monitor")
+    assert "frame 1/100" not in done.stderr
+
+
+def test_an_option_that_is_read_while_solving_is_awaited_until_something_is_solved(tmp_path: Path):
+    """A body at rest without loads solves nothing."""
+    still = SCENE | {"gravity": {"acceleration": [0, 0, 0]}}
+    run(1, *COMMAND, block_scene(tmp_path, **still), "-o", tmp_path / "o.h5", "-ksp_view", status=0)
+    done = run(1, *COMMAND, block_scene(tmp_path, **SCENE), "-o", tmp_path / "p.h5", "-ksp_view", status=0)
+    assert "KSP Object" in done.stdout
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_a_solver_that_ends_by_a_rule_of_its_own_is_told(petsc_options, static: bool):
+    """Its reason was taken for that of a first iteration of statics that overshoots, without end."""
+    petsc_options(snes_type="ksponly", pc_type="jacobi")
+    lattice = beam()
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-9, static=static)
+    problem = StepProblem(lattice.nodes, lattice.nodes, weight(lattice))
+    with pytest.raises(InputError, match="ksponly ends by a rule of its own"):
+        stepper.step(problem)
+    stepper.destroy()
+
+
+def test_iterations_of_a_step_have_a_bound_that_no_option_lifts(petsc_options):
+    """Steps that are cut short to nothing go on as long as they may."""
+    petsc_options(snes_linesearch_maxstep="1e-9", snes_max_it="100000", pc_type="jacobi")
+    lattice = beam()
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-9)
+    problem = StepProblem(lattice.nodes, lattice.nodes, weight(lattice))
+    with pytest.raises(StepFailed, match="DIVERGED_MAX_IT"):
+        stepper.step(problem)
+    assert 0.5 * MOST_ITERATIONS < stepper.work_so_far().ksp_its + 10 * stepper.iterations < 1.1 * MOST_ITERATIONS
+    stepper.destroy()
+
+
+@pytest.mark.parametrize("load", ["gravity", "force"])
+def test_a_load_beyond_all_numbers_is_told(tmp_path: Path, load: str):
+    force = {"region": {"box": [[0, 0, 0], [1, 1, 0.1]], "relative": True}, "total": [1e30, 0, 0]}
+    tables = {"gravity": {"acceleration": [1e30, 0, 0]}} if load == "gravity" else {"force": [force]}
+    path = block_scene(tmp_path, **SCENE | tables)
+    assert "check gravity, force" in command_error("run", path, "-o", tmp_path / "o.h5")
 
 
 @pytest.mark.parametrize("preset", ["newton", "anderson", "lbfgs"])

@@ -204,6 +204,13 @@ class Multigrid:
 
     def _read_options(self) -> None:
         """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG."""
+        options = PETSc.Options(self.prefix)
+        for name in ("mg_levels_pc_type", f"mg_levels_{len(self.levels)}_pc_type"):
+            if options.hasName(name):
+                kind = options.getString(name)
+                raise InputError(
+                    f"-{self.prefix}{name} {kind}: the finest level has no matrix, but 3 x 3 blocks of its own"
+                )
         with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):
             self.pc.setFromOptions()
             self.pc.setUp()
@@ -297,6 +304,13 @@ class ProjectedHessian:
                 self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
 
+    def by_blocks(self, x: Rows, y: Rows) -> Rows:
+        """Write D^-1 x (3, m) into y, and return it; D the 3 x 3 diagonal blocks of H."""
+        apply_blocks(self.unknowns.size, x, self.inverse, y)
+        if self.smoother:
+            self.smoother.correct(y)
+        return y
+
 
 class DiagonalBlocks:
     """Inverse of the 3 x 3 diagonal blocks of the finest level (a context of PCPYTHON)."""
@@ -306,10 +320,7 @@ class DiagonalBlocks:
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         unknowns = self.hessian.unknowns
-        moved = unknowns.columns_to_write(y)
-        apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, moved)
-        if self.hessian.smoother:
-            self.hessian.smoother.correct(moved)
+        self.hessian.by_blocks(unknowns.columns(x), unknowns.columns_to_write(y))
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")

@@ -182,6 +182,8 @@ class ErrorControl:
         self.has_residual = solved <= now.goal * now.distance
         if self.has_residual:
             self.estimate.residual = ksp.buildResidual(self.estimate.residual)
+            if self.estimate.preconditioner.least_norm(self.estimate.residual) > solved:
+                self.has_residual, solved = False, np.inf
         left = ksp.getResidualNorm() if self.estimate.preconditioner.is_uniform else np.inf
         return replace(now, left=left, solved=solved)
 

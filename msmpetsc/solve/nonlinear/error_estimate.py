@@ -170,8 +170,10 @@ class ErrorEstimate:
         missing = self._left()
         if not self.is_trusted:
             return missing
-        least = LOWER * self._least(self.ksp) * self.lowest
-        return min(missing, residual / np.sqrt(least)) if least > 0 else missing
+        least = LOWER * self._least(self.ksp)
+        if not least > 0 or self.preconditioner.least_norm(self.residual) > residual / np.sqrt(least):
+            return missing
+        return min(missing, residual / np.sqrt(least * self.lowest))
 
     def _least(self, ksp: PETSc.KSP) -> float:
         """The least eigenvalue of P^(-1) H that is known, that of a solve by CG included; 0 where there is none."""
@@ -210,7 +212,9 @@ class ErrorEstimate:
         energy = ksp.getSolution().dot(self.right_side)
         if not (min(least, energy) > 0 and residual < CLOSE * np.sqrt(self.lowest * least * energy)):
             return False
-        return self._left() < LEFT * self.lengths[ksp.its]
+        if not self._left() < LEFT * self.lengths[ksp.its]:
+            return False
+        return self.preconditioner.least_norm(self.residual) < CLOSE * np.sqrt(energy)
 
     def _left(self) -> float:
         """Bound on what is missing of |e|_M, where H is no less than ``lowest`` M: |r_k|_(M^-1) over that."""

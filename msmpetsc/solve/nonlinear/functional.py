@@ -15,7 +15,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest, 
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.errors import StepFailed
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
@@ -23,6 +23,8 @@ from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
 ROUNDINGS = 3 * np.finfo(float).eps  # of a row of F: in free fall one eps was passed now and then
 SINGLE_ROW = 10.0  # times as much in a single row
 NEGLIGIBLE = 1e-6  # of the body's size: rounding that moves it less is of no concern
+# Greatest coordinates of the body that a load may move a node by: beyond, no digits of its shape are left.
+FARTHEST = 1e6
 HOPELESS = 0.3  # of what its forces move a body: rounding that moves it more leaves no step to speak of
 
 
@@ -186,12 +188,24 @@ class Rounding:
     """
 
     def __init__(self, functional: StepFunctional, diagonal: Floats):
-        self.functional, self.comm = functional, functional.comm
+        self.functional, self.comm, self.diagonal = functional, functional.comm, diagonal
         self.rows = np.tile(ROUNDINGS * diagonal, 3)  # of F [kg m] for each metre of a coordinate
         stiffness, mass = self.comm.allreduce(np.array([3 * float(diagonal.sum()), float(functional.mass.sum())]))
         # Springs or cells whose forces are k eps off move nodes by no more than sqrt(sum t^2 k) eps in the norm of H
         # where that is positive definite, and in that of M no farther; the diagonal is no less than the sum.
         self.moved, self.size = float(ROUNDINGS * np.sqrt(stiffness)), float(np.sqrt(mass))
+
+    def refuse_loads(self) -> None:
+        """Raise InputError for loads of the step that move a node farther than numbers can follow (collective)."""
+        functional = self.functional
+        load = np.sqrt((functional.problem.load[functional.unknowns.free] ** 2).sum(axis=1))
+        local = np.array([greatest(load), functional.t2 * greatest(load / self.diagonal)])
+        most, moved = np.max(self.comm.allgather(local), axis=0)
+        if moved > FARTHEST * functional.extent:
+            raise InputError(
+                f"loads of up to {most:.2g} N on a node would move it by {moved:.2g} m in a step, of a body that "
+                f"reaches {functional.extent:.2g} m: check gravity, force and their units"
+            )
 
     def is_all_of(self, f: PETSc.Vec) -> bool:
         """Whether F is nothing but rounding, row by row, for soft parts have less of it than stiff ones."""

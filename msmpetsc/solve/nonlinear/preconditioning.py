@@ -86,6 +86,10 @@ class Preconditioner:
         columns = memory.write(y)
         columns[:] = like(columns, solution.values)
 
+    def by_diagonal(self, r: Rows) -> Rows:
+        """Return D^-1 r (3, m), D the diagonal of A."""
+        return r / (self.own + self.t2 * self.added)
+
     def destroy(self) -> None:
         for part in (*self.blocks, self.pc, self.vector):
             part.destroy()
@@ -180,6 +184,10 @@ class LatticePreconditioner:
                 self.translations.around(self.pc, x, y)
             else:
                 self.pc.apply(x, y)
+
+    def by_diagonal(self, r: Rows) -> Rows:
+        """Return D^-1 r (3, m), D the 3 x 3 blocks of each node."""
+        return self.multigrid.fine.by_blocks(r, np.empty_like(r))
 
     def forget(self) -> None:
         """Forget the hierarchy: the next step builds a new one."""
@@ -298,9 +306,18 @@ class StepPreconditioner:
     def setUp(self, _: PETSc.PC) -> None:
         self.in_use.pc.setUp()
 
+    @property
+    def applied(self) -> Preconditioner | LatticePreconditioner:
+        return self.for_searches if self.is_searching and self.for_searches else self.in_use
+
     def apply(self, _: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        chosen = self.for_searches if self.is_searching and self.for_searches else self.in_use
-        chosen.apply(x, y)
+        self.applied.apply(x, y)
+
+    def least_norm(self, r: PETSc.Vec) -> float:
+        """Return a lower bound of |r|_(H^-1) that P has no part in: H is no more than 2 D, or 4 D where it changed."""
+        columns = self.applied.unknowns.columns(r)
+        square = float(np.vdot(columns, self.applied.by_diagonal(columns)))
+        return 0.5 * float(np.sqrt(max(self.applied.unknowns.comm.allreduce(square), 0.0)))
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.in_use.pc.view(viewer)

@@ -34,12 +34,14 @@ from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
-from msmpetsc.solve.presets import Preset, SolverOptions
+from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
+from msmpetsc.solve.refused_options import BY_ERROR
 from msmpetsc.solve.work import Work
 
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 SOFTER = 9.0  # how far |F| may rise at first; then lambda, from one solid that leads on to the next
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
+NEWTON = 10  # iterations of CG that the rest of an iteration of Newton's method costs
 RAISED = 2.0  # times |F| before: friction and contact have kinks within what g has no digits for
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 CLIMBS = (  # PETSc takes it for a minimum where |H F| / |F| < 1e-4, as any is in small units
@@ -104,8 +106,10 @@ class Stepper:
         self.is_detour = False  # the way to the last iterate is not what the linear solve has led to
         self.outcome = Outcome()  # of the solve in progress, as its last iterate has it
         self.is_first, self.begun = False, np.inf  # iteration, of which softer solids may follow; |F| before it
+        self.overshoots = False  # it has, and ends its solve
         self.slopes: Array | None = None  # V U' of a softer solid, for the next Hessian
         self.iterations = 0  # of all steps so far
+        self.before = Work()  # of the steps before the present one
         self.is_forced = False  # the last move was a full one, whatever g said of it
         self.is_bent = False  # such a move has raised |F|: g is to be asked all the same
         self.base = np.empty_like(self.lattice.nodes)  # positions that g is compared with
@@ -192,7 +196,7 @@ class Stepper:
         not go together.
         """
         with petsc_errors("PETSc cannot take a step with these options", self._abandon):
-            before = self.work_so_far()
+            self.before = self.work_so_far()
             self._begin(problem, start)
             self.is_first = self.static and self.stiffest > 2 and self.preset.true_hessian and not self.budget
             self.slopes = None
@@ -205,12 +209,13 @@ class Stepper:
             self.first_guess.learn(q)
             distance = self.functional.distance(q)
             error = self.control.rounding.added_to(verdict.error, distance, outcome.at_rounding)
-            cost = replace(self.work_so_far() - before, step_error=error)
+            cost = replace(self.work_so_far() - self.before, step_error=error)
             slack = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
             return StepResult(q, problem.q, cost, problem=problem, slack=slack)
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:
         self.functional.begin(problem)
+        self.control.rounding.refuse_loads()
         self.base[:] = problem.fixed
         self.friction.begin(problem.contact)
         self.control.estimate.convexity = 1.0
@@ -247,13 +252,24 @@ class Stepper:
         return Work(iterations=self.iterations, ksp_its=ksp_its, products=products, proof_products=proof)
 
     def solve_once(self, outcome: Outcome) -> Outcome:
-        """Bring F at x down to the goal of an outcome so far, by SNES (collective). Raises StepFailed.
+        """Bring F at x down to the goal of an outcome so far (collective). Raises StepFailed and InputError.
+
+        If the first iteration overshoots, solids of a smaller lambda lead on to the solution.
+        """
+        solved = self._solve(outcome)
+        if not self.overshoots:
+            return solved
+        self._solve_softened()
+        return self._solve(outcome)
+
+    def _solve(self, outcome: Outcome) -> Outcome:
+        """Bring F at x down to the goal by SNES (collective). Raises StepFailed and InputError.
 
         Under compression the true Hessian may be indefinite. CG then stops with the descent it has,
         but if its very first direction has negative curvature it climbs, as the line search says:
         the projected Hessian takes over for some iterations (_linearise).
         """
-        self.outcome = outcome
+        self.outcome, self.overshoots = outcome, False
         if self._is_solved():
             return self.outcome
         self.projected = self.preset.projected > 0
@@ -262,8 +278,6 @@ class Stepper:
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()
         iterations, most = self._run_snes(), self.snes.getTolerances()[3]
-        if self.snes.reason == PETSc.SNES.ConvergedReason.CONVERGED_ITS and not self.budget:
-            return self._solve_softened(outcome)
         while self.preset.true_hessian and self.snes.reason in CLIMBS and iterations < most:
             self.projected = True
             its = self._run_snes()
@@ -274,10 +288,13 @@ class Stepper:
         if self.snes.reason < 0:
             worst = where_worst(self.functional, self._evaluate(self.snes.getSolution()))
             raise not_converged(self.snes, self.ksp, self.outcome, iterations, worst, self.preset.true_hessian)
+        if not (self.outcome.is_enough or self.overshoots or self.budget):
+            ends = f"-{self.prefix}snes_type {self.snes.getType()} ends by a rule of its own"
+            raise InputError(f"{ends}, {self.outcome.error:.2e} off: {BY_ERROR}")
         return self.outcome
 
-    def _solve_softened(self, outcome: Outcome) -> Outcome:
-        """Solve for solids whose lambda is mu, then more and more of it. Raises StepFailed.
+    def _solve_softened(self) -> None:
+        """Solve for solids whose lambda is mu, then more and more of it. Raises StepFailed and InputError.
 
         The greater lambda, the shorter a straight way until it has changed volumes; from solution to solution they
         change little. The first Hessian of each has the pressure of the one before: with its own lambda, what lacks of
@@ -288,11 +305,10 @@ class Stepper:
         while solid and 2 * ratio < self.stiffest:
             with solid.softened(ratio):
                 self.forget(modes=False)
-                self.solve_once(Outcome(max(self.control.target, DEFAULT_ERROR)))
+                self._solve(Outcome(max(self.control.target, DEFAULT_ERROR)))
                 self.slopes = solid.hessian_at(self.functional.positions(self.x), False).slopes
             ratio *= SOFTER
         self.forget(modes=False)
-        return self.solve_once(outcome)
 
     def _run_snes(self) -> int:
         self.snes.solve(None, self.x)
@@ -453,7 +469,8 @@ class Stepper:
             self.outcome = outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
         if not np.isfinite(outcome.residual):
             return NOT_FINITE
-        if self.is_first and self._overshoots(its):
+        self.overshoots = self.is_first and self._overshoots(its)
+        if self.overshoots:
             return reasons.CONVERGED_ITS
         if outcome.is_enough:
             if outcome.at_rounding:
@@ -465,6 +482,9 @@ class Stepper:
             return reasons.CONVERGED_ITS
         if Stop.agreed(self.comm):
             return reasons.DIVERGED_INNER  # _run_snes says so
+        spent = self.work_so_far() - self.before
+        if spent.ksp_its + NEWTON * (spent.iterations + its) > MOST_ITERATIONS:
+            return reasons.DIVERGED_MAX_IT
         self._adapt()
         return reasons.ITERATING
 

@@ -3,6 +3,7 @@
 One that runs already is lent others for the time of a run.
 """
 
+import atexit
 import ctypes
 import os
 import re
@@ -21,6 +22,10 @@ from msmpetsc.errors import InputError, printable
 from msmpetsc.solve.petsc.words import options_of
 
 FILE_OPTIONS = ("-options_file", "-options_file_yaml")
+NOT_HERE = {
+    "-python": "PETSc would start a Python within this one",
+    "-fp_trap": "numbers that are not finite are told by the step that meets them",
+}
 OPTION = re.compile(r"--?[A-Za-z]")
 READ_BY_OBJECTS = re.compile(r"(^|_)(snes|ksp|pc|mat|vec|mg|sub|eps|st)_")  # whenever one is made
 TOKEN = re.compile(r'"[^"]*"?|\S+')
@@ -33,7 +38,7 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
     Raises InputError for option files that cannot be read, and for values that PETSc refuses at its start.
     """
-    on_root(comm, lambda: _check_files(words))  # rank 0 alone reads them: others would wait
+    on_root(comm, lambda: _check_words(words))  # rank 0 alone reads files: others would wait
     failed = None
     with _captured_stderr() as text:
         try:
@@ -48,10 +53,12 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
         sys.stderr.write(text[0])
 
 
-def _check_files(words: list[str]) -> None:
-    """Raise InputError for the first option file that PETSc could not read."""
+def _check_words(words: list[str]) -> None:
+    """Raise InputError for options that end the process, and for the first option file that PETSc could not read."""
     words = [*os.environ.get("PETSC_OPTIONS", "").split(), *words, ""]
     for option, name in pairwise(words):
+        if option in NOT_HERE:
+            raise InputError(f"{option}: {NOT_HERE[option]}")
         if option not in FILE_OPTIONS:
             continue
         where = f"{option} {printable(name)}"
@@ -67,6 +74,8 @@ def _check_lines(where: str, lines: list[str]) -> None:
     """Raise InputError for a line that is no option, with or without a value, nor an alias."""
     for number, line in enumerate(lines, 1):
         tokens = TOKEN.findall(line.partition("#")[0])
+        if tokens and tokens[0] in NOT_HERE:
+            raise InputError(f"{where}: line {number}: {NOT_HERE[tokens[0]]}")
         value = tokens[1] if len(tokens) > 1 else ""
         is_alias = tokens[:1] == ["alias"] and len(tokens) == 3
         is_option = len(tokens) <= 2 and all(map(OPTION.match, tokens[:1])) and not re.match("-[A-Za-z]", value)
@@ -96,6 +105,16 @@ def is_running() -> bool:
     """Return whether this process has started PETSc."""
     module = sys.modules.get("petsc4py.PETSc")
     return module is not None and module.Sys.isInitialized() and not module.Sys.isFinalized()
+
+
+@atexit.register
+def finalise() -> None:
+    """End PETSc, if it runs, while Python still does (collective).
+
+    PETSc destroys what Python's collector has left it: a PC of type python calls Python for that.
+    """
+    if is_running():
+        sys.modules["petsc4py.PETSc"]._finalize()
 
 
 def start_for_runs(comm: MPI.Comm, words: Sequence[str]) -> None:

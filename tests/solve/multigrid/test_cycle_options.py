@@ -27,6 +27,7 @@ REFUSED = {
     "--preset anderson -pc_type mg": "newton's presets",
     "-mg_levels_ksp_typ cg": "no part of this run",
     "-mg_levels_pc_type nonsense": "nonsense",
+    "-mg_levels_1_pc_type redistribute": "finest level",
 }
 
 

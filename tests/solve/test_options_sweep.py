@@ -1,0 +1,108 @@
+"""Each option that -help lists for the objects of a run, with values of wrong types, zero, negative and no numbers.
+
+Each is tried in a fork of this process, which has carried out the scene: a fifth of a second, where a start takes two.
+"""
+
+import os
+import re
+import resource
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from block_scene import GRAVITY, block_scene
+from conftest import HANGS, run
+from mpi4py import MPI
+
+from msmpetsc.cli.main import main
+from msmpetsc.solve.petsc.initialise import finalise, start_for_runs
+
+PINNED = [{"region": {"box": [[-1, -1, 0.9], [2, 2, 2]], "relative": True}}]
+FLOOR = [{"shape": "plane", "point": [0, 0, -0.001], "normal": [0, 0, 1], "response": "penalty"}]
+MOVES = {"time": {"step": 0.01, "duration": 0.01}, "gravity": GRAVITY}
+SCENES = {  # tables, and options that make the objects
+    "multigrid": (MOVES | {"pin": PINNED, "solver": {"preset": "newton-multigrid", "error": 1e-6}}, []),
+    "contact": (MOVES | {"obstacle": FLOOR, "solver": {"preset": "newton", "error": 1e-4}}, ["-pc_type", "gamg"]),
+    "anderson": (MOVES | {"pin": PINNED, "solver": {"preset": "anderson", "error": 1e-4}}, []),
+}
+OF_OBJECTS = re.compile(r"(?!\w*(plot|_lg))\w*?(snes|ksp|pc|mat|mg|sub|npc)_")  # there may be no display
+VIEWER = re.compile(r" (ascii|binary|draw|socket|saws)\[?:")
+CHOICES = re.compile(r"\((?:choose )?one of\)?(.*?)\(\w*\)?$")
+NOT_WORDS = ["abc", "0", "-1", "nan"]
+SECONDS = 60  # of a core: a case takes a fifth of one
+SIGNALS = (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS, signal.SIGILL)
+
+
+def options_in(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the options that PETSc's help lists, each with the values to try."""
+    seen = set()
+    for name, rest in re.findall(r"^ +-(\w+)(:? .*)$", text, re.MULTILINE):
+        if name in seen or VIEWER.match(rest) or not OF_OBJECTS.match(name):
+            continue
+        seen.add(name)
+        choices = CHOICES.search(rest)
+        for value in ["foo", *choices[1].split()] if choices else NOT_WORDS:
+            yield f"-{name}", value
+
+
+def attempt(folder: Path, words: list[str]) -> tuple[int | None, str]:
+    """Return the status of a command in a fork, negative for a signal, None for no end; and all that it says."""
+    path = folder / "said"
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+            for number in SIGNALS:  # PETSc's handlers would wait for an MPI that this process does not have
+                signal.signal(number, signal.SIG_DFL)
+            said = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            for stream in (1, 2):
+                os.dup2(said, stream)
+            sys.stdout, sys.stderr = (os.fdopen(stream, "w", closefd=False) for stream in (1, 2))
+            status = main(words)
+            finalise()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+    end = time.monotonic() + HANGS
+    while time.monotonic() < end:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status), path.read_text(errors="replace")
+        time.sleep(0.005)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return None, path.read_text(errors="replace")
+
+
+def fault_of(status: int | None, said: str) -> str:
+    """Return why an end is none that a user should meet; "" for a good one."""
+    errors = [line for line in said.splitlines() if line.startswith("msmpetsc: error:")]
+    if status not in (0, 2, 3) or len(errors) != (status != 0):
+        return f"status {status}, {len(errors)} lines of error"
+    return next((noise for noise in ("Traceback", "PETSC ERROR", "MPI_ABORT") if noise in said), "")
+
+
+@pytest.mark.parametrize(
+    ("name", "every"),
+    [("multigrid", 50), *(pytest.param(name, 1, marks=pytest.mark.slow) for name in SCENES)],
+)
+def test_each_option_is_obeyed_or_refused_in_one_line(tmp_path: Path, name: str, every: int):
+    tables, objects = SCENES[name]
+    words = ["run", block_scene(tmp_path, **tables), "-o", tmp_path / "o.h5", "--overwrite", *objects]
+    words = [str(word) for word in words]
+    listed = run(1, "-m", "msmpetsc", *words, "-help", status=0).stdout
+    start_for_runs(MPI.COMM_WORLD, [])
+    assert main(words) == 0
+    tried = list(options_in(listed))
+    assert len(tried) > 300
+    ends = {option: attempt(tmp_path, [*words, *option]) for option in tried[::every]}
+    faults = {
+        " ".join(option): (fault, ends[option][1][-400:]) for option in ends if (fault := fault_of(*ends[option]))
+    }
+    assert not faults, "\n".join(f"{option}: {fault}\n{said}" for option, (fault, said) in faults.items())

@@ -187,7 +187,8 @@ class ErrorControl:
 
     def _solved(self, ksp: PETSc.KSP) -> float:
         """Bound on |e|_H that a linear solve has left."""
-        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.is_blind:
+        is_far = self.estimate.preconditioner.is_uniform and self.estimate.least < NEAR
+        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.is_blind or is_far:
             return np.inf
         solved, residual = self.solve_bound.of(LOWER * self.estimate.least), ksp.getResidualNorm()
         if np.isfinite(solved) and residual > 0:

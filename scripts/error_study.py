@@ -1,12 +1,15 @@
 #!/usr/bin/env python3
 """Holds the error that steps say they have against their true one, on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--set KEY=VALUE ...]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--kinds any rub far touch] [--only K] [--set KEY=VALUE ...]
 
 Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
 or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
 friction, in parts of up to 1e6 to 1, pinned, led or free, in short and long steps, by any preset. Every step is solved
 a second time to rounding from where it ended: what it says of its error over that distance is the ratio.
+
+--kinds takes turns between such scenes (any), bodies that rub on each other with friction (rub), starts that are
+mirrored, collapsed or scattered, or spin fast (far), and bodies that fall on an edge or a corner (touch).
 
 Exit status: 1 if a step that a run of status 0 took says less than a third of its true error, or a scene ends in a
 fault. --only K runs scene K alone, leaves it in out/error_study/SEED for `msmpetsc run`, and prints each step.
@@ -28,6 +31,7 @@ from msmpetsc.scene.reading import load_scene
 
 LEAST = 1 / 3  # a smaller ratio is bad
 SECONDS = 300  # a scene may take so long
+KINDS = ("any", "rub", "far", "touch")
 NOTHING = 1e-9  # true errors below it cannot be told from 0
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-3, 1e-3, 1e-5)
 ENDS = {"done": 0, "stopped": 3, "refused": 2, "cut off": None}  # exit status; any other is a fault
@@ -35,13 +39,24 @@ FOLDER = lab.OUT / "error_study"
 Draw = np.random.Generator
 
 
-def draw_scene(seed: int, number: int, folder: Path) -> Path:
-    """Write scene ``number`` of a seed and its mesh; the path of the scene."""
+def draw_scene(seed: int, number: int, folder: Path, kind: str = "any") -> Path:
+    """Write scene ``number`` of a seed and its meshes; the path of the scene."""
     folder.mkdir(parents=True, exist_ok=True)
     draw = np.random.default_rng([seed, number])
+    path = folder / f"hard_{number}.toml"
+    scene = rubbing(draw, path) if kind == "rub" else any_scene(draw, path)
+    if kind == "far":
+        start_far(draw, scene)
+    if kind == "touch":
+        touch(draw, scene, trimesh.load(folder / scene["mesh"]["source"]).bounds)
+    path.write_text(tomli_w.dumps(scene))
+    return path
+
+
+def any_scene(draw: Draw, path: Path) -> dict:
     sides = np.array(SIDES[draw.integers(len(SIDES))])
     scene: dict = {
-        "mesh": {"source": mesh_of(draw, sides, folder / f"hard_{number}.obj")},
+        "mesh": {"source": mesh_of(draw, sides, path.with_suffix(".obj"))},
         "cages": {"count": int(draw.integers(40, 151))},
         "material": material_of(draw),
         "time": {"step": log_uniform(draw, 1e-4, 0.2), "duration": 0.0},
@@ -56,11 +71,55 @@ def draw_scene(seed: int, number: int, folder: Path) -> Path:
     for chance, add in ((0.7, add_start), (0.4, add_pin), (0.45, add_plates), (0.3, add_part), (0.2, add_anchor)):
         if draw.random() < chance:
             add(draw, scene, sides)
-    path = folder / f"hard_{number}.toml"
-    path.write_text(tomli_w.dumps(scene))
-    return path
+    return scene
 
 
+def rubbing(draw: Draw, path: Path) -> dict:
+    """A block that is led down onto a slab, then along it or round."""
+    step, bodies = log_uniform(draw, 1e-3, 2e-2), []
+    for name, low, high in (("block", [-0.15, -0.15, 0.0015], [0.15, 0.15, 0.1515]), SLAB):
+        box = trimesh.creation.box(bounds=[low, high]).subdivide().subdivide()
+        box.export(mesh := path.with_name(f"{path.stem}_{name}.ply"))
+        bodies.append({"mesh": {"source": mesh.name}})
+    down = [0.0, 0.0, -float(draw.uniform(0.005, 0.03))]
+    along = {"by": [*draw.normal(0, 0.1, 2).tolist(), down[2]], "turn": [0.0, 0.0, float(draw.normal(0, 60))]}
+    poses = [{"time": step, "by": down}, {"time": 4 * step} | along]
+    bodies[0]["anchor"] = [{"region": {"box": [[-0.1, -0.1, 0.85], [1.1, 1.1, 1.1]], "relative": True}, "path": poses}]
+    bodies[1]["pin"] = [{"region": {"box": [[-0.1, -0.1, -0.1], [1.1, 1.1, 0.3]], "relative": True}}]
+    solid = {"law": "neo-hookean", "poisson_ratio": float(draw.choice([0.1, 0.25, 0.45]))}
+    return {
+        "body": bodies,
+        "cages": {"cell_size": 0.075},
+        "material": {"young_modulus": log_uniform(draw, 1e4, 1e7), "density": 1000.0} | solid,
+        "time": {"step": step, "duration": 4 * step},
+        "self_contact": {"distance": log_uniform(draw, 2e-4, 1e-3), "friction": float(draw.uniform(0.1, 1))},
+        "output": {"surface": False},
+        "solver": {
+            "preset": str(draw.choice(["newton", "newton-multigrid"])),
+            "error": float(draw.choice(ERRORS[1:3])),
+        },
+    }
+
+
+def start_far(draw: Draw, scene: dict) -> None:
+    scale = [1.0, 1.0, 1.0]
+    scale[draw.integers(3)] = float(draw.choice([-1.0, -0.5, 0.0, 0.01]))
+    scene["start"] = {"scale": scale, "scatter": float(draw.choice([0.0, 0.1, 1.0]))}
+    if draw.random() < 0.5:
+        scene["start"]["spin"] = draw.normal(0, log_uniform(draw, 1, 200), 3).tolist()
+
+
+def touch(draw: Draw, scene: dict, bounds: np.ndarray) -> None:
+    """The ground, which the lowest point of the body meets in one of the first two steps."""
+    speed, response = log_uniform(draw, 0.1, 10), str(draw.choice(["penalty", "penalty", "reflect"]))
+    gap = float(draw.uniform(0.1, 2)) * speed * scene["time"]["step"]
+    plane = {"shape": "plane", "point": [0.0, 0.0, bounds[0, 2] - gap], "normal": [0.0, 0.0, 1.0], "response": response}
+    friction = {"friction": float(draw.uniform(0.1, 1))} if response == "penalty" else {}
+    scene["obstacle"] = [plane | friction]
+    scene["start"] = {"velocity": [*draw.normal(0, 1, 2).tolist(), -speed]}
+
+
+SLAB = "slab", [-0.25, -0.25, -0.1], [0.25, 0.25, 0.0]
 SIDES = ([1, 0.25, 0.25], [1, 0.12, 0.12], [0.5, 0.5, 0.5], [1, 1, 0.15], [0.6, 0.6, 0.6])
 
 
@@ -148,9 +207,9 @@ def add_anchor(draw: Draw, scene: dict, sides: np.ndarray) -> None:
     scene["anchor"] = [{"region": region, "path": [{"time": scene["time"]["duration"], "by": by}]}]
 
 
-def measured(seed: int, changes: list[str], number: int) -> dict:
+def measured(seed: int, changes: list[str], kinds: list[str], number: int) -> dict:
     """What became of one scene, some keys changed: ``status``, its words, each step's error as said and in truth."""
-    scene = draw_scene(seed, number, FOLDER / str(seed))
+    scene = draw_scene(seed, number, FOLDER / str(seed), kinds[number % len(kinds)])
     result = scene.with_suffix(".h5")
     result.unlink(missing_ok=True)
     run = lab.run(scene, result, ["--true-error", 1, "--quiet"], changes, timeout=SECONDS, warm=True)
@@ -188,15 +247,16 @@ def main() -> int:
     options = lab.parser(__doc__)
     options.add_argument("--scenes", type=int, default=500)
     options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--kinds", nargs="+", choices=KINDS, default=["any"])
     options.add_argument("--only", type=int)
     options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     args = options.parse_args()
     if args.only is not None:
-        row = measured(args.seed, args.set, args.only)
+        row = measured(args.seed, args.set, args.kinds, args.only)
         print(json.dumps(row, indent=1))
         return int(bad(row))
     with ThreadPoolExecutor(2) as pool:
-        rows = list(pool.map(partial(measured, args.seed, args.set), range(args.scenes)))
+        rows = list(pool.map(partial(measured, args.seed, args.set, args.kinds), range(args.scenes)))
     for row in filter(bad, rows):
         steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
         print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)

@@ -23,9 +23,11 @@ from msmpetsc.fields import Frame
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.implicit import ContactFaces
+from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.simulate import TimeLoop
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
@@ -203,6 +205,24 @@ def test_a_step_that_fails_without_the_surface_is_solved_with_it(folder: Path, s
     monkeypatch.setattr(Stepper, "step", failing)
     play(fall(folder, "failing", 0.02, time={"step": 0.01, "duration": 0.02}))
     assert all(each == ["nothing"] + ["all"] * len(each[1:]) for each in solves.values()) and len(solves) == 2
+
+
+def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path):
+    """A ball flies at a block, and its Newton correction through the block, of which the Hessian knows nothing."""
+    bodies = [body("block", [0, 0, 0]), body("ball", [0, 0, SIDE + 0.002], start={"velocity": [0, 0, -5.0]})]
+    time, gravity = {"step": 0.01, "duration": 0.01}, {"acceleration": [0, 0, -500.0]}  # either moves them 5 cm
+    scene = load_scene(write(folder, "through", body=bodies, time=time, gravity=gravity))
+    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+        environment, stepper, state = simulation.environment, simulation.integrator.stepper, simulation.state
+        functional, minimum, q = stepper.functional, stepper.minimum, state.q
+        faces = ContactFaces(environment, q, 2 * q - state.q_previous, 0.01, 0.01, None, stepper.lattice.pinned)
+        environment.contacts.widen()
+        functional.begin(faces.problem())
+        stepper.unknowns.from_nodes(q, stepper.x)
+        correction = stepper.control.estimate(functional.evaluate(stepper.x, stepper.f), np.inf, np.inf)
+        compression = minimum.curvature.compression(q)
+        verdict = minimum.examine(stepper.x, Outcome(corrected=True), compression, correction)
+    assert verdict.error > 10 * correction / functional.distance(q)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

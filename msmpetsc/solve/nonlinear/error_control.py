@@ -189,7 +189,8 @@ class ErrorControl:
 
     def _solved(self, ksp: PETSc.KSP) -> float:
         """Bound on |e|_H that a linear solve has left."""
-        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.is_blind:
+        is_far = self.estimate.preconditioner.is_uniform and self.estimate.least < NEAR
+        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.is_blind or is_far:
             return np.inf
         solved, residual = self.solve_bound.of(LOWER * self.estimate.least), ksp.getResidualNorm()
         if np.isfinite(solved) and residual > 0:
@@ -211,11 +212,14 @@ class ErrorControl:
         """What is known where a step goes on from a point that is no minimum, or farther from one
         than it seemed; None where there is no more to gain.
 
-        has_moved : the point was left; if not the goal becomes closer, until g has no digits left to tell by
+        has_moved : the point was left. From a saddle the goal stays; else it becomes closer, until g has no digits left
+            to tell by: where a second correction has shown that g is no parabola, a bound of the same size says nothing
         """
-        goal = now.goal if has_moved else CLOSER * now.goal
-        if not has_moved and goal < CLOSEST * self.target and np.isfinite(now.error):
+        is_saddle, closest = np.isinf(now.error), CLOSEST * self.target
+        goal = now.goal if has_moved and is_saddle else CLOSER * now.goal
+        if not has_moved and goal < closest and not is_saddle:
             return None
+        goal = max(goal, min(closest, now.goal)) if has_moved else goal
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, left=np.inf, solved=np.inf, corrected=False)
 
     def forget(self, modes: bool) -> None:

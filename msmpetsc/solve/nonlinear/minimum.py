@@ -81,25 +81,24 @@ class Minimum:
 
     def _approach(self, x: PETSc.Vec, corrected: bool) -> bool:
         """Make the point to look at x less its correction; whether it is, or x itself, for the surface meets itself."""
-        x.copy(self.nearer)
         self.first.set(0.0)
-        if corrected:
-            self.nearer.axpy(-1.0, self.estimate.correction)
-            corrected = self._is_free(x, self.nearer)
-        if corrected:
+        if corrected and self._follow(x, self.nearer):
             self.estimate.correction.copy(self.first)
-        else:
-            x.copy(self.nearer)
-        return corrected
+            return True
+        x.copy(self.nearer)
+        return False
 
-    def _is_free(self, x: PETSc.Vec, nearer: PETSc.Vec) -> bool:
-        """Whether the surface meets itself nowhere on the way from one to the other."""
+    def _follow(self, x: PETSc.Vec, end: PETSc.Vec) -> bool:
+        """Write x less its correction into ``end``; return whether the surface meets itself nowhere on the way."""
+        x.copy(end)
+        end.axpy(-1.0, self.estimate.correction)
         positions = self.functional.positions
-        return self.functional.surface is None or self.functional.free_share(positions(x), positions(nearer)) == 1.0
+        return self.functional.surface is None or self.functional.free_share(positions(x), positions(end)) == 1.0
 
     def _second_estimate(self, nearer: Iterate, first: float, bound: float, enough: float, lowest: float) -> float:
         """Estimate the error of x by both corrections, of which the first has the length ``first``.
 
+        If the second leads through the surface, g is no parabola over it, and the error may be far larger.
         Where the second cannot be had, as CG breaks down on an F of little but rounding, what
         bounds it has its place if the curvature allows; else the error is infinite.
         """
@@ -109,6 +108,8 @@ class Minimum:
         second = self.estimate(nearer, bound, enough, will_do, lowest)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
+        if not self._follow(self.nearer, self.f):
+            return relative(first + DOUBTFUL * second, distance)
         known = second - (self.estimate.missing or 0.0)
         if first > 0 and known > SMALL * first:
             return DOUBTFUL * relative(max(first, second), distance)

@@ -14,13 +14,19 @@ Nodes that go with the obstacles near them need no such solve, and are tried fir
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
+from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.comm import Stop
 from msmpetsc.contact.surface.pairs import Contacts
-from msmpetsc.errors import StepFailed
+from msmpetsc.errors import StepFailed, StepStopped
 from msmpetsc.solve.nonlinear.functional import StepFunctional
+from msmpetsc.solve.nonlinear.jacobian import Jacobian
+
+Vectors: TypeAlias = tuple[PETSc.Vec, PETSc.Vec, PETSc.Vec]
 
 # Directions between looks at the progress: a press takes 5 to 30
 PATIENCE = 40
@@ -28,19 +34,19 @@ PATIENCE = 40
 PROGRESS = 0.1
 # Directions at fixed s after each share: a direction doubles a gap that the share has closed
 CORRECTIONS = 2
-
-# (q (l, 3) [m], how far held nodes (l, 3) and obstacles' points (o, 3) still go [m]) -> dx (l, 3) [m], held nodes too
-Direction = Callable[[Positions, Rows, Rows], Rows]
+# ksp_rtol of a direction: contact is so much stiffer than bodies
+RTOL = 1e-7
 
 
 class LedStart:
     """Way from where a step begins to a start at its end. All methods are collective.
 
-    direction : solves for Newton's direction, with anchors and obstacles where the functional has them
+    ksp     : solves with the Jacobian
+    vectors : three of unknowns, that are written to
     """
 
-    def __init__(self, functional: StepFunctional, direction: Direction):
-        self.functional, self.direction = functional, direction
+    def __init__(self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP, vectors: Vectors):
+        self.functional, self.jacobian, self.ksp, self.vectors = functional, jacobian, ksp, vectors
 
     def reach(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:
         """Return the guess (l, 3) [m], or a start that the surface reaches without crossing anything.
@@ -59,8 +65,9 @@ class LedStart:
         if problem.prescribed is None and contacts.same(contacts.begin, end):
             still = 0.0 if obstacles.total else drift(moved)
             return problem.q + share * moved + (1 - share) * still
-        for way in (moved, 0 * moved) if obstacles.moves(contacts.begin, end) else ():
-            way = obstacles.carried(problem.q, way, contacts.begin, end, functional.lattice.cell_size)
+        for way in (moved, 0 * moved):
+            if obstacles.total:
+                way = obstacles.carried(problem.q, way, contacts.begin, end, functional.lattice.cell_size)
             carried = np.where(functional.lattice.pinned[:, None], problem.fixed, problem.q + way)
             if functional.free_share(problem.q, carried, contacts.begin) == 1.0:
                 return carried
@@ -82,9 +89,9 @@ class LedStart:
                 left = np.where(is_held, (1 - s) * (problem.fixed - problem.q), 0.0)
                 contacts.time, functional.problem = now, replace(problem, prescribed=problem.fixed - left)
                 for _ in range(CORRECTIONS if s > 0 else 0):
-                    way = self.direction(q, 0 * left, still)
+                    way = self._direction(q, np.zeros_like(left), still)
                     q = q + functional.free_share(q, q + way) * way
-                way = self.direction(q, left, contacts.obstacles.way(now, end))
+                way = self._direction(q, left, contacts.obstacles.way(now, end))
                 contacts.time = end
                 share = functional.free_share(q, q + way, now)
                 if share == 1.0:
@@ -97,3 +104,30 @@ class LedStart:
             'try other paths, or safety.on_failure = "substep"',
             "contact",
         )
+
+    def _direction(self, q: Positions, held: Rows, obstacles: Rows) -> Rows:
+        """Return Newton's direction (l, 3) [m] at q (l, 3) [m], held nodes included.
+
+        held, obstacles : how far held nodes (l, 3) and obstacles' points (o, 3) go along it [m]
+        """
+        functional, unknowns, (x, change, f) = self.functional, self.functional.unknowns, self.vectors
+        contact = functional.problem.contact
+        assert contact is not None and contact.surface is not None
+        if Stop.agreed(functional.comm):
+            raise StepStopped("stopped by a signal")
+        unknowns.from_nodes(q, x)
+        functional.evaluate(x, f)
+        self.jacobian.linearise(q, contact, True, contact.no_duals())
+        forces = self.jacobian.hessian.forces(held)
+        contact.surface.add_change_of_gradient(q, obstacles, forces)
+        unknowns.scaled_sum(np.zeros_like(q), functional.t2, forces, change)
+        f.axpy(1.0, change)
+        tolerances = self.ksp.getTolerances()
+        self.ksp.setInitialGuessNonzero(False)
+        self.ksp.setTolerances(rtol=RTOL)
+        self.ksp.solve(f, x)
+        self.ksp.setTolerances(*tolerances)
+        x.scale(-1.0)
+        way = held.copy()
+        unknowns.to_nodes(x, way)
+        return way

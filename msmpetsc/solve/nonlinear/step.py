@@ -41,7 +41,6 @@ from msmpetsc.solve.work import Work
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 SOFTER = 9.0  # how far |F| may rise at first; then lambda, from one solid that leads on to the next
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
-LED = 1e-7  # ksp_rtol of directions of a start that is led
 RAISED = 2.0  # times |F| before: friction and contact have kinks within what g has no digits for
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 CLIMBS = (  # PETSc takes it for a minimum where |H F| / |F| < 1e-4, as any is in small units
@@ -119,7 +118,6 @@ class Stepper:
         self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)  # lambda of a cell, in mu
         self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
         self.first_guess = FirstGuess(self.functional, self.preset.iterations is None)
-        self.led_start = LedStart(self.functional, self._direction_led)
         self.options = SolverOptions(self.preset, self.prefix, self.budget)
         try:
             with petsc_errors("PETSc refuses its options"):
@@ -128,6 +126,7 @@ class Stepper:
                 self.has_npc = self.options.is_given("npc_snes_type")  # a plain iteration that preconditions SNES
                 self.snes, self.ksp = self._create_solvers()
                 self.control, self.minimum = self._create_control()
+                self.led_start = LedStart(self.functional, self.jacobian, self.ksp, (self.x, self.f, self.work))
         except InputError:
             self.destroy()
             raise
@@ -236,30 +235,6 @@ class Stepper:
         share = self.functional.free_share(iterate.q, balanced)
         if share < 1.0:
             self.unknowns.from_nodes(iterate.q + share * (balanced - iterate.q), self.x)
-
-    def _direction_led(self, q: Positions, held: Rows, obstacles: Rows) -> Rows:
-        """Return Newton's direction (l, 3) [m] at q (l, 3), carried along by what moves (``LedStart``).
-
-        held, obstacles : how far held nodes (l, 3) and obstacles' points (o, 3) go [m]
-        """
-        contact, hessian = self.functional.problem.contact, self.jacobian.hessian
-        assert contact is not None and contact.surface is not None
-        if Stop.agreed(self.comm):
-            raise StepStopped("stopped by a signal")
-        self.unknowns.from_nodes(q, self.x)
-        self.functional.evaluate(self.x, self.work)
-        self.jacobian.linearise(q, contact, True, contact.no_duals())
-        forces = hessian.forces(held)
-        contact.surface.add_change_of_gradient(q, obstacles, forces)
-        self.unknowns.scaled_sum(np.zeros_like(q), self.functional.t2, forces, self.f)
-        self.work.axpy(1.0, self.f)
-        self.ksp.setInitialGuessNonzero(False)
-        self.ksp.setTolerances(rtol=LED)
-        self.ksp.solve(self.work, self.x)
-        self.x.scale(-1.0)
-        way = held.copy()
-        self.unknowns.to_nodes(self.x, way)
-        return way
 
     def forget(self, modes: bool = True) -> None:
         """Forget what earlier steps showed, so that the next step does not depend on it; modes: the lowest mode too."""

@@ -47,6 +47,7 @@ class LedStart:
 
     def __init__(self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP, vectors: Vectors):
         self.functional, self.jacobian, self.ksp, self.vectors = functional, jacobian, ksp, vectors
+        self.most_its = ksp.getTolerances()[3]
 
     def reach(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:
         """Return the guess (l, 3) [m], or a start that the surface reaches without crossing anything.
@@ -124,7 +125,7 @@ class LedStart:
         f.axpy(1.0, change)
         tolerances = self.ksp.getTolerances()
         self.ksp.setInitialGuessNonzero(False)
-        self.ksp.setTolerances(rtol=RTOL)
+        self.ksp.setTolerances(rtol=RTOL, max_it=self.most_its)
         self.ksp.solve(f, x)
         self.ksp.setTolerances(*tolerances)
         x.scale(-1.0)

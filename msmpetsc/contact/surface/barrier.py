@@ -234,6 +234,14 @@ class Barrier:
     def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
+    def nearest(self, contacts: ContactSets, points: Positions) -> Indices:
+        """Return the points (k,) of the pair of least distance; none where there are no contacts."""
+        parts, at = (self.mesh.edges, self.mesh.faces), np.asfortranarray(points)
+        pairs = [near[i] for _, near in self._pushing(contacts) for i in range(len(near))]
+        nearest = min(pairs, key=lambda pair: pair.compute_distance(at, *parts), default=None)
+        numbers = [] if nearest is None else [i for i in nearest.vertex_ids(*parts) if i >= 0]
+        return np.array(numbers, np.int64)
+
     def clearance(self, contacts: ContactSets, sets: PairSets, points: Positions) -> float:
         """Return no more than the least distance [m] of these pairs, of which contacts are all at points S (p, 3)."""
         known = zip(contacts, sets, self.distances, strict=True)

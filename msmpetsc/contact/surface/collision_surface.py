@@ -60,7 +60,11 @@ def collision_surface(
     law = BarrierLaw(distance, float(distance**2 * layer), table.friction, stick)
     carried = SurfacePoints(comm, lattice, embedding, met)
     joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))
-    surface = CollisionSurface(joint, carried, law, meets_itself)
+    names = [f"body.{number}" if len(bodies) > 1 else "the body" for number in range(len(bodies))]
+    names += [f"obstacle.{number}" for number in met.numbers]
+    counts = [len(part.points) for part in (*surfaces, *met.solids)]
+    parts = list(zip(names, counts, strict=True)) if surfaces else []
+    surface = CollisionSurface(joint, carried, law, meets_itself, parts)
     on_root(comm, lambda: _refuse_touching(surface))
     return surface
 

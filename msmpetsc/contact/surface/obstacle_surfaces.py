@@ -16,21 +16,28 @@ from msmpetsc.scene.reading import Scene
 EDGES = 4.0  # of the bodies' surface: the longest of an obstacle, whose larger triangles would push stiffly
 MOST = 10_000  # triangles of an obstacle, from which on it is not split
 ROUND = 4  # times that an icosahedron's triangles are split: half a thousandth of its radius off the ball
-BESIDE = 4.0  # cells, or ways where these are longer: so near an obstacle nodes go along with it
+# Cells from an obstacle: the nodes that carry a surface beside it, which go as it does
+FIRST = 1.75
+# Cells, or ways where these are longer, beyond which nodes pass from an obstacle's way to their own
+BESIDE = 4.0
+# Cells: the least distance that inverse distances are of
+TOUCHING = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass
 class ObstacleSurfaces:
     """Surfaces of obstacles, on all ranks, one after the other.
 
     numbers   : (k,) of the obstacles in the scene
     obstacles : these, and their paths
     solids    : their surfaces at time 0
+    straight  : times [s] between which points go straight, whatever their paths; None: nowhere
     """
 
     numbers: list[int]
     obstacles: list[Obstacle]
     solids: list[Surface]
+    straight: tuple[float, float] | None = None
 
     @cached_property
     def total(self) -> int:
@@ -43,6 +50,13 @@ class ObstacleSurfaces:
 
     def points_at(self, time: float) -> Positions:
         """Return the points (o, 3) [m] at a time [s]."""
+        if self.straight and self.straight[0] < time < self.straight[1]:
+            begin, end = self.straight
+            share = (time - begin) / (end - begin)
+            return (1 - share) * self._on_path(begin) + share * self._on_path(end)
+        return self._on_path(time)
+
+    def _on_path(self, time: float) -> Positions:
         paths = zip((obstacle.path for obstacle in self.obstacles), self.solids, strict=True)
         return np.concatenate([path.moved(solid.points, path.value_at(time)) for path, solid in paths])
 
@@ -56,19 +70,23 @@ class ObstacleSurfaces:
         return np.stack([np.bincount(owner, along, len(self.solids)) for along in forces.T], axis=1)
 
     def carried(self, q: Positions, moved: Rows, begin: float, end: float, cell: float) -> Rows:
-        """Return how far nodes q (n, 3) [m] go in a step, (n, 3) [m]: with an obstacle beside them, or by ``moved``.
+        """Return how far nodes q (n, 3) [m] go in a step, (n, 3) [m]: with obstacles near them, or by ``moved``.
 
-        So what is near an obstacle keeps its distance; farther off, nodes pass from its way to their own.
+        Nodes of cells at an obstacle keep their place beside it. Between obstacles the ways are interpolated by inverse
+        distances, so that a plate and a floor squeeze a body evenly; farther off, nodes pass to their own way.
         """
+        weights, near = np.zeros((len(q), 1)), np.zeros((len(q), 1))
+        way = np.zeros_like(q)
         for obstacle in self.obstacles:
             path = obstacle.path
             at_rest = path.unmoved(q, path.value_at(begin))
-            way = path.moved(at_rest, path.value_at(end)) - q
-            depth, _ = obstacle.solid.depths(at_rest)
-            length = np.linalg.norm(way, axis=1)
-            share = (1 + (depth + BESIDE * cell) / (BESIDE * np.maximum(length, cell))).clip(0, 1)
-            moved = np.where(length[:, None] > 0, moved + share[:, None] * (way - moved), moved)
-        return moved
+            of_obstacle = path.moved(at_rest, path.value_at(end)) - q
+            distance = np.maximum(-obstacle.solid.depths(at_rest)[0] - FIRST * cell, 0.0)[:, None]
+            weight = 1 / np.maximum(distance, TOUCHING * cell)
+            way, weights = way + weight * of_obstacle, weights + weight
+            length = np.maximum(np.linalg.norm(of_obstacle, axis=1), cell)[:, None]
+            near = np.maximum(near, (1 + (BESIDE * cell - distance) / (BESIDE * length)).clip(0, 1))
+        return moved + near * (way / weights - moved)
 
 
 def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> ObstacleSurfaces:

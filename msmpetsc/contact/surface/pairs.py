@@ -35,12 +35,19 @@ class CollisionSurface:
     surface      : on rank 0, triangles that cut others taken out, and the obstacles'; None on the others
     points       : its points as the nodes carry them
     meets_itself : or obstacles alone
+    parts        : name of each body and obstacle as a scene has it, and the number of its points; on rank 0
     """
 
     surface: Surface | None
     points: SurfacePoints
     law: BarrierLaw
     meets_itself: bool
+    parts: list[tuple[str, int]]
+
+    def name_of(self, point: int) -> str:
+        """Return the name of the body or the obstacle that has the point of this number."""
+        ends = np.cumsum([count for _, count in self.parts])
+        return self.parts[int(np.searchsorted(ends, point, side="right"))][0]
 
 
 @dataclass(frozen=True)
@@ -105,6 +112,7 @@ class NearPairs:
 
     def __init__(self, comm: MPI.Comm, collision: CollisionSurface):
         self.comm, self.points, self.law = comm, collision.points, collision.law
+        self.name_of = collision.name_of
         self.owned, surface = collision.points.weights.shape[1], collision.surface
         self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, collision) if surface else None)
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
@@ -230,7 +238,7 @@ class Contacts:
         if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:  # so that the next steps need no look
             self.near.look(x, self.time, ahead)
         self.find(x, base=q)
-        found, free = self.touch(x, self.time), self.free_share(q, x, True) == 1.0
+        found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
         is_right = free and found.energy <= (1 + SAME) * known.energy + left_out
         if free and not is_right:
             self.narrow(x, self.time)
@@ -270,18 +278,29 @@ class Contacts:
         of_all: Touch = self.comm.bcast(touch)
         return of_all
 
+    def nearest(self, q: Positions) -> str:
+        """Return in words which two parts of the surface are nearest at q, and where."""
+        moment, words = self.find(q, with_points=True), ""
+        if self.barrier:
+            points = self.barrier.nearest(moment.contacts, moment.points)
+            names = dict.fromkeys(self.near.name_of(point) for point in points)
+            place = ", ".join(f"{x:.4g}" for x in moment.points[points].mean(axis=0))
+            words = f"{' and '.join(names)} meet at ({place}) m" if len(points) else "parts of the surface meet"
+        in_words: str = self.comm.bcast(words)
+        return in_words
+
     def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[Pairs, float]:
         """Return the newest pairs, and no less than how far points are from them on a way from q at ``begin`` [s]."""
         pairs = self.near.around(q, begin)
         places = (q, begin), (end, self.time)
         return pairs, max(self.near.farthest(at, pairs.q, time, pairs.time) for at, time in places)
 
-    def free_share(self, q: Positions, end: Positions, with_obstacles: bool = False) -> float:
-        """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on.
+    def free_share(self, q: Positions, end: Positions, begin: float | None = None) -> float:
+        """Return the share, up to 1, of the straight way from q to ``end`` on which no two triangles meet.
 
-        with_obstacles : these go from where they are when the step begins
+        begin : obstacles go from their place at this time [s] to their present place; None: they stay
         """
-        begin = self.begin if with_obstacles else self.time
+        begin = self.time if begin is None else begin
         pairs, bound = self._bound(q, begin, end)
         if bound < pairs.clear:
             return 1.0

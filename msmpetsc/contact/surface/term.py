@@ -173,13 +173,29 @@ class SurfaceContact:
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         moment = self._acting(q)
-        if moment is None:
-            return
-        forces, points = self._gradient(moment), self.contacts.points
+        if moment is not None:
+            self._add_to_nodes(self._gradient(moment), gradient)
+
+    def _add_to_nodes(self, forces: Rows, gradient: Rows) -> None:
+        """Add W^T f of forces (total, 3) [N] on rank 0 to ``gradient`` (owned or more, 3)."""
+        points = self.contacts.points
         touched = np.flatnonzero(forces[: points.bodies].any(axis=1))
         touched, forces = self.comm.bcast((touched, forces[touched]))
         weights = points.carried(touched)
         gradient[: weights.shape[1]] += weights.T @ forces
+
+    def add_change_of_gradient(self, q: Positions, way: Rows, gradient: Rows) -> None:
+        """Add the first-order change of its gradient [N] at q when obstacles' points move by ``way`` (o, 3) [m].
+
+        The Hessian is that without the negative part of each pair.
+        """
+        moment = self._acting(q)
+        if moment is None:
+            return
+        moved = np.zeros_like(moment.points)
+        moved[self.contacts.points.bodies :] = way
+        whole = self._whole_hessian(moment, True, None)
+        self._add_to_nodes(moved if whole is None else (whole @ moved.ravel()).reshape(-1, 3), gradient)
 
     def _gradient(self, moment: ContactsAt) -> Rows:
         """Return the gradient (total, 3) [N] on rank 0, friction included; (0, 3) on the others."""
@@ -251,17 +267,23 @@ class SurfaceContact:
 
     def _curvature(self, moment: ContactsAt, projected: bool, duals: Rows | None) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
+        whole = self._whole_hessian(moment, projected, duals)
+        if whole is None:
+            return None
+        rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
+        touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))
+        numbers = (3 * touched[:, None] + np.arange(3)).ravel()
+        return touched, csr_array(whole[numbers][:, numbers])
+
+    def _whole_hessian(self, moment: ContactsAt, projected: bool, duals: Rows | None) -> csr_array | None:
+        """Return on rank 0 the Hessian (3 total, 3 total) [N/m] of all points, obstacles' among them."""
         barrier = self.contacts.barrier
         if barrier is None:
             return None
         parts = barrier.hessian(moment.contacts, moment.points, projected)
         if self.friction:
             parts.append(self.friction.hessian(moment.points, duals))
-        whole = csr_array(sum(parts))
-        rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
-        touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))
-        numbers = (3 * touched[:, None] + np.arange(3)).ravel()
-        return touched, csr_array(whole[numbers][:, numbers])
+        return csr_array(sum(parts)) if parts else csr_array((moment.points.size,) * 2)
 
     def bound(self, q: Positions) -> Floats:
         """Return (owned,) [N/m] no less than each block of the projected Hessian: powers of 4, which change seldom."""

@@ -118,18 +118,22 @@ class TrueHessian:
                 part.slopes[:] = slopes
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        assert self.elastic is not None, "the Hessian was not linearised"
         self.products += 1
         with PRODUCT:
             self.unknowns.to_nodes(x, self.v)
-            self.product[:] = 0
-            self.elastic.add_product(self.v, self.product)
-            if self.surface:
-                with CONTACT:
-                    self.surface.add_product(self.v, self.product)
-            self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+            self.unknowns.scaled_sum(self.v, self.t2, self.forces(self.v), y)
             if self.contact:
                 self.contact.add(x, y)
+
+    def forces(self, v: Rows) -> Rows:
+        """Return the Hessian of E and of the surface times v (l, 3), in (l, 3) [N] until the next call."""
+        assert self.elastic is not None, "the Hessian was not linearised"
+        self.product[:] = 0
+        self.elastic.add_product(v, self.product)
+        if self.surface:
+            with CONTACT:
+                self.surface.add_product(v, self.product)
+        return self.product
 
 
 def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str = "") -> PETSc.Mat:

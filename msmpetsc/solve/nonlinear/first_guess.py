@@ -3,7 +3,6 @@
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, like, to_host
-from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
 
@@ -23,8 +22,7 @@ class FirstGuess:
 
         Besides y, as published: y and the elastic corrections of the last steps, extrapolated; q_n, moved by
         what the free flight moves on average where nothing is held, so that a step that stops early keeps the momentum;
-        and the free flight y + t^2 M^(-1) f_ext itself. Of the best alone it is asked whether the surface crosses
-        something on the way there.
+        and the free flight y + t^2 M^(-1) f_ext itself.
         """
         problem, lattice = self.functional.problem, self.functional.lattice
         q, y = problem.q, problem.y
@@ -32,16 +30,16 @@ class FirstGuess:
             return y
         flight = y.copy()
         flight[: lattice.owned] += self.functional.t2 * problem.load / lattice.mass[:, None]
-        guesses = [y, q + self._drift(flight - q)]
+        guesses = [y, q + self.drift(flight - q)]
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
         surface = self.functional.surface
         met = surface is not None and surface.presses(q)  # parts of it push each other
         if not met:  # else a free flight leads into what presses
             guesses.append(flight)
-        values = [self.functional.value(self._held(guess)) for guess in guesses]
+        values = [self.functional.value(self.held(guess)) for guess in guesses]
         best = self._least(guesses, values) if surface and met else int(np.argmin(values))
-        return self._without_crossing(guesses[best])
+        return guesses[best]
 
     def _least(self, guesses: list[Positions], without: list[float]) -> int:
         """The guess (a number) of least g, of which ``without`` is that without self-contact.
@@ -56,35 +54,10 @@ class FirstGuess:
         for number in np.argsort(without):
             if without[number] - stored >= least:
                 break
-            value = functional.value(self._held(guesses[number]), True)
+            value = functional.value(self.held(guesses[number]), True)
             if value < least:
                 best, least = int(number), value
         return best
-
-    def _without_crossing(self, guess: Positions) -> Positions:
-        """The guess, or as much of the way there, beside the body's own as a whole, as leads to no crossing.
-
-        Raises StepFailed where anchors and obstacles alone lead the surface through something.
-        """
-        functional, q = self.functional, self.functional.problem.q
-        share = functional.free_share(q, self._held(guess), True)
-        if share == 1.0:
-            return guess
-        assert functional.surface is not None
-        contacts, moved = functional.surface.contacts, guess - q
-        obstacles, ends = contacts.obstacles, (contacts.begin, contacts.time)
-        if functional.problem.prescribed is None and contacts.same(*ends):
-            drift = 0.0 if obstacles.total else self._drift(moved)
-            return q + share * moved + (1 - share) * drift
-        for way in [0 * moved] if contacts.same(*ends) else [moved, 0 * moved]:  # what is led moves on at once
-            end = q + obstacles.carried(q, way, *ends, functional.lattice.cell_size)
-            if functional.free_share(q, self._held(end), True) == 1.0:
-                return end
-        raise StepFailed(
-            "has anchors or obstacles that lead the surface through itself or lead it through them; "
-            'try safety.on_failure = "substep", or other paths',
-            "contact",
-        )
 
     def learn(self, x: Positions) -> None:
         """The step has come to x (l, 3) [m]."""
@@ -94,12 +67,12 @@ class FirstGuess:
         """Forget what earlier steps showed."""
         self.corrections = []
 
-    def _held(self, guess: Positions) -> Positions:
+    def held(self, guess: Positions) -> Positions:
         """The guess, but with the held nodes where they will be."""
         lattice = self.functional.lattice
         return np.where(lattice.pinned[:, None], self.functional.problem.fixed, guess) if self.holds else guess
 
-    def _drift(self, moved: Rows) -> Floats | float:
+    def drift(self, moved: Rows) -> Floats | float:
         """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""
         if self.holds:
             return 0.0

@@ -135,15 +135,15 @@ class StepFunctional:
         """What keeps the surface from crossing itself in this step, if anything does."""
         return self.problem.contact.surface if self.problem.contact else None
 
-    def free_share(self, base: Positions, q: Positions, with_obstacles: bool = False) -> float:
+    def free_share(self, base: Positions, q: Positions, begin: float | None = None) -> float:
         """Share, up to 1, of the straight way from base to q (l, 3) on which the surface meets nothing.
 
-        with_obstacles : these go from where the step begins to where they are at its end
+        begin : obstacles go from their place at this time [s] to their present place; None: they stay
         """
         if self.surface is None:
             return 1.0
         with CONTACT:
-            return self.surface.contacts.free_share(base, q, with_obstacles)
+            return self.surface.contacts.free_share(base, q, begin)
 
     def noise(self, count: int) -> Rows:
         """Random numbers (count, n) in [-1/2, 1/2), the same for any number of ranks."""

@@ -30,6 +30,7 @@ from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import FrictionDuals, Jacobian
+from msmpetsc.solve.nonlinear.led_start import LedStart
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.petsc.events import LOCAL
@@ -129,6 +130,7 @@ class Stepper:
                 self.has_npc = self.options.is_given("npc_snes_type")  # a plain iteration that preconditions SNES
                 self.snes, self.ksp = self._create_solvers()
                 self.control, self.minimum = self._create_control()
+                self.led_start = LedStart(self.functional, self.jacobian, self.ksp, (self.x, self.f, self.work))
         except InputError:
             self.destroy()
             raise
@@ -220,7 +222,10 @@ class Stepper:
         self.friction.begin(problem.contact)
         self.control.estimate.convexity = 1.0
         self.is_forced = self.is_bent = False
-        self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
+        guess = self.first_guess.best() if start is None else start
+        if start is None or self.static:
+            guess = self.led_start.reach(self.first_guess.held(guess), self.first_guess.drift)
+        self.unknowns.from_nodes(guess, self.x)
         multigrid = self.jacobian.preconditioner.to_balance
         if start is None and multigrid:
             self._balance(multigrid)

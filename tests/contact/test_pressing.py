@@ -1,0 +1,93 @@
+"""Obstacles that move by far more than the barrier's distance in a step, with a body between them."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from block_scene import DENSITY, SIDES, G, block_scene, play
+from crossings import count_crossings
+
+from msmpetsc.build import Model
+from msmpetsc.errors import StepFailed
+from msmpetsc.fields import Frame
+
+SOLID = {"young_modulus": 1e5, "density": DENSITY, "law": "neo-hookean", "poisson_ratio": 0.3}
+STEP = 0.01
+HEIGHT = SIDES[2]
+FLOOR = {"shape": "box", "box": [[-0.3, -0.3, -0.1], [0.8, 0.8, -0.004]], "response": "barrier"}
+PLATE = {"shape": "box", "box": [[-0.3, -0.3, HEIGHT + 0.002], [0.8, 0.8, HEIGHT + 0.1]], "response": "barrier"}
+CENTER = [*SIDES[:2] / 2, HEIGHT + 0.002]
+WAYS = {
+    "straight": {"by": [0, 0, -0.25 * HEIGHT]},
+    "sheared": {"by": [0.03, 0, -0.2 * HEIGHT]},
+    "turning": {"by": [0, 0, -0.2 * HEIGHT], "turn": [0, 0, 20]},
+    "tilted": {"by": [0, 0, -0.2 * HEIGHT], "turn": [4, 0, 0]},
+}
+
+
+def pressed(folder: Path, plate: dict, steps: int, **tables) -> tuple[Model, list[Frame]]:
+    time = {"step": STEP, "duration": STEP * steps}
+    solver = {"preset": "newton", "error": 1e-4}
+    tables = {"material": SOLID, "solver": solver, "output": {}, "obstacle": [FLOOR, plate]} | tables
+    scene = block_scene(folder, time=time, gravity={"acceleration": [0, 0, -G]}, **tables)
+    trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide_to_size(0.1).export(folder / "scene.ply")
+    return play(scene)
+
+
+def crossings(model: Model, frame: Frame) -> int:
+    """Return how many edges of body and obstacles cross triangles, by the model's own surfaces."""
+    obstacles = model.collision.points.obstacles
+    parts = [model.surface.triangles, *(solid.triangles for solid in obstacles.solids)]
+    firsts = np.cumsum([0, len(model.surface.points), *(len(s.points) for s in obstacles.solids)])
+    triangles = np.concatenate([part + first for part, first in zip(parts, firsts, strict=False)])
+    return count_crossings(np.concatenate([frame.surface, obstacles.points_at(frame.time)]), triangles)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
+    """Each of its steps is a hundred times the barrier's distance long; momentum is that of all forces."""
+    steps = 3
+    plate = PLATE | {"center": CENTER, "path": [{"time": STEP * steps, **WAYS[way]}]}
+    model, frames = pressed(tmp_path, plate, steps, self_contact={"friction": 0.4})
+    assert not any(crossings(model, frame) for frame in frames)
+    weight = np.array([0, 0, -G * DENSITY * SIDES.prod()])
+    for before, after in pairwise(frames):
+        force = after.push.sum(axis=0) + weight
+        gained = (after.momentum - before.momentum) / STEP
+        scale = np.abs(after.push).max() + np.linalg.norm(weight)
+        np.testing.assert_allclose(gained, force, atol=2e-3 * scale)
+    assert frames[-1].push[1, 2] < -weight[2]
+
+
+def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
+    """The cone widens it; the plate that pushes goes on by eighty times the barrier's distance in a step."""
+    ring = trimesh.creation.annulus(r_min=0.1, r_max=0.16, height=0.06, sections=24).subdivide_to_size(0.06)
+    cone = trimesh.creation.cone(radius=0.2, height=0.4, sections=32)
+    cone.apply_translation([0, 0, -0.25])
+    ring.apply_translation([0, 0, 0.0])
+    cone.export(tmp_path / "cone.ply")
+    plate = {"shape": "box", "box": [[-0.3, -0.3, 0.032], [0.3, 0.3, 0.1]], "response": "barrier"}
+    plate["path"] = [{"time": 0.05, "by": [0, 0, -0.05]}]
+    obstacles = [{"shape": "mesh", "mesh": {"source": "cone.ply"}, "response": "barrier"}, plate]
+    scene = block_scene(
+        tmp_path,
+        material=SOLID,
+        solver={"preset": "newton", "error": 1e-3},
+        output={},
+        time={"step": 0.01, "duration": 0.05},
+        obstacle=obstacles,
+        cages={"cell_size": 0.03},
+    )
+    ring.export(tmp_path / "scene.ply")
+    model, frames = play(scene)
+    assert not any(crossings(model, frame) for frame in frames)
+    radius = np.linalg.norm(frames[-1].surface[:, :2], axis=1)
+    assert radius.min() > 1.02 * 0.1
+
+
+def test_a_step_that_cannot_end_names_the_two_parts_that_meet(tmp_path: Path):
+    plate = PLATE | {"path": [{"time": STEP, "by": [0, 0, -1.5 * HEIGHT]}]}
+    with pytest.raises(StepFailed, match=r"the body and obstacle\.\d meet at|obstacle\.\d and the body meet at"):
+        pressed(tmp_path, plate, 1)

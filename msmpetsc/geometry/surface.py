@@ -48,6 +48,17 @@ def compact(points: Positions, triangles: Indices) -> Surface:
     return Surface(points[used], numbers.reshape(-1, 3))
 
 
+def outward(surface: Surface) -> Rows:
+    """Return the unit normals (v, 3) at the points of a closed surface, outward whichever way it is wound."""
+    a, b, c = surface.points[surface.triangles].transpose(1, 0, 2) - surface.points.mean(axis=0)
+    areas = np.cross(b - a, c - a)
+    normals = np.zeros_like(surface.points)
+    np.add.at(normals, surface.triangles, areas[:, None])
+    sizes = np.linalg.norm(normals, axis=1)[:, None]
+    unit: Rows = np.copysign(1.0, np.vdot(a, areas)) * normals / np.maximum(sizes, np.finfo(float).tiny)
+    return unit
+
+
 def bounds_of(surface: Surface) -> Rows:
     """Return the bounding box (2, 3) [m] of all points."""
     return np.array([surface.points.min(axis=0), surface.points.max(axis=0)])

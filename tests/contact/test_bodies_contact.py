@@ -18,7 +18,7 @@ from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs
 from msmpetsc.environment import Environment
-from msmpetsc.errors import StepFailed
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
@@ -56,6 +56,30 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
     path = folder / f"{name}.toml"
     path.write_text(tomli_w.dumps(scene | tables))
     return path
+
+
+def pile(folder: Path, meshes: list[str], apart: float) -> Path:
+    """Scene of a block on another, which is pinned, with such a distance [m] between the two."""
+    pin = [{"region": {"box": [[0, 0, 0], [1, 1, 0.1]], "relative": True}}]
+    bodies = [body(meshes[0], [0, 0, 0], pin=pin), body(meshes[1], [0, 0, SIDE + apart])]
+    time, gravity = {"step": 0.01, "duration": 0.1}, {"acceleration": [0, 0, -G]}
+    return write(folder, "pile", body=bodies, time=time, gravity=gravity)
+
+
+@pytest.mark.parametrize("meshes", [["block", "block"], ["block", "inward"], ["inward", "block"]])
+def test_a_block_that_touches_another_at_rest_lies_on_it(folder: Path, meshes: list[str]):
+    mesh = trimesh.load(folder / "block.ply")
+    mesh.invert()
+    mesh.export(folder / "inward.ply")
+    model, frames = play(pile(folder, meshes, 0.0))
+    upper = model.lattice.body == 1
+    sunk, free = (frames[0].position - frames[-1].position)[upper].mean(axis=0), 0.5 * G * 0.1**2
+    assert abs(sunk[:2]).max() < 1e-4 and -DISTANCE < sunk[2] < 0.2 * free
+
+
+def test_bodies_that_overlap_at_rest_are_named(folder: Path):
+    with pytest.raises(InputError, match=r"cut others at rest.* \(of body\.0, body\.1, which must be parted"):
+        play(pile(folder, ["block", "block"], -0.1 * SIDE))
 
 
 def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from block_scene import CELL, DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
 from mpi4py import MPI
 from obstacles import box, plane, sphere
@@ -233,6 +234,19 @@ def test_a_block_at_rest_sinks_until_the_ground_carries_it(tmp_path: Path, stiff
     assert k * depth[-1].sum() == pytest.approx(MASS * G, rel=1e-6)
     pushes = [frame.contact for frame in frames]
     np.testing.assert_allclose(pushes, 0.5 * k * (depth**2).sum(axis=1), rtol=1e-12)
+
+
+def test_a_stiff_die_comes_to_rest_though_contact_is_stiffer_than_the_corners_that_touch(tmp_path: Path):
+    """What F has of rounding is that of contact: the lightest corners weigh less than a millionth of a cell."""
+    die = trimesh.creation.box([0.2] * 3)
+    die.apply_transform(trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3)))
+    die.apply_translation([0, 0, 0.02 - die.bounds[0, 2]])
+    die.export(tmp_path / "die.ply")
+    material = {"young_modulus": 1e10, "density": DENSITY, "poisson_ratio": 0.3, "law": "neo-hookean"}
+    tables = {"cages": {"count": 64}, "material": material, "solver": {"error": 1e-3}}
+    scene = grounded(tmp_path, [0, 0, -G], 45, 0.01, GROUND, mesh={"source": "die.ply"}, **tables)
+    _, frames = play(scene)
+    assert frames[-1].kinetic < 1e-3
 
 
 def slide(folder: Path, slope: float, steps: int = 60, t: float = 0.01, speed: dict | None = None, **tables):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import play
+from block_scene import block_scene, play
 from test_tunnelling import ball, totals
 
 PLANE = {"shape": "plane", "point": [0, 0, -0.55], "normal": [0, 0, 1]}
@@ -29,6 +29,17 @@ def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: floa
     if integrator != "verlet":  # whose swings the budget counts up and down
         assert sum(frame.energy_gained for frame in frames) < share * frames[0].kinetic
     assert frames[-1].momentum[2] > 0  # it leaves
+
+
+@pytest.mark.parametrize("step", [0.005, 0.0025])
+def test_bdf2_does_not_give_back_what_the_impact_of_a_soft_plate_took(tmp_path: Path, step: float):
+    fall = FALL | {"start": {"velocity": [0, 0, -2.5]}, "time": {"step": step, "duration": 0.08, "integrator": "bdf2"}}
+    material = {"young_modulus": 5e4, "density": 1000.0, "poisson_ratio": 0.1, "law": "neo-hookean"}
+    ground = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": "penalty"}
+    size = np.array([0.25, 0.125, 0.0125])
+    _, frames = play(block_scene(tmp_path, size, cages={"count": 50}, material=material, obstacle=[ground], **fall))
+    assert rise(frames) < 1e-2
+    assert frames[-1].momentum[2] > 0
 
 
 def test_an_exchange_gains_and_a_reflection_does_not(tmp_path: Path):

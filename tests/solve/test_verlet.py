@@ -204,6 +204,18 @@ def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp
     assert frames[-1].momentum[2] == pytest.approx(0.5 * model.lattice.mass.sum(), rel=0.2)  # the rest sways
 
 
+@pytest.mark.parametrize("stop", [6.0, 6.5])
+def test_the_work_of_an_anchor_that_lets_go_is_no_energy_from_nowhere(tmp_path: Path, stop: float):
+    """It turns round half a step before it lets go within a step, and the nodes keep the speed that this gave them."""
+    top = {"box": [[-1, -1, 0.2], [1, 1, 1]]}
+    path = [{"time": time * T, "by": [0, 0, 0.03 * height]} for time, height in ((6.25, 1), (12, 6))]
+    anchor = [{"region": top, "path": path, "stop": stop * T}]
+    time = {"step": T, "duration": 9 * T, "substep": 1e-4} | EXPLICIT
+    _, frames = play(block_scene(tmp_path, time=time, anchor=anchor, gravity={"acceleration": [0, 0, -G]}))
+    assert frames[6].kinetic + frames[6].elastic > 0.1
+    assert max(frame.energy_gained for frame in frames) < 3e-3 * frames[6].kinetic
+
+
 TILT = 0.3  # [rad] of the slope
 
 

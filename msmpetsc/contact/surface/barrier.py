@@ -117,6 +117,17 @@ class Barrier:
         cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
         return np.array(sorted(cut), np.int64)
 
+    def touching(self, owner: Indices) -> list[tuple[int, int]]:
+        """Return the pairs of bodies, by the body of each point (p,), that are nearer than dhat at rest."""
+        mesh, points, found = self.mesh, self.mesh.rest_positions, set()
+        near = self.candidates(points, 0.0)[0]
+        for pair in (*near.fv_candidates, *near.ee_candidates):
+            first, _, second, _ = owner[pair.vertex_ids(mesh.edges, mesh.faces)]
+            far = pair.compute_distance(points, mesh.edges, mesh.faces) >= self.law.distance**2
+            if first != second and not far:
+                found.add((int(min(first, second)), int(max(first, second))))
+        return sorted(found)
+
     def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> PairSets:
         """Return all pairs that may be nearer than dhat once each point has moved by no more than
         ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; and those in creases, wherever they are.

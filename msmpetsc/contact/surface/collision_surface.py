@@ -17,7 +17,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import simplify
-from msmpetsc.geometry.surface import Surface, compact, joined
+from msmpetsc.geometry.surface import Surface, compact, joined, outward
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
 from msmpetsc.scene.reading import Scene
@@ -84,7 +84,8 @@ def _prepared(
         coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
-        bodies = _without_cut(bodies)
+        sides = max((np.ptp(body.points, axis=0) for body in bodies), key=np.linalg.norm)
+        bodies = _without_cut(_parted(bodies, NEAREST * (table.distance or NEAR * float(np.linalg.norm(sides)))))
     ends = np.concatenate([b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies])
     edges = np.linalg.norm(ends, axis=2)
     if table.surface is None:
@@ -112,6 +113,20 @@ def _place(surface: Surface, triangle: int) -> str:
     return "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
 
 
+def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
+    """Return surfaces of bodies, drawn in by ``gap`` [m] if any two are nearer at rest: a barrier needs a distance."""
+    whole = joined(bodies)
+    assert whole is not None
+    owner = np.repeat(np.arange(len(bodies)), [len(body.points) for body in bodies])
+    barrier = Barrier(whole, BarrierLaw(gap, 1.0, 0.0, 1.0), len(owner))
+    touching = barrier.touching(owner)
+    if not touching:
+        return bodies
+    names = ", ".join(f"body.{i} and body.{j}" for i, j in touching)
+    log.info("self_contact: %s touch at rest: all surfaces that meet are drawn in by %.2g m", names, gap)
+    return [Surface(body.points - gap * outward(body), body.triangles) for body in bodies]
+
+
 def _without_cut(bodies: list[Surface]) -> list[Surface]:
     """Return surfaces without the triangles that cut others. Raises InputError where too many do."""
     whole = joined(bodies)
@@ -121,12 +136,13 @@ def _without_cut(bodies: list[Surface]) -> list[Surface]:
         return bodies
     what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at "
     what += f"{_place(whole, cut[0])} m"
+    ends = np.cumsum([len(body.triangles) for body in bodies])[:-1]
+    if len(of := np.unique(np.searchsorted(ends, cut, side="right"))) > 1:
+        what += f" (of {', '.join(f'body.{number}' for number in of)}, which must be parted if they overlap)"
     if len(cut) > MOST_CUT * len(whole.triangles):
         raise InputError(f'{what}, too many to leave out: mesh.prepare = ["union"] or ["repair"] may mend the mesh')
     log.warning("%s: they are left out, and may be crossed", what)
-    of_body = np.split(
-        ~np.isin(np.arange(len(whole.triangles)), cut), np.cumsum([len(b.triangles) for b in bodies])[:-1]
-    )
+    of_body = np.split(~np.isin(np.arange(len(whole.triangles)), cut), ends)
     return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)]
 
 

@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest, like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -73,7 +73,8 @@ class Verlet(Integrator):
         self.elastic = self.gradient[:owned]  # grad E without what obstacles push
         self.sides = environment.no_sides[:, :owned]
         self.damping = environment.damping
-        self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside, and of loads that change
+        # [J] in a step: work on this rank's nodes, of obstacles without friction, of loads that change, of anchors
+        self.work = 0.0
         self.springs_work = 0.0  # [J] in a step, that the springs of this rank's nodes took in
         self.gained = 0.0  # [J] by the springs since the start, from nowhere and not lost since; negative: a credit
         self.halvings = 0  # of substeps, for what they gained
@@ -145,15 +146,24 @@ class Verlet(Integrator):
         duration = 0.5 * (times[1] - start)
         for begin, end in pairwise(times):
             self._kick(begin, duration, begin, end)
-            before = self.q.copy()
+            before, held = self.q.copy(), self.fixed
             self._drift(begin, end)
-            moved = self.q - before
-            self.springs_work += 0.5 * np.vdot(self.elastic, moved)
+            moved, held = self.q - before, held | self.fixed
+            self._count_work(moved, held)
             self.work += self.environment.energy_of_new_obstacles(self.q, begin, end, self.sides)
             self._pull(end)
-            self.springs_work += 0.5 * np.vdot(self.elastic, moved)
+            self._count_work(moved, held)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
+
+    def _count_work(self, moved: Rows, held: Mask) -> None:
+        """Add half of the present forces' work [J] on a substep's moves (owned, 3) [m]: of springs, and of anchors.
+
+        Anchors lead ``held`` nodes (owned,) against all forces, with the load as the energy balance has it.
+        """
+        self.springs_work += 0.5 * np.vdot(self.elastic, moved)
+        against = self.gradient[: self.lattice.owned] - self.environment.load(self.end)
+        self.work += 0.5 * float(np.vdot(against[held], moved[held]))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
         """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and
@@ -222,11 +232,18 @@ class Verlet(Integrator):
         prescribed = self.environment.prescribed(self.position.values, end)
         if prescribed is not None:
             anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
+            freed = anchored[~self.environment.fixed_at(self.end)[anchored]]
+            self.work -= self._kinetic(freed)
             self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
             self.q[anchored] = prescribed[anchored]
+            self.work += self._kinetic(freed)
         if self.environment.strikes or self.environment.has_sides:
             self._strike(begin, end)
         self.position.update()
+
+    def _kinetic(self, nodes: Indices) -> float:
+        """Kinetic energy [J] of this rank's ``nodes`` (k,)."""
+        return 0.5 * float(self.lattice.mass[nodes] @ (self.v[nodes] ** 2).sum(axis=1))
 
     def _strike(self, begin: float, end: float) -> None:
         """Find faces of contact; the velocity of a node that bounces off is what then led it there."""

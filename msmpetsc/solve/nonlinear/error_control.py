@@ -34,8 +34,7 @@ LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabo
 FINAL = 60.0  # times the error that would do: a linear solve from there on is to be the last
 PARABOLA = 0.2  # of F: what the linear solve has not left of it, where its bound is believed
 NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
-STALLED = 1e-6  # of |F|, below FULL_STEP_ERROR: an iteration that changes it by less moves within rounding
-STAYS = 0.5  # of the bound before: F no longer falls though each correction was known
+STAYS = 0.5  # of |F| before: where it no longer falls, it may be rounding of stiff contact
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
 NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 KINDS = {
@@ -101,8 +100,9 @@ class ErrorControl:
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """What is known at an iterate: its error, or a bound on it while that is far too large."""
         residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
-        stalls = abs(residual - before.residual) < STALLED * residual < STALLED * FULL_STEP_ERROR * distance
-        at_rounding, alarm = stalls or self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
+        stays = residual > STAYS * before.residual
+        at_rounding = self.rounding.is_all_of(iterate, self.functional.problem.contact if stays else None)
+        alarm = min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm)
         now = replace(now, corrected=False, beside=np.inf)
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
@@ -125,8 +125,7 @@ class ErrorControl:
             if lowest > 0 and now.bound <= now.goal * lowest:
                 return replace(now, error=now.bound / lowest)
         found = self.estimated(iterate, now, now.goal)
-        stays = before.corrected and STAYS * before.bound < now.bound < FULL_STEP_ERROR  # rounding of stiff contact
-        if is_near or stays or self.estimate.is_trusted:
+        if is_near or self.estimate.is_trusted:
             return found
         return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here
 

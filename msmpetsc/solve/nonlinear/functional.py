@@ -207,10 +207,15 @@ class Rounding:
                 f"reaches {functional.extent:.2g} m: check gravity, force and their units"
             )
 
-    def is_all_of(self, f: PETSc.Vec) -> bool:
-        """Whether F is nothing but rounding, row by row, for soft parts have less of it than stiff ones."""
-        functional = self.functional
-        rows = np.abs(functional.memory.read(f)) / (self.rows * max(functional.extent, np.finfo(float).tiny))
+    def is_all_of(self, iterate: Iterate, contact: Contact | None) -> bool:
+        """Return whether F is nothing but rounding, row by row, for soft parts have less of it than stiff ones.
+
+        contact : as stiff as it is at the iterate; None to leave it out, which costs less
+        """
+        functional, known = self.functional, self.rows
+        if contact:
+            known = known + np.tile(ROUNDINGS * functional.t2 * contact.bound(iterate.q)[functional.unknowns.free], 3)
+        rows = np.abs(functional.memory.read(iterate.f)) / (known * max(functional.extent, np.finfo(float).tiny))
         squares, count = self.comm.allreduce(np.array([float(rows @ rows), rows.size]))
         return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= SINGLE_ROW)
 

@@ -46,5 +46,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names, those not imported yet included."""
-    return sorted({*globals(), *FROM})
+    """Return the public names, those not imported yet included, and Python's own."""
+    return sorted({*FROM, *(name for name in globals() if name.startswith("__"))})

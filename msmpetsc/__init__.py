@@ -1,8 +1,5 @@
 """Elastic bodies from closed surface meshes: mass-spring lattices stepped with PETSc."""
 
-import hashlib
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what FROM says, for type checkers
@@ -49,20 +46,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names, those not imported yet included."""
-    return sorted({*globals(), *FROM})
-
-
-def _kernel_folder() -> Path:
-    """Return a folder for the compiled kernels of just these sources.
-
-    numba looks for changes in a kernel's own file alone, not in those of the kernels it calls:
-    after an update it would go on with parts of the old version.
-    """
-    package = Path(__file__).parent
-    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
-    kernels = b"".join(source for source in sources if b"njit" in source or b"@kernel" in source)
-    return package / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
-
-
-os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported
+    """Return the public names, those not imported yet included, and Python's own."""
+    return sorted({*FROM, *(name for name in globals() if name.startswith("__"))})

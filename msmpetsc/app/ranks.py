@@ -62,9 +62,13 @@ def _variables(values: dict[str, str]) -> Iterator[None]:
             del os.environ[name]
 
 
-def lines_said(output: str) -> list[str]:
-    """Return the lines of what a child said, without the frame that mpiexec draws around its messages."""
-    return [line.strip() for line in output.splitlines() if line.strip(" -")]
+def last_error(output: str) -> str:
+    """Return why a child failed: the last line of its output that is an error, or else the last line."""
+    lines = [line.strip() for line in output.splitlines() if line.strip(" -")]  # without mpiexec's frames
+    if any("attempt to run as root" in line for line in lines):
+        return "mpiexec starts no ranks as root: set OMPI_ALLOW_RUN_AS_ROOT=1 and OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"
+    errors = [line for line in lines if "msmpetsc: error:" in line]
+    return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
 
 
 def environment(alone: bool = False) -> dict[str, str]:

@@ -18,7 +18,7 @@ from msmpetsc.app.ending import ending_together
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
 from msmpetsc.app.summary import Cost, log_end, log_model, refuse_unwritable, tell_stop, versions, warn_of_long_steps
-from msmpetsc.backend.kernel import cache_is_empty
+from msmpetsc.backend import kernel_cache
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
@@ -85,8 +85,9 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
     Returns where the steps ended, at the last or by a signal; what they cost; and the failure of one that ended them.
     """
     failure = None
-    if cache_is_empty():
-        log.info("compiling kernels, once, about a minute")
+    if kernel_cache.is_empty():
+        once = "once" if kernel_cache.writable() else "as no folder can keep them (NUMBA_CACHE_DIR)"
+        log.info("compiling kernels, %s, about a minute", once)
     with (
         Signals(comm) as signals,
         begun(SETUP) as set_up,

@@ -141,6 +141,11 @@ class Simulation:
         self._words = words_of(petsc_options)
         self._shape: Geometry | None = None  # that the model was made of
 
+    def __repr__(self) -> str:
+        """Return one line: the scene, and the ranks that it is run on."""
+        ranks = f"{self.comm.size} rank{'s' * (self.comm.size > 1)}"
+        return f"Simulation({self.scene!r}, {self.device or 'cpu'}, {ranks})"
+
     def frames(self, frames: int | None = None, *, set: Mapping[str, Any] | None = None) -> Iterator[Frame]:
         """Yield the frames of a run from the start, frame 0 first (collective).
 

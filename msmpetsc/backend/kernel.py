@@ -1,19 +1,26 @@
 """One body for every index, where the arrays are: a compiled loop on the CPU, one thread an index on a GPU."""
 
-import os
 from collections.abc import Callable
 from functools import wraps
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 
 from msmpetsc.backend.arrays import on_host
+from msmpetsc.backend.kernel_cache import KernelCache
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def cache_is_empty() -> bool:
-    """Return whether numba's cache for these sources (msmpetsc/__init__.py) has no kernel's index file."""
-    return not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
+def njit(**options: Any) -> Callable[[Function], Function]:
+    """Compile a function as ``numba.njit(**options)`` does, and keep its machine code for later processes."""
+
+    def compiled(function: Function) -> Function:
+        dispatcher: Any = numba.njit(**options)(function)
+        dispatcher._cache = KernelCache(function)
+        return dispatcher  # type: ignore[no-any-return]
+
+    return compiled
 
 
 def kernel(body: Callable[..., None]) -> Callable[..., None]:
@@ -21,12 +28,12 @@ def kernel(body: Callable[..., None]) -> Callable[..., None]:
 
     ``kernel(body)(count, *arguments)`` does the same for all i below a count, in any order.
 
-    The first argument is an array, whose type tells where. What the body calls is compiled by
-    numba.njit and takes its roots from ``math``; no two indices write to the same place. The loop
-    stands in the body, and not here, so that numba finds what it has compiled before.
+    The first argument is an array, whose type tells where. The body calls functions compiled by ``njit``
+    and takes its roots from ``math``; no two indices write to the same place. The loop stands in the
+    body, and not here, so that its machine code is found again.
     """
     # A division by zero is infinite, as on a GPU: the step then tells of a number that is not finite.
-    compiled = numba.njit(cache=True, error_model="numpy")(body)
+    compiled = njit(error_model="numpy")(body)
 
     @wraps(body)
     def everywhere(count: int, *arguments: Any) -> None:

@@ -5,15 +5,12 @@ here a tenth of that: the words of an array's description are put together once,
 """
 
 import ctypes
-import hashlib
-import os
 import re
 import struct
 from collections.abc import Callable
 from functools import cache, lru_cache
 from importlib.metadata import version
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import cupy
@@ -21,6 +18,7 @@ import numba
 import numpy as np
 from numba import cuda as untyped
 
+from msmpetsc.backend import kernel_cache
 from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import MsmpetscError
 
@@ -116,17 +114,13 @@ class Launch:
 
 
 def compiled(body: Callable[..., None], kinds: tuple[Kind, ...]) -> str:
-    """Return the PTX of a body for these arguments and this GPU; kept beside numba's cache."""
+    """Return the PTX of a body for these arguments and this GPU, kept as other kernels are."""
     capability = cupy.cuda.Device().compute_capability
-    target = f"{body.__module__}.{body.__name__} {kinds} {capability} {version('numba-cuda')}"
-    path = Path(os.environ["NUMBA_CACHE_DIR"]) / f"{hashlib.sha256(target.encode()).hexdigest()[:24]}.ptx"
-    if path.exists():
-        return path.read_text()
+    name = kernel_cache.key(body, map(type_of, kinds), ("PTX", capability, version("numba-cuda")))
+    if kept := kernel_cache.load(name):
+        return kept.decode()
     ptx = ptx_of(body, kinds, (int(capability[:-1]), int(capability[-1])))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_suffix(f".{os.getpid()}")  # other ranks may write the same
-    new.write_text(ptx)
-    new.replace(path)
+    kernel_cache.save(name, ptx.encode())
     return ptx
 
 

@@ -98,7 +98,7 @@ def parsed(words: list[str]) -> argparse.Namespace:
     if ours and ours[0] not in COMMANDS and not ours[0].startswith("-"):
         word = printable(ours[0], 60)
         if word.endswith(SCENE_NAMES):
-            raise InputError(f"{word} is no command, did you mean 'msmpetsc run {word}'?")
+            raise InputError(f"{word} is no command, did you mean 'msmpetsc run {shlex.quote(word)}'?")
         raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
     _refuse_one_dash(ours, petsc)
     args, unknown = command_parser().parse_known_args(ours, argparse.Namespace(petsc_options=shlex.join(petsc)))

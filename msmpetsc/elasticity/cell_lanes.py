@@ -5,10 +5,10 @@ values at a cell's 8 corners (3 components each), its constants, what a law keep
 at 8 corners. The formulas are those of elasticity.cell_strain and elasticity.neo_hookean.
 """
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
@@ -29,12 +29,12 @@ WORK = RESULT + 24 * LANES
 FAST = {"contract", "nsz", "reassoc", "arcp"}  # numba: sums may be reordered, for lanes
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _component_in(w: Floats, at: int) -> Eight:
     return w[at], w[at + 24], w[at + 48], w[at + 72], w[at + 96], w[at + 120], w[at + 144], w[at + 168]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _strains_in(w: Floats, lane: int, at: int = 0) -> Strains:
     """Return the strains of the cell in a lane, by the corners' values from ``at`` on."""
     form = form_of(w, CONSTANTS + lane)
@@ -45,7 +45,7 @@ def _strains_in(w: Floats, lane: int, at: int = 0) -> Strains:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _gather(nodes: Indices, b: int, q: Rows, w: Floats, at: int = 0) -> None:
     for lane in range(LANES):
         for a in range(8):
@@ -53,7 +53,7 @@ def _gather(nodes: Indices, b: int, q: Rows, w: Floats, at: int = 0) -> None:
             w[k], w[k + 8], w[k + 16] = q[i, 0], q[i, 1], q[i, 2]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _scatter(nodes: Indices, b: int, w: Floats, rows: Rows) -> None:
     for lane in range(LANES):
         for a in range(8):
@@ -63,20 +63,20 @@ def _scatter(nodes: Indices, b: int, w: Floats, rows: Rows) -> None:
             rows[i, 2] += w[RESULT + 24 * a + 16 + lane]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _load(rows: Rows, row: int, w: Floats, at: int) -> None:
     for i in range(rows.shape[1]):
         w[at + i] = rows[row, i]
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(fastmath=FAST, error_model="numpy")
 def _product_lanes(w: Floats) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
         write_forces(w, RESULT + lane, w, k, turned_pull(e, w[k + 104], w, AT_STATE + lane), e)
 
 
-@numba.njit(cache=True)
+@njit()
 def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
     """Add (Hessian) v [N] to ``product`` (l, 3), its ``state`` that of ``linearise``; all of one dtype."""
     w = np.zeros(WORK, v.dtype)
@@ -88,14 +88,14 @@ def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
         _scatter(blocks.nodes, b, w, product)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(fastmath=FAST, error_model="numpy")
 def _gradient_lanes(w: Floats, h4: float) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
         write_forces(w, RESULT + lane, w, k, pull(e, w[k + 104], w[k + 112], h4), e)
 
 
-@numba.njit(cache=True)
+@njit()
 def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
     """Add grad E [N] at q (l, 3) [m] to ``gradient`` (l, 3)."""
     w = np.zeros(WORK)
@@ -106,7 +106,7 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
         _scatter(blocks.nodes, b, w, gradient)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(fastmath=FAST, error_model="numpy")
 def _change_lanes(w: Floats, over: float) -> None:
     for lane in range(LANES):
         moved, base, s = _strains_in(w, lane), _strains_in(w, lane, RESULT), AT_STATE + lane
@@ -114,7 +114,7 @@ def _change_lanes(w: Floats, over: float) -> None:
         w[s + 16] = quadratic_change(w, CONSTANTS + lane, moved, base)
 
 
-@numba.njit(cache=True)
+@njit()
 def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
     """Return E(q) - E(base) [J] of the cells that the rank owns, by how the nodes moved: it keeps its digits."""
     moved, w, change = q - base, np.zeros(WORK), 0.0

@@ -6,9 +6,8 @@ slopes and the four modes of lattice.cell_moments.
 
 from typing import TypeAlias
 
-import numba
-
 from msmpetsc.backend.arrays import Floats
+from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.springs import Four, Vector
 
 LANES = 8
@@ -20,13 +19,13 @@ Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, 
 Strains: TypeAlias = tuple[Seven, Seven, Seven]  # of x, y and z
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def form_of(c: Floats, k: int) -> Six:
     """Return the first six constants of a cell, which mean slopes depend on."""
     return c[k], c[k + 8], c[k + 16], c[k + 24], c[k + 32], c[k + 40]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def strain(u: Eight, form: Six) -> Seven:
     """Return 4 h times a component's mean slope, and its modes, by the corners' values, x fastest."""
     a, b, c, d, e, f, g, h = u
@@ -45,7 +44,7 @@ def strain(u: Eight, form: Six) -> Seven:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def corner_strain(a: int, form: Six) -> Seven:
     """Return 4 h times the mean slopes, and the modes, of what is 1 at corner a and 0 at the others."""
     x, y, z = 2.0 * (a & 1) - 1.0, 1.0 * (a & 2) - 1.0, 0.5 * (a & 4) - 1.0
@@ -61,7 +60,7 @@ def corner_strain(a: int, form: Six) -> Seven:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def modes_forces(c: Floats, k: int, e: Seven) -> Four:
     """Return the slopes of the modes' energy by the modes of a strain."""
     xy, xz, yz, of_yz, of_xz, of_xy = c[k + 48], c[k + 56], c[k + 64], c[k + 72], c[k + 80], c[k + 88]
@@ -73,7 +72,7 @@ def modes_forces(c: Floats, k: int, e: Seven) -> Four:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def write_forces(store: Floats, at: int, c: Floats, k: int, slopes: Nine, e: Strains) -> None:
     """Write a cell's forces on its corners into 24 numbers: ``slopes`` by 4 h times the mean slopes, and the modes'."""
     _write_component(store, at, c, k, (slopes[0], slopes[1], slopes[2]), e[0])
@@ -81,7 +80,7 @@ def write_forces(store: Floats, at: int, c: Floats, k: int, slopes: Nine, e: Str
     _write_component(store, at + 16, c, k, (slopes[6], slopes[7], slopes[8]), e[2])
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _write_component(w: Floats, at: int, c: Floats, k: int, slopes: Vector, e: Seven) -> None:
     p, q, r = slopes
     m, n, o, v = modes_forces(c, k, e)

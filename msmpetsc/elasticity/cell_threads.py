@@ -6,11 +6,10 @@ What a kernel writes at corner a of a cell has the place (block, a, component, l
 
 from collections.abc import Callable
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
-from msmpetsc.backend.kernel import kernel
+from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
@@ -26,19 +25,19 @@ from msmpetsc.elasticity.neo_hookean import (
 from msmpetsc.elasticity.springs import Way
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def constants_at(cells: CellRows, i: int) -> int:
     """Return where the constants of cell i begin."""
     return int(cells.which[i // LANES]) * ROWS * LANES + i % LANES
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def state_at(i: int) -> int:
     """Return where what a Hessian keeps of cell i begins."""
     return (i // LANES) * STATE * LANES + i % LANES
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def strains_at(q: Positions, cells: CellRows, i: int) -> Strains:
     """Return the strains of cell i."""
     c, form = cells.nodes[i], form_of(cells.constants, constants_at(cells, i))
@@ -49,7 +48,7 @@ def strains_at(q: Positions, cells: CellRows, i: int) -> Strains:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def gradient_at(q: Positions, cells: CellRows, i: int) -> Nine:
     """Return F of cell i."""
     return gradient_of(strains_at(q, cells, i), 1.0 / cells.h4)

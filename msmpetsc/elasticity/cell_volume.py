@@ -14,11 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, on_host, to_host
-from msmpetsc.backend.kernel import kernel
+from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_blocks import add_corners
 from msmpetsc.elasticity.cell_strain import Six, strain
 from msmpetsc.elasticity.springs import Product, Vector, Way, add_block, between, dot, rows_of
@@ -62,12 +61,12 @@ class ResistanceAt(NamedTuple):
     projected: bool = True
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@numba.njit(cache=True)
+@njit()
 def edges(q: Positions, cell: Indices, frame: int) -> Frame:
     """Return the edges [m] from a corner of a cell to the far ends of its three edges."""
     corner = cell[FRAMES[frame, 0]]
@@ -78,19 +77,19 @@ def edges(q: Positions, cell: Indices, frame: int) -> Frame:
     )
 
 
-@numba.njit(cache=True)
+@njit()
 def cofactors(e: Frame) -> Frame:
     """Return the slopes of the volume of three edges [m^2], one for each edge."""
     return _cross(e[1], e[2]), _cross(e[2], e[0]), _cross(e[0], e[1])
 
 
-@numba.njit(cache=True)
+@njit()
 def _volume(a: Vector, b: Vector, c: Vector) -> float:
     """Return a . (b x c)."""
     return dot(a, _cross(b, c))
 
 
-@numba.njit(cache=True)
+@njit()
 def corner_change(e: Frame, before: Frame, d: Frame, resistance: float, least: float) -> float:
     """Return the energy of a corner of the edges e less that of its edges ``before``, which changed by d [J].
 
@@ -108,14 +107,14 @@ def corner_change(e: Frame, before: Frame, d: Frame, resistance: float, least: f
     return -resistance * larger / least * (lack**2 + lack * lack_before + lack_before**2)
 
 
-@numba.njit(cache=True)
+@njit()
 def corner_slope(e: Frame, n: Frame, resistance: float, least: float) -> float:
     """Return d energy / d volume of a corner with the edges e and cofactors n [N/m^2]: not positive."""
     lack = max(1.0 - dot(e[0], n[0]) / least, 0.0)
     return -3.0 * resistance * lack * lack / least
 
 
-@numba.njit(cache=True)
+@njit()
 def corner_product(e: Frame, n: Frame, w: Frame, resistance: float, least: float, projected: bool) -> Frame:
     """Return the product of a corner's Hessian with changes w of its edges, one vector for each edge [N].
 
@@ -132,7 +131,7 @@ def corner_product(e: Frame, n: Frame, w: Frame, resistance: float, least: float
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _turned(change: float, n: Vector, slope: float, a: Vector, b: Vector) -> Vector:
     """Return change n + slope (a + b)."""
     return (
@@ -142,7 +141,7 @@ def _turned(change: float, n: Vector, slope: float, a: Vector, b: Vector) -> Vec
     )
 
 
-@numba.njit(cache=True)
+@njit()
 def least_volume(q: Positions, c: Indices) -> float:
     """Return the least of the eight corner volumes of a cell [m^3]; each edge is read once."""
     x0, x1, x2, x3 = between(q, c[0], c[1]), between(q, c[3], c[2]), between(q, c[4], c[5]), between(q, c[7], c[6])
@@ -179,7 +178,7 @@ def least_volumes(q: Positions, cells: Indices) -> Floats:
     return least
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
     corners = q[c[0], k], q[c[1], k], q[c[3], k], q[c[2], k], q[c[4], k], q[c[5], k], q[c[7], k], q[c[6], k]
     x, y, z, _, _, _, _ = strain(corners, form)
@@ -202,7 +201,7 @@ def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -
     return volumes / (4.0 * cell_size) ** 3
 
 
-@numba.njit(cache=True)
+@njit()
 def _add_corner(rows: Rows, at: Indices, frame: int, factor: float, vectors: Frame) -> None:
     """Three vectors to the far ends of a corner's edges, and what balances them to the corner."""
     for role in range(4):
@@ -212,14 +211,14 @@ def _add_corner(rows: Rows, at: Indices, frame: int, factor: float, vectors: Fra
         row[2] += factor * vector[2]
 
 
-@numba.njit(cache=True)
+@njit()
 def corner_curvature(e: Frame, n: Vector, resistance: float, least: float) -> float:
     """Return d^2 energy / d volume^2 of a corner with the edges e, n the first of its cofactors
     [N/m^5]: not negative, and 0 where it does not resist."""
     return 6.0 * resistance * max(1.0 - dot(e[0], n) / least, 0.0) / least**2
 
 
-@numba.njit(cache=True)
+@njit()
 def vector_of(role: int, vectors: Frame) -> Vector:
     """Return, of three vectors at the far ends of a corner's edges, that of a role; the corner's balances them."""
     a, b, c = vectors

@@ -23,9 +23,8 @@ A Hessian keeps F, V U' and V U'' of each cell; V stands in a cell's constants.
 
 import math
 
-import numba
-
 from msmpetsc.backend.arrays import Floats
+from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.cell_strain import Nine, Seven, Strains, modes_forces
 from msmpetsc.elasticity.springs import Vector
 
@@ -36,7 +35,7 @@ TURNS = 30  # iterations towards a cell's rotation
 TURNED = 1e-12  # how little the last one changes of it
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def cofactors(f: Nine) -> Nine:
     """Return cof F by rows."""
     return (
@@ -52,19 +51,19 @@ def cofactors(f: Nine) -> Nine:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def determinant(f: Nine, n: Nine) -> float:
     """Return det F by its first row and that of its cofactors n."""
     return f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _inner(a: Nine, b: Nine) -> float:
     rows = a[0] * b[0] + a[1] * b[1] + a[2] * b[2], a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
     return rows[0] + rows[1] + (a[6] * b[6] + a[7] * b[7] + a[8] * b[8])
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _change_of_cofactors(f: Nine, g: Nine) -> Nine:
     """Return F x G: by how much cof F changes along G."""
     return (
@@ -80,7 +79,7 @@ def _change_of_cofactors(f: Nine, g: Nine) -> Nine:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _slopes(j: float, mu: float, lame: float) -> tuple[float, float]:
     """Return U' and U'' at J = j."""
     above = max(j, ONSET)
@@ -88,7 +87,7 @@ def _slopes(j: float, mu: float, lame: float) -> tuple[float, float]:
     return lame * (above - 1.0) - mu / above + curvature * (j - above), curvature
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def volume_energy(j: float, mu: float, lame: float) -> float:
     """Return U at J = j."""
     above = max(j, ONSET)
@@ -96,7 +95,7 @@ def volume_energy(j: float, mu: float, lame: float) -> float:
     return 0.5 * lame * (above - 1.0) ** 2 - mu * math.log(above) + below * (slope + 0.5 * curvature * below)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def volume_change(j: float, before: float, change: float, mu: float, lame: float) -> float:
     """Return U(j) - U(before), which keeps the digits of change = j - before."""
     if j >= ONSET and before >= ONSET:
@@ -107,7 +106,7 @@ def volume_change(j: float, before: float, change: float, mu: float, lame: float
     return volume_energy(j, mu, lame) - volume_energy(before, mu, lame)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _borne(f: Nine, j: float, slope: float, least: float) -> float:
     """Return by what |U'| is multiplied in what it may take from mu; J above ``least`` counts as convex.
 
@@ -121,12 +120,12 @@ def _borne(f: Nine, j: float, slope: float, least: float) -> float:
     return largest if slope < 0.0 and j >= least else NORM * norm
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _times(a: float, x: Nine) -> Nine:
     return a * x[0], a * x[1], a * x[2], a * x[3], a * x[4], a * x[5], a * x[6], a * x[7], a * x[8]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _plus(x: Nine, a: float, y: Nine) -> Nine:
     """Return x + a y."""
     return (
@@ -136,27 +135,27 @@ def _plus(x: Nine, a: float, y: Nine) -> Nine:
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _slope_of(e: Strains) -> Nine:
     """Return 4 h times the mean slope by rows."""
     a, b, c = e
     return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def gradient_of(e: Strains, over: float) -> Nine:
     """Return F by the strains of positions; ``over`` is 1 / (4 h)."""
     return _times(over, _slope_of(e))
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def kept_gradient(state: Floats, s: int) -> Nine:
     """Return F as a Hessian keeps it."""
     rows = state[s], state[s + 8], state[s + 16], state[s + 24], state[s + 32], state[s + 40]
     return rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], state[s + 48], state[s + 56], state[s + 64]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def pull(e: Strains, m: float, lame: float, h4: float) -> Nine:
     """Return grad E by 4 h times the mean slope."""
     g, over = _slope_of(e), 1.0 / h4
@@ -165,7 +164,7 @@ def pull(e: Strains, m: float, lame: float, h4: float) -> Nine:
     return _plus(_times(m, g), over * _slopes(j, m, lame)[0], n)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def turned_pull(e: Strains, m: float, state: Floats, s: int) -> Nine:
     """Return the Hessian's product with the strains of a displacement, as ``pull`` does the gradient."""
     f, g = kept_gradient(state, s), _slope_of(e)
@@ -174,7 +173,7 @@ def turned_pull(e: Strains, m: float, state: Floats, s: int) -> Nine:
     return _plus(_plus(_times(m, g), along, n), state[s + 72], _change_of_cofactors(f, g))
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def quadratic(w: Floats, k: int, a: Strains, b: Strains) -> float:
     """Return the inner product of two strains in the form that mu has: mean slopes and modes, times m."""
     total: float = w[k + 104] * _inner(_slope_of(a), _slope_of(b))
@@ -184,13 +183,13 @@ def quadratic(w: Floats, k: int, a: Strains, b: Strains) -> float:
     return total
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def quadratic_change(w: Floats, k: int, moved: Strains, base: Strains) -> float:
     """Return by how much half of ``quadratic`` changes as strains go from ``base`` by ``moved``."""
     return quadratic(w, k, moved, base) + 0.5 * quadratic(w, k, moved, moved)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def write_state(store: Floats, s: int, f: Nine, slope: float, curvature: float) -> None:
     """Write what a Hessian keeps of a cell: F, V U' and V U''."""
     store[s], store[s + 8], store[s + 16], store[s + 24], store[s + 32] = f[0], f[1], f[2], f[3], f[4]
@@ -198,7 +197,7 @@ def write_state(store: Floats, s: int, f: Nine, slope: float, curvature: float) 
     store[s + 72], store[s + 80] = slope, curvature
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def slopes_at(f: Nine, mu: float, lame: float, projected: bool) -> tuple[float, float]:
     """Return U' and U'' at F, U' ``projected`` to what mu bears."""
     n = cofactors(f)
@@ -210,7 +209,7 @@ def slopes_at(f: Nine, mu: float, lame: float, projected: bool) -> tuple[float, 
     return slope, curvature
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def lost(f: Nine, mu: float, lame: float) -> float:
     """Return what the Hessian takes from mu |G|^2 at the most, beyond mu itself."""
     n = cofactors(f)
@@ -219,7 +218,7 @@ def lost(f: Nine, mu: float, lame: float) -> float:
     return max(abs(slope) * _borne(f, j, slope, CONVEX) - mu, 0.0)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def rotation_of(f: Nine) -> tuple[Nine, bool]:
     """Return the rotation of F, by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986), and whether it has one.
 
@@ -236,20 +235,20 @@ def rotation_of(f: Nine) -> tuple[Nine, bool]:
     return f, True
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def changes(d: Nine, f: Nine) -> tuple[float, float]:
     """Return J at F, and by how much D changes it: cof F : D + F : cof D + det D, which keeps its digits."""
     n, n_d = cofactors(f), cofactors(d)
     return determinant(f, n), _inner(n, d) + _inner(f, n_d) + determinant(d, n_d)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def kept_cofactors(state: Floats, s: int) -> Nine:
     """Return cof F of the F that a Hessian keeps."""
     return cofactors(kept_gradient(state, s))
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def along_cofactors(n: Nine, g: Seven) -> Vector:
     """Return cof F g of the mean slope g of a strain."""
     return (
@@ -259,7 +258,7 @@ def along_cofactors(n: Nine, g: Seven) -> Vector:
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def corner_stiffness(g: Seven, c: Floats, k: int) -> float:
     """Return what a Hessian has of mu on the diagonal at the corner whose strain ``corner_strain`` gives."""
     x, y, z, v = modes_forces(c, k, g)

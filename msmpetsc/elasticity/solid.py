@@ -6,11 +6,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, greatest, on_host, to_host
-from msmpetsc.backend.kernel import kernel
+from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity import cell_lanes, cell_threads
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, add_corners, blocks_of, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
@@ -20,13 +19,13 @@ from msmpetsc.elasticity.springs import add_block
 from msmpetsc.lattice.lattice import Lattice
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _row_of(cells: CellRows, i: int, a: int) -> int:
     """Return what corner a of cell i adds to."""
     return int(cells.nodes[i, a]) if cells.by_node else (i // LANES * 8 + a) * LANES + i % LANES
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _size(a: int, constants: Floats, k: int) -> float:
     g = corner_strain(a, form_of(constants, k))
     return math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])

@@ -19,11 +19,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
-from msmpetsc.backend.kernel import kernel
+from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.lattice.lattice import Lattice
 
 Product = Callable[[Array, Array], None]  # adds (a Hessian) v [N] to the second argument
@@ -36,13 +35,13 @@ SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a sy
 TINY = 1e-300
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def dot(a: Vector, b: Vector) -> float:
     """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(cache=True)
+@njit()
 def spring_change(before: Vector, d: Vector, r: float, k: float, b: float) -> float:
     """Return the energy of a spring that changed by d less what it was ``before`` [J].
 
@@ -59,7 +58,7 @@ def spring_change(before: Vector, d: Vector, r: float, k: float, b: float) -> fl
     return change
 
 
-@numba.njit(cache=True)
+@njit()
 def spring_pull(e: Vector, r: float, k: float, b: float) -> float:
     """Return f [N/m]: the gradient at the end that a spring e points to is f e."""
     length = math.sqrt(dot(e, e))
@@ -70,7 +69,7 @@ def spring_pull(e: Vector, r: float, k: float, b: float) -> float:
     return f
 
 
-@numba.njit(cache=True)
+@njit()
 def spring_block(spring: Vector, r: float, k: float, b: float, projected: bool) -> Four:
     """Return c, e of a spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
 
@@ -89,7 +88,7 @@ def spring_block(spring: Vector, r: float, k: float, b: float, projected: bool) 
     return k * across, along * spring[0], along * spring[1], along * spring[2]
 
 
-@numba.njit(cache=True)
+@njit()
 def block_product(c: float, e: Vector, d: Vector) -> Vector:
     """Return (c I + e e^T) d."""
     along = dot(e, d)
@@ -125,7 +124,7 @@ class Way(NamedTuple):
         return cls(base, end, end - base)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def between(q: Positions, a: int, b: int) -> Vector:
     """Return the way from node a to node b."""
     return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
@@ -190,7 +189,7 @@ class SpringScatter(OwnedSprings):
         add_elastic_diagonal(q, self.springs, blocks)
 
 
-@numba.njit(cache=True)
+@njit()
 def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None:
     """Add grad E [N] to ``gradient`` (l, 3); without stiffening it is L x - J d(x) (Eq. 14-15)."""
     ends, rest_length, stiffness, stiffening = springs
@@ -207,7 +206,7 @@ def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None
         gradient[b, 2] -= f * e[2]
 
 
-@numba.njit(cache=True)
+@njit()
 def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> None:
     """Add to ``concavity`` (l,) [N/m], at both ends of each compressed spring, twice what it pushes across itself.
 
@@ -222,7 +221,7 @@ def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> N
         concavity[ends[s, 1]] += push
 
 
-@numba.njit(cache=True)
+@njit()
 def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Rows) -> None:
     """Write the Hessian of E at q as the c and e of ``spring_block`` into ``blocks`` (s, 4).
 
@@ -236,7 +235,7 @@ def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Row
             blocks[s, i] = block[i]
 
 
-@numba.njit(cache=True)
+@njit()
 def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
     ends, rest_length, stiffness, stiffening = springs
@@ -247,7 +246,7 @@ def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
             add_block(blocks[ends[s, end]], c, 1.0, (ex, ey, ez))
 
 
-@numba.njit(cache=True)
+@njit()
 def add_elastic_product(ends: Indices, blocks: Rows, v: Rows, product: Rows) -> None:
     """Add (Hessian of E) v [N] to ``product`` (l, 3), its ``blocks`` those of elastic_hessian.
 
@@ -278,7 +277,7 @@ def add_elastic_product(ends: Indices, blocks: Rows, v: Rows, product: Rows) -> 
         product[first, 2] += sz
 
 
-@numba.njit(cache=True)
+@njit()
 def add_block(block: Floats, c: float, factor: float, g: Vector) -> None:
     """Add c I + factor g g^T to a block (9,)."""
     for row in range(3):

@@ -8,10 +8,10 @@ A square is (axis, plane, j, k): normal to its axis, at node `plane` 0..3 along 
 axes in cyclic order. An edge is (axis, i, j, k): cell i along its axis, nodes j, k along the next two.
 """
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask
+from msmpetsc.backend.kernel import njit
 
 ITSELF = 13  # entry of the cell among its 27
 CELL_STRIDE = np.array([9, 3, 1])
@@ -58,19 +58,19 @@ for _dx, _dy, _dz in np.ndindex(2, 2, 2):
 OF_CORNER = np.nonzero(AROUND[:, CELLS].any(2))[1].reshape(8, 36).copy()  # the squares of those cells
 
 
-@numba.njit(cache=True)
+@njit()
 def corner_bit(v: int, axis: int) -> int:
     """Return the coordinate, 0 or 1, of corner v along an axis."""
     return (v >> (2 - axis)) & 1
 
 
-@numba.njit(cache=True)
+@njit()
 def corner_node(v: int) -> int:
     """Return the entry of corner v among the 64 nodes."""
     return 16 * (1 + corner_bit(v, 0)) + 4 * (1 + corner_bit(v, 1)) + 1 + corner_bit(v, 2)
 
 
-@numba.njit(cache=True)
+@njit()
 def cells_around(v: int, valid: Mask) -> int:
     """Return a bit mask of the valid cells around corner v: bit 4i + 2j + k of the cell (i,j,k)."""
     first = 9 * corner_bit(v, 0) + 3 * corner_bit(v, 1) + corner_bit(v, 2)
@@ -81,14 +81,14 @@ def cells_around(v: int, valid: Mask) -> int:
     return mask
 
 
-@numba.njit(cache=True)
+@njit()
 def smoothstep(z: float) -> float:
     """Return z^2 (3 - 2z) on [0,1], constant beyond: its slope is 0 at both ends."""
     z = min(max(z, 0.0), 1.0)
     return z * z * (3.0 - 2.0 * z)
 
 
-@numba.njit(cache=True)
+@njit()
 def corner_blend(v: int, u: Floats) -> float:
     """Return W(v, p) of Eq. 8: the product over the axes of smoothstep(1 - distance to v).
 

@@ -41,11 +41,11 @@ from functools import cache
 from math import atan2, sqrt
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import Route, SortedKeys
 from msmpetsc.geometry.block import (
     AROUND,
@@ -157,7 +157,7 @@ class PointView(NamedTuple):
     squares: Rows  # (108,4) weights of the grid squares; NaN = not yet
 
 
-@numba.njit(cache=True)
+@njit()
 def set_view(u: Floats, view: PointView) -> None:
     """Set the view to that of the point u (3,)."""
     for axis in range(3):
@@ -167,7 +167,7 @@ def set_view(u: Floats, view: PointView) -> None:
     view.squares[:, 0] = np.nan
 
 
-@numba.njit(cache=True)
+@njit()
 def edge_angle(edge: int, view: PointView) -> float:
     """Return g_jk of a grid edge: the angle that it subtends from p over |e_j x e_k|."""
     if view.angles[edge] == 0.0:
@@ -178,7 +178,7 @@ def edge_angle(edge: int, view: PointView) -> float:
     return float(view.angles[edge])
 
 
-@numba.njit(cache=True)
+@njit()
 def turn_from_plane(c: float, length2: float, dot: float, d2: float) -> float:
     """Return sign(c) (beta |c| / |e_j x e_k| - the edge's angle from p's foot in the plane).
 
@@ -193,7 +193,7 @@ def turn_from_plane(c: float, length2: float, dot: float, d2: float) -> float:
     return turn if c >= 0.0 else -turn
 
 
-@numba.njit(cache=True)
+@njit()
 def triangle_sums(frame: Frame, g: Angles) -> tuple[float, float]:
     """Return m_n / d of the two triangles (00,10,11) and (00,11,01) of a square; g: see square_weights."""
     a0, a1, b0, b1, d = frame
@@ -213,7 +213,7 @@ def triangle_sums(frame: Frame, g: Angles) -> tuple[float, float]:
     return half * first, half * second
 
 
-@numba.njit(cache=True)
+@njit()
 def square_weights(frame: Frame, g: Angles) -> Weights:
     """Return the unnormalised weights (w00, w10, w11, w01) of a unit square whose normal is its plane's axis (Eq. 3-5).
 
@@ -229,7 +229,7 @@ def square_weights(frame: Frame, g: Angles) -> Weights:
     return first - first_a + second - second_b, first_a - first_b, first_b + second_a, second_b - second_a
 
 
-@numba.njit(cache=True)
+@njit()
 def square_frame(square: int, view: PointView) -> Frame:
     """Return (a0, a1, b0, b1, d) of a square in the block, as in square_weights."""
     axis, plane, j, k = SQUARE[square, 0], SQUARE[square, 1], SQUARE[square, 2], SQUARE[square, 3]
@@ -238,7 +238,7 @@ def square_frame(square: int, view: PointView) -> Frame:
     return planes[a, j], planes[a, j + 1], planes[b, k], planes[b, k + 1], planes[axis, plane]
 
 
-@numba.njit(cache=True)
+@njit()
 def set_square(square: int, view: PointView) -> None:
     """Put the weights of a square into the view; 0 where its plane holds p, which is not on it."""
     a0, a1, b0, b1, d = square_frame(square, view)
@@ -258,7 +258,7 @@ def set_square(square: int, view: PointView) -> None:
         view.squares[square, i] = w[i]
 
 
-@numba.njit(cache=True)
+@njit()
 def set_limit(square: int, view: PointView, weights: Floats) -> bool:
     """Set the weights of p on the cage's surface if it lies on this closed square; return whether it does.
 
@@ -274,7 +274,7 @@ def set_limit(square: int, view: PointView, weights: Floats) -> bool:
     return True
 
 
-@numba.njit(cache=True)
+@njit()
 def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> None:
     """Set the mean value coordinates of p in the union of the valid cells around a corner (L_v of Eq. 8; Eq. 1-2).
 
@@ -298,7 +298,7 @@ def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> N
     weights /= weights.sum()
 
 
-@numba.njit(cache=True)
+@njit()
 def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
     """Return b(p) of Eq. 9, f_h = smoothstep(x / h): 0 on what valid neighbours share, else up to 1.
 
@@ -315,7 +315,7 @@ def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
     return smoothstep(product / smoothing)
 
 
-@numba.njit(cache=True)
+@njit()
 def boundary_blends(u: Floats, valid: Mask, blends: Floats) -> float:
     """Set W(v, p) of Eq. 8 in blends (8,), 0 at corners of no other valid cell; return their sum."""
     for v in range(8):
@@ -325,7 +325,7 @@ def boundary_blends(u: Floats, valid: Mask, blends: Floats) -> float:
     return float(blends.sum())
 
 
-@numba.njit(cache=True)
+@njit()
 def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) -> None:
     """Set s(p) of Eq. 7: u (p,3) in [0,1]; neighbours (p,27) bool; smoothing h in (0,1]; weights (p,64), result."""
     alone = np.zeros(27, np.bool_)
@@ -369,7 +369,7 @@ def gradient_table() -> Rows:
     return table
 
 
-@numba.njit(cache=True)
+@njit()
 def affine_weights(u: Rows, neighbours: Mask, table: Rows, weights: Rows) -> None:
     """Set J(p) of Eq. 8 with affine L_v by ``gradient_table``; arguments as of ``cages_weights``."""
     weights[:] = 0.0

@@ -19,10 +19,10 @@ the first has its columns whole.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Rows
+from msmpetsc.backend.kernel import njit
 from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
 from msmpetsc.geometry.surface import Surface, is_inside
 from msmpetsc.geometry.valid_cells import clip_between, extent, grown
@@ -105,7 +105,7 @@ def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
     return distinct, sums
 
 
-@numba.njit(cache=True)
+@njit()
 def _sums_above(column: Indices, values: Rows) -> Rows:
     """Return for each row the sum of the values (c, k) from it to the end of its column (c,)."""
     sums = values.copy()
@@ -115,7 +115,7 @@ def _sums_above(column: Indices, values: Rows) -> Rows:
     return sums
 
 
-@numba.njit(cache=True)
+@njit()
 def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows]:
     """Cut triangles into cells.
 
@@ -145,7 +145,7 @@ def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows
     return cells[:used], values[:used]
 
 
-@numba.njit(cache=True)
+@njit()
 def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tuple[int, int]:
     """Return the first cell index that a polygon reaches along an axis, and that after its last."""
     if n == 0:
@@ -154,7 +154,7 @@ def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tu
     return max(int(np.floor(smallest)), low[axis]), min(int(np.floor(largest)) + 1, high[axis])
 
 
-@numba.njit(cache=True)
+@njit()
 def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> None:
     """Add the integrals over a triangle of a cell, as seen along the last axis, to ``sums`` (SUMS,).
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
+from msmpetsc.backend.kernel import njit
 from msmpetsc.errors import InputError
 
 LIMIT = 1 << 21  # cells along an axis: three times 21 bits fill 63 of a key
@@ -117,7 +117,7 @@ class BodyGrids:
         return nodes
 
 
-@numba.njit(cache=True)
+@njit()
 def _spread(x: int) -> int:
     """Return the bits of x with two zeros between each two."""
     x &= 0x1FFFFF
@@ -128,7 +128,7 @@ def _spread(x: int) -> int:
     return (x | x << 2) & 0x1249249249249249
 
 
-@numba.njit(cache=True)
+@njit()
 def _gather(x: int) -> int:
     """Return the inverse of ``_spread``."""
     x &= 0x1249249249249249
@@ -139,7 +139,7 @@ def _gather(x: int) -> int:
     return (x | x >> 32) & 0x1FFFFF
 
 
-@numba.njit(cache=True)
+@njit()
 def _encode(ijk: Indices, keys: Indices) -> None:
     for n in range(len(ijk)):
         keys[n] = -1
@@ -147,7 +147,7 @@ def _encode(ijk: Indices, keys: Indices) -> None:
             keys[n] = _spread(ijk[n, 0]) | _spread(ijk[n, 1]) << 1 | _spread(ijk[n, 2]) << 2
 
 
-@numba.njit(cache=True)
+@njit()
 def _decode(keys: Indices, ijk: Indices) -> None:
     for n in range(len(keys)):
         ijk[n, 0], ijk[n, 1], ijk[n, 2] = _gather(keys[n]), _gather(keys[n] >> 1), _gather(keys[n] >> 2)

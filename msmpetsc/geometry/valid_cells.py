@@ -11,13 +11,13 @@ through one small graph of labels.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
+from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import Route
 from msmpetsc.geometry.grid import LIMIT, packed
 
@@ -25,7 +25,7 @@ SLACK = 1e-12  # of the largest coordinate: above the rounding of an interpolate
 EXTERIOR = 0
 
 
-@numba.njit(cache=True)
+@njit()
 def grown(rows: Array, used: int) -> Array:
     """Return an array with the ``used`` first of these rows (r, n) and room for one more."""
     if used < len(rows):
@@ -35,7 +35,7 @@ def grown(rows: Array, used: int) -> Array:
     return larger
 
 
-@numba.njit(cache=True)
+@njit()
 def _clip(polygon: Rows, n: int, axis: int, plane: float, side: float, out: Rows) -> int:
     """Clip a polygon to side * (x[axis] - plane) >= 0 (Sutherland-Hodgman); return its size."""
     m = 0
@@ -55,14 +55,14 @@ def _clip(polygon: Rows, n: int, axis: int, plane: float, side: float, out: Rows
     return m
 
 
-@numba.njit(cache=True)
+@njit()
 def clip_between(polygon: Rows, n: int, axis: int, planes: tuple[float, float], work: Rows, out: Rows) -> int:
     """Clip a polygon to the layer between two planes of an axis; return its size."""
     m = _clip(polygon, n, axis, planes[0], 1.0, work)
     return _clip(work, m, axis, planes[1], -1.0, out)
 
 
-@numba.njit(cache=True)
+@njit()
 def extent(polygon: Rows, n: int, axis: int) -> tuple[float, float]:
     """Return the smallest and largest coordinate along an axis."""
     smallest, largest = polygon[0, axis], polygon[0, axis]
@@ -72,14 +72,14 @@ def extent(polygon: Rows, n: int, axis: int) -> tuple[float, float]:
     return smallest, largest
 
 
-@numba.njit(cache=True)
+@njit()
 def _slack(triangle: Rows, axis: int) -> float:
     """Return more than the rounding of a coordinate interpolated between a triangle's corners."""
     smallest, largest = extent(triangle, 3, axis)
     return SLACK * (1.0 + max(abs(smallest), abs(largest)))
 
 
-@numba.njit(cache=True)
+@njit()
 def _index_range(
     triangle: Rows, part: Rows, n: int, axis: int, limits: tuple[int, int], slack: float
 ) -> tuple[int, int]:
@@ -94,7 +94,7 @@ def _index_range(
     return max(int(np.floor(smallest)), limits[0]), min(int(np.floor(largest)), limits[1] - 1)
 
 
-@numba.njit(cache=True)
+@njit()
 def touched_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
     """Return every cell that a triangle touches: exact up to rounding, and conservative within it.
 

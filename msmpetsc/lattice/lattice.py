@@ -7,11 +7,11 @@ end that it owns. Global node numbers follow Morton order, so they do not depend
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
@@ -295,7 +295,7 @@ def _sums_of_springs(net: Topology, values: Floats, share: Rows) -> Floats:
     return sums
 
 
-@numba.njit(cache=True)
+@njit()
 def _sums_by_direction(cells: Indices, values: Floats, share: Rows, owned: int) -> Rows:
     sums = np.zeros((owned, 27))
     for i in range(len(cells)):
@@ -306,7 +306,7 @@ def _sums_by_direction(cells: Indices, values: Floats, share: Rows, owned: int) 
     return sums
 
 
-@numba.njit(cache=True)
+@njit()
 def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int, Indices, Indices]:
     """Return the springs between the corners of cells, each once.
 

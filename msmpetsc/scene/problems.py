@@ -40,7 +40,34 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "rule": "{words}, got {got}",
     "one_of": "must give exactly one of {names}; has {given}",
 }
-EXAMPLES = {"gravity": "acceleration = [0, 0, -9.81]"}  # of tables that are taken for numbers
+EXAMPLES = {  # of tables, lists of tables and vectors that are taken for a number or a name
+    "mesh": '{ source = "body.ply" }',
+    "cages": "{ count = 3000 }",
+    "material": "{ young_modulus = 1e5, density = 1000 }",
+    "time": "{ step = 0.01, duration = 1.0 }",
+    "gravity": "{ acceleration = [0, 0, -9.81] }",
+    "acceleration": "[0, 0, -9.81]",
+    "start": "{ velocity = [0, 0, -1] }",
+    "velocity": "[0, 0, -1]",
+    "spin": "[0, 0, 1]",
+    "scale": "[1, 1, 1.2]",
+    "twist": "{ axis = [0, 0, 1], degrees = 90 }",
+    "self_contact": "{ friction = 0.3 }",
+    "solver": "{ error = 1e-3 }",
+    "safety": '{ on_failure = "substep" }',
+    "output": "{ every = 2 }",
+    "picture": "{ times = [0.1] }",
+    "body": '[{ mesh = { source = "body.ply" } }]',
+    "region": "{ box = [[0, 0, 0.9], [1, 1, 1]], relative = true }",
+    "pin": "[{ region = { box = [[0, 0, 0], [1, 1, 0.1]], relative = true } }]",
+    "part": "[{ region = { box = [[0, 0, 0], [1, 1, 0.1]], relative = true }, young_modulus = 1e6 }]",
+    "anchor": "[{ region = { box = [[0, 0, 0.9], [1, 1, 1]] }, path = [{ time = 1.0, by = [0, 0, 0.1] }] }]",
+    "path": "[{ time = 1.0, by = [0, 0, 0.1] }]",
+    "force": "[{ region = { box = [[0, 0, 0.9], [1, 1, 1]] }, total = [0, 0, -1] }]",
+    "total": "[0, 0, -1]",
+    "obstacle": '[{ shape = "plane", point = [0, 0, 0], normal = [0, 0, 1] }]',
+    "probe": '[{ name = "tip", point = [0, 0, 0.1] }]',
+}
 
 
 def rule(words: str, *others: str) -> PydanticCustomError:
@@ -130,8 +157,9 @@ def _got(value: Any) -> str:
 
 def _words(e: ErrorDetails) -> str:
     kind, context = e["type"], e.get("ctx", {})
-    if kind == "model_type" and e["loc"][-1:] and e["loc"][-1] in EXAMPLES:
-        return f"must be a table, {{ {EXAMPLES[e['loc'][-1]]} }}, got {_got(e['input'])}"
+    key = e["loc"][-1] if e["loc"] else ""
+    if kind in ("model_type", "tuple_type") and key in EXAMPLES:
+        return WORDS[kind].format(got=f"{_got(e['input'])}; for example {key} = {EXAMPLES[key]}")
     if kind == "extra_forbidden":
         return f"unknown key, {_suggestion(e['loc'][-1], context['valid'])}"
     if kind == "unknown_name":

@@ -1,5 +1,6 @@
 """Scene file (TOML) and what the command line changes in it -> a checked Scene."""
 
+import shlex
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
@@ -82,7 +83,8 @@ def load_scene(path: str | Path, changes: Changes = (), by_user: bool = True) ->
     """
     path = Path(path)
     if path.name.lower().endswith(MESHES) and path.is_file():
-        raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {path.with_suffix('.toml')} --mesh {path}")
+        scene, mesh = (shlex.quote(str(name)) for name in (path.with_suffix(".toml"), path))
+        raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {scene} --mesh {mesh}")
     return scene_of(path, _read(path, "scene"), changes, by_user)
 
 
@@ -93,7 +95,7 @@ def scene_of(path: Path, text: str, changes: Changes = (), by_user: bool = True,
     """
     data = _parse(path, text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
-        raise InputError(f"{path}: is a study, no scene: msmpetsc study {path}")
+        raise InputError(f"{path}: is a study, no scene: msmpetsc study {shlex.quote(str(path))}")
     keys = {_override(data, override): override for override in overrides_of(changes)}
     checked = _checked(path, data, text, keys)
     if to_read:

@@ -11,7 +11,7 @@ from threading import Lock
 
 import psutil
 
-from msmpetsc.app.ranks import environment, lines_said
+from msmpetsc.app.ranks import environment, last_error
 from msmpetsc.study.forkserver import COLD, Forked
 
 GRACE = 3.0  # [s] between the request to end and the end
@@ -98,13 +98,6 @@ class Processes:
 
 def too_long(timeout: float) -> str:
     return f"took longer than {timeout:g} s"
-
-
-def last_error(log: str) -> str:
-    """Return the last line of a log that is an error, or else the last line."""
-    lines = lines_said(log)
-    errors = [line for line in lines if "msmpetsc: error:" in line]
-    return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
 
 
 def end(process: subprocess.Popen[bytes] | Forked) -> None:

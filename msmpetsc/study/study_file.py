@@ -216,7 +216,7 @@ def load_study(path: Path) -> Study:
     """Read and check a study file. Raises InputError naming every problem, one a line."""
     text, data = read_toml(path, "study")
     if {"mesh", "body"} & data.keys() and OF_STUDIES.isdisjoint(data):
-        raise InputError(f"{path}: is a scene, no study: msmpetsc run {path}")
+        raise InputError(f"{path}: is a scene, no study: msmpetsc run {shlex.quote(str(path))}")
     try:
         return Study.model_validate(data, context={"presets": preset_names()})
     except ValidationError as error:

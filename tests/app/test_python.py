@@ -127,3 +127,10 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
     said = {"input": "it fails", "memory": "there is not enough memory (Unable"}[what]
     (line,) = errors(done.stderr)
     assert done.returncode == 2 and line.startswith(f"msmpetsc: error: {said}") and "Traceback" not in done.stderr
+
+
+def test_completion_offers_public_names_alone():
+    names = {name for name in dir(msmpetsc) if not name.startswith("__")}
+    public = {"Frame", "Result", "Scene", "Simulation", "frames", "open", "run"}
+    assert names == public | {"register_force", "register_obstacle", "register_preset"}
+    assert "__version__" in dir(msmpetsc)

@@ -168,9 +168,10 @@ def test_frames_are_those_of_every_third_step_and_the_last(tmp_path: Path):
 def test_scenes_and_frames_print_one_line(scene: Path):
     simulation = msm.Simulation(scene)
     last = list(simulation.frames(2))[-1]
-    for shown in (repr(simulation.scene), str(simulation.scene), repr(last)):
+    for shown in (repr(simulation), repr(simulation.scene), str(simulation.scene), repr(last)):
         assert "\n" not in shown and len(shown) < 200, shown
     assert "cells of 0.125 m of scene.ply, implicit-euler" in repr(simulation.scene)
+    assert repr(simulation) == f"Simulation({simulation.scene!r}, cpu, 1 rank)"
     assert repr(last).startswith("Frame(2: t = ") and str(last.position.shape) in repr(last)
 
 

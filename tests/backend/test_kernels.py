@@ -1,43 +1,157 @@
-"""Compiled kernels are kept for just the sources that they were compiled from."""
+"""Compiled kernels are found again by the same sources, wherever they can be kept, and never by changed ones."""
 
 import os
-import runpy
+import resource
 import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import python
+from conftest import ENVIRONMENT, python
 
 import msmpetsc
-from msmpetsc.backend.kernel import cache_is_empty
+from msmpetsc.backend import kernel_cache
 
 PACKAGE = Path(msmpetsc.__file__).parent
+FILES = resource.RLIMIT_FSIZE
+NOWHERE = "/dev/null/home"  # not even root can make this folder
+PLAIN = "from typing import NamedTuple\nFACTOR = 2.0\nclass Pair(NamedTuple):\n    first: float\n    second: float\n"
+CALLED = "from msmpetsc.backend.kernel import njit\n@njit()\ndef called(x):\n    return x + 1.0\n"
+CALLER = """
+from msmpetsc.backend.called import called
+from msmpetsc.backend.kernel import njit
+from msmpetsc.backend.plain import FACTOR, Pair
+@njit()
+def caller(pair):
+    return FACTOR * called(pair.first)
+print(caller(Pair(first=3.0, second=5.0)), sum(caller.stats.cache_hits.values()))
+"""
 
 
-def test_a_change_of_any_kernels_source_gives_another_folder(tmp_path: Path):
-    shutil.copytree(PACKAGE, tmp_path / "msmpetsc", ignore=shutil.ignore_patterns("__pycache__"))
-
-    def folder() -> Path:
-        return runpy.run_path(str(tmp_path / "msmpetsc" / "__init__.py"))["_kernel_folder"]()
-
-    first = folder()
-    assert first.parent == tmp_path / "msmpetsc" / "__pycache__" and folder() == first
-    (tmp_path / "msmpetsc" / "scene" / "schema.py").write_text("")  # no kernels in it
-    assert folder() == first
-    with open(tmp_path / "msmpetsc" / "contact" / "obstacles" / "solids.py", "a") as file:
-        file.write("# of another version\n")
-    assert folder() != first
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """A copy of the package with a kernel of its own, in which no kernel can be kept."""
+    package = tmp_path / "copy" / "msmpetsc"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__", "shipped"))
+    (package / "__pycache__").touch()
+    for name, text in (("plain", PLAIN), ("called", CALLED), ("caller", CALLER)):
+        (package / "backend" / f"{name}.py").write_text(text)
+    return package
 
 
-def test_the_users_own_folder_is_taken(tmp_path: Path):
-    for given, seen in (({"NUMBA_CACHE_DIR": str(tmp_path)}, str(tmp_path)), ({}, str(PACKAGE))):
-        environment = {name: x for name, x in os.environ.items() if name != "NUMBA_CACHE_DIR"} | given
-        code = "import msmpetsc, numba; print(numba.config.CACHE_DIR)"
-        assert python("-c", code, env=environment).stdout.startswith(seen)
-
-
-def test_an_empty_cache_is_told_from_a_filled_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder that kernels are kept in, within the one that the user has chosen."""
+    monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert cache_is_empty()
-    (tmp_path / "kernel.nbi").touch()
-    assert not cache_is_empty()
+    kernel_cache.folders.cache_clear()
+    folder = kernel_cache.writable()
+    assert folder is not None and folder.parent == tmp_path
+    yield folder
+    kernel_cache.folders.cache_clear()
+
+
+def environment(package: Path, **variables: object) -> dict[str, str]:
+    """Variables with which kernels of this package can be kept in those folders alone that are named here, or /tmp."""
+    given = {"HOME": NOWHERE, "PYTHONPATH": str(package.parent), **variables}
+    others = {name: x for name, x in ENVIRONMENT.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    return others | {name: str(x) for name, x in given.items()}
+
+
+def called(package: Path, **variables: object) -> tuple[float, int]:
+    """What the kernel returns in a process of its own, and whether it was found compiled."""
+    done = python(package / "backend" / "caller.py", env=environment(package, **variables))
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    value, found = done.stdout.split()
+    return float(value), int(found)
+
+
+@pytest.mark.parametrize("name", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME", "TMPDIR"])
+def test_kernels_are_found_again_wherever_they_can_be_kept(copied: Path, tmp_path: Path, name: str):
+    (tmp_path / "here").mkdir()
+    assert [called(copied, **{name: tmp_path / "here"}) for _ in range(2)] == [(8.0, 0), (8.0, 1)]
+
+
+def test_kernels_work_where_nothing_can_be_written(copied: Path):
+    command = [copied / "backend" / "caller.py"]
+    for _ in range(2):
+        done = python(*command, env=environment(copied), preexec_fn=lambda: resource.setrlimit(FILES, (0, 0)))
+        assert (done.stdout, done.stderr) == ("8.0 0\n", "")
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "value"),
+    [
+        ("called", "x + 1.0", "x + 2.0", 10.0),
+        ("plain", "FACTOR = 2.0", "FACTOR = 20.0", 80.0),
+        ("plain", "    first: float\n    second: float\n", "    second: float\n    first: float\n", 8.0),
+    ],
+)
+def test_changed_sources_never_find_old_kernels(copied: Path, tmp_path: Path, name, old, new, value):
+    """Neither a kernel that is called, nor a constant or a named tuple of a file without kernels."""
+    assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (8.0, 0)
+    path = copied / "backend" / f"{name}.py"
+    path.write_text(path.read_text().replace(old, new))
+    assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (value, 0)
+
+
+def test_processes_that_keep_the_same_kernel_at_once(copied: Path, tmp_path: Path):
+    command, variables = [sys.executable, copied / "backend" / "caller.py"], environment(copied, HOME=tmp_path)
+    ranks = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables) for _ in range(4)]
+    assert {rank.communicate()[0].split()[0] for rank in ranks} == {"8.0"}
+    assert called(copied, HOME=tmp_path) == (8.0, 1)
+
+
+def test_a_kernel_that_is_damaged_on_the_disk_is_compiled_anew(copied: Path, tmp_path: Path):
+    assert called(copied, HOME=tmp_path) == (8.0, 0)
+    for content in (b"", b"\0" * 1000):
+        for path in tmp_path.glob(".cache/*/*"):
+            path.write_bytes(content)
+        assert called(copied, HOME=tmp_path) == (8.0, 0)
+        assert called(copied, HOME=tmp_path) == (8.0, 1)
+
+
+def test_a_disk_that_is_full_keeps_nothing(chosen: Path):
+    _, most = resource.getrlimit(FILES)
+    try:
+        resource.setrlimit(FILES, (0, most))
+        kernel_cache.save("a", bytes(100))
+        kernel_cache.folders.cache_clear()
+        assert kernel_cache.writable() is None
+    finally:
+        resource.setrlimit(FILES, (most, most))
+    assert kernel_cache.load("a") is None and not any(chosen.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["writable by all", "writable by a group", "a link", "of another user"])
+def test_no_folder_is_read_that_somebody_else_may_write_to(chosen: Path, kind: str):
+    kernel_cache.save("a", b"code")
+    assert kernel_cache.load("a") == b"code" and not kernel_cache.is_empty()
+    if kind == "a link":
+        chosen.rename(chosen.parent / "other")
+        chosen.symlink_to("other")
+    elif kind == "of another user":
+        if os.getuid():
+            pytest.skip("only root can give a folder away")
+        os.chown(chosen, 12345, -1)
+    else:
+        chosen.chmod(0o777 if kind == "writable by all" else 0o775)
+    kernel_cache.folders.cache_clear()
+    assert chosen not in kernel_cache.folders()[0] and kernel_cache.load("a") is None
+
+
+def test_kernels_of_a_folder_that_cannot_be_written_are_found(copied: Path, tmp_path: Path):
+    """As in a container whose image has them: what lacks is kept elsewhere."""
+    if not os.getuid():
+        pytest.skip("root can write to any folder: scripts/bare tries it as a user")
+    assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (8.0, 0)
+    (folder,) = tmp_path.glob("msmpetsc-kernels-*")
+    folder.chmod(0o555)
+    assert called(copied, NUMBA_CACHE_DIR=tmp_path, HOME=tmp_path) == (8.0, 1)
+
+
+def test_every_kernel_is_kept_in_this_way():
+    for path in PACKAGE.rglob("*.py"):
+        assert path.name == "kernel.py" or "numba.njit" not in path.read_text(), path

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import tarfile
 import zipfile
@@ -55,6 +56,7 @@ def test_new_takes_z_for_upwards_or_what_is_said(suffix, words, up, tmp_path, mo
     with caplog.at_level("INFO", logger="msmpetsc"):
         assert main(["new", "my.toml", "--mesh", f"box.{suffix}", *words]) == 0
     assert f"{up} is taken for upwards" in caplog.text
+    assert "the file is taken to be in m, its longest side as 0.2 m" in caplog.text
     turns = [step for step in load_scene("my.toml").mesh.prepare if "rotate" in step]
     assert len(turns) == (up == "y")
     assert "upwards" in Path("my.toml").read_text()
@@ -74,9 +76,9 @@ def test_parts_are_measured_by_their_area_and_thickness_by_volume_and_area():
 
 
 BODIES = {
-    "ball": (trimesh.creation.icosphere(subdivisions=2, radius=0.1), ["obstacle"], "as in the file"),
-    "mm": (trimesh.creation.icosphere(subdivisions=2, radius=40), ["obstacle"], "the file has mm"),
-    "bar": (trimesh.creation.box([0.1, 0.5, 0.1]), ["pin"], "as in the file"),
+    "ball": (trimesh.creation.icosphere(subdivisions=2, radius=0.1), ["obstacle"], "to be in m"),
+    "mm": (trimesh.creation.icosphere(subdivisions=2, radius=40), ["obstacle"], "to be in mm"),
+    "bar": (trimesh.creation.box([0.1, 0.5, 0.1]), ["pin"], "to be in m"),
     "inwards": (trimesh.creation.box([0.1, 0.1, 0.1]), ["obstacle"], "wound inwards"),
 }
 
@@ -154,7 +156,7 @@ def test_a_shipped_scene_is_copied_as_it_is(tmp_path: Path, capsys):
 
 
 def packed(folder: Path, kind: str) -> set[str]:
-    """The files of a wheel or a source archive of this clone, built in a folder."""
+    """The files of a wheel, an editable one or a source archive of this clone, built in a folder."""
     tree = folder / "tree"
     shutil.copytree(ROOT, tree, symlinks=True, ignore=lambda folder, names: [
         name for name in names if name.startswith(".") or name in ("out", "tests", "build", "__pycache__")
@@ -163,7 +165,7 @@ def packed(folder: Path, kind: str) -> set[str]:
     build = f"from setuptools import build_meta; build_meta.build_{kind}('..')"
     done = python("-c", build, cwd=tree)
     assert done.returncode == 0, done.stderr
-    if kind == "wheel":
+    if kind != "sdist":
         return set(zipfile.ZipFile(next(folder.glob("*.whl"))).namelist())
     return {name.partition("/")[2] for name in tarfile.open(next(folder.glob("*.tar.gz"))).getnames()}
 
@@ -176,3 +178,23 @@ def test_what_is_passed_on_holds_scenes_studies_changes_and_citation(kind: str, 
     assert {scenes / "bunny_fall.toml", scenes / "studies" / "hard" / "plate.obj"} < set(shipped)
     assert {f"msmpetsc/shipped/{path.relative_to(scenes)}" for path in shipped} <= names
     assert all(any(name.endswith(own) for name in names) for own in ("CHANGELOG.md", "CITATION.cff", "LICENSE"))
+
+
+def test_an_editable_installation_is_a_path_that_type_checkers_can_follow(tmp_path: Path):
+    names = packed(tmp_path, "editable")
+    assert [name for name in names if "/" not in name] == [f"__editable__.msmpetsc-{msmpetsc.__version__}.pth"]
+
+
+def test_commands_that_are_shown_can_be_pasted(tmp_path: Path, capsys):
+    """Names with blanks are quoted."""
+    scene, mesh = tmp_path / "my scene.toml", tmp_path / "my box.ply"
+    trimesh.creation.box([0.1, 0.2, 0.1]).export(mesh)
+    assert main(["new", str(scene), "--mesh", str(mesh)]) == 0
+    command = capsys.readouterr().out.splitlines()[-1].removeprefix("to run it: ")
+    assert shlex.split(command) == ["msmpetsc", "run", str(scene), "--picture"]
+    told = command_error("run", mesh, "-o", tmp_path / "x.h5").partition("no scene: ")[2]
+    assert shlex.split(told) == ["msmpetsc", "new", str(mesh.with_suffix(".toml")), "--mesh", str(mesh)]
+    told = command_error("study", scene).partition("no study: ")[2]
+    assert shlex.split(told) == ["msmpetsc", "run", str(scene)]
+    told = command_error("check", scene).partition("of ")[2].partition(": ")[2].partition(" stores")[0]
+    assert shlex.split(told) == ["msmpetsc", "check", "--update", str(scene)]

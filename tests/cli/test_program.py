@@ -13,6 +13,7 @@ from block_scene import block_scene
 from conftest import ENVIRONMENT, python
 from one_process import command_error
 
+from msmpetsc.backend import kernel_cache
 from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.commands import doctor
 from msmpetsc.cli.main import main, parsed
@@ -94,8 +95,14 @@ def test_doctor_finds_a_sound_installation_sound():
     done = python("-m", "msmpetsc", "doctor")
     states = {line[9:26].strip(): line[:8].strip() for line in done.stdout.splitlines()}
     assert done.returncode == 0, done.stdout + done.stderr
-    assert {"PETSc", "MPI", "GPU", "HDF5"} <= set(states)
-    assert all(states[name] == "ok" for name in ("PETSc", "MPI", "HDF5", "extra run")) and "BROKEN" not in done.stdout
+    assert {"PETSc", "MPI", "GPU", "HDF5"} <= set(states) and f"kept in {kernel_cache.writable()}" in done.stdout
+    needed = ("PETSc", "MPI", "HDF5", "kernels", "extra run")
+    assert all(states[name] == "ok" for name in needed) and "BROKEN" not in done.stdout
+
+
+def test_doctor_tells_of_kernels_that_cannot_be_kept():
+    code = doctor.PROBES["kernels"].replace("writable()", "None")
+    assert doctor.probed(code) == (doctor.OK, "") and "NUMBA_CACHE_DIR" in doctor.NOTHING["kernels"][1]
 
 
 def test_doctor_tells_what_is_missing_from_what_is_broken(tmp_path: Path):

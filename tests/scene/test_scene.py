@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
+from msmpetsc.scene.problems import EXAMPLES
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import SceneFile
 
@@ -262,7 +263,7 @@ def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):
     ("override", "expected"),
     [
         ("cages.count=-3", "scene.toml: cages.count: must be > 0, got -3 (--set cages.count=-3)"),
-        ("gravity=-9.81", "{ acceleration = [0, 0, -9.81] }, got -9.81 (--set gravity=-9.81)"),
+        ("gravity=-9.81", "got -9.81; for example gravity = { acceleration = [0, 0, -9.81] } (--set gravity=-9.81)"),
         ("cages.cout=3", "scene.toml: cages.cout: unknown key, did you mean 'count'?"),
         ("cages.cell_size=1", "in place of all keys there: --set 'cages={cell_size=1}')"),
         ("time.step=5", "scene.toml: time.duration: must hold at least one step of 5 s"),
@@ -320,3 +321,22 @@ def test_what_changes_in_time_wants_both(tmp_path, change):
     assert problems(tmp_path, STATE, change) == [
         f"scene.toml: time.{key}: required, but missing (line 6)" for key in ("step", "duration")
     ]
+
+
+TABLES = [name for name, field in SceneFile.model_fields.items() if field.annotation is not str]
+PLACES = [  # of tables and vectors within tables
+    "gravity.acceleration", "start.velocity", "start.spin", "start.scale", "start.twist", "pin.0.region",
+    "anchor.0.path", "force.0.total", "obstacle.0.path", "output.probe",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("place", [*TABLES, *PLACES])
+def test_a_table_given_as_a_number_has_a_remedy_that_holds(tmp_path: Path, place: str):
+    table, _, within = place.partition(".")
+    around = [f"{table}={EXAMPLES[table]}"] if within and table != "output" else []
+    text = STATE.replace('integrator = "static"', "step = 0.01, duration = 1.0")
+    (line,) = (line for line in problems(tmp_path, text, *around, f"{place}=-9.81") if f" {place}: " in line)
+    key, _, remedy = line.partition("for example ")[2].removesuffix(f" (--set {place}=-9.81)").partition(" = ")
+    assert "got -9.81" in line and key == place.rpartition(".")[2]
+    others = text if place != "body" else text.replace('mesh = { source = "bunny_scan" }', "")
+    load(tmp_path, others, *around, f"{place}={remedy}")

@@ -94,6 +94,13 @@ def test_pip_is_silent_and_not_asked_twice(clone: Path):
     assert set_up(clone).stdout == ""
 
 
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_setup_says_what_it_does_and_does_nothing(clone: Path, word: str):
+    done = set_up(clone, "test", word)
+    assert done.returncode == 0 and "scripts/setup [EXTRA...]" in done.stdout and done.stderr == ""
+    assert "set " not in done.stdout and not (clone / ".venv").exists()
+
+
 def test_what_pip_says_is_shown_where_it_fails_and_the_next_start_tries_again(clone: Path):
     done = set_up(clone, PIP_STATUS="3")
     assert done.returncode == 1 and "Collecting packages\na warning\n" in done.stderr

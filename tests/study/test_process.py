@@ -10,9 +10,10 @@ import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene
-from conftest import ENVIRONMENT, run
+from conftest import AS_ROOT, ENVIRONMENT, run
 from study_files import alive
 
+from msmpetsc.cli.commands import doctor
 from msmpetsc.study import process
 from msmpetsc.study.forkserver import COLD
 from msmpetsc.study.process import Ended, Processes, environment
@@ -100,3 +101,15 @@ def test_a_case_may_have_more_ranks_than_cores(monkeypatch):
     command = ["mpiexec", "-n", str(os.cpu_count() + 1), "true"]
     done = subprocess.run(command, env=environment(), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="Open MPI refuses root alone")
+def test_what_root_must_set_for_mpiexec_is_said(tmp_path: Path, processes: Processes, monkeypatch: pytest.MonkeyPatch):
+    """By a study's cases, check --ranks and doctor, in place of the last line of Open MPI's."""
+    for name in AS_ROOT:
+        monkeypatch.delenv(name)
+    words = ["OMPI_ALLOW_RUN_AS_ROOT=1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"]
+    ended = processes.run(["mpiexec", "-n", "2", "true"], tmp_path / "log", timeout=60)
+    state, line = doctor.probed("", "mpiexec", "-n", "2")
+    assert ended.word == "failed" and state == doctor.BROKEN
+    assert all(word in text for word in words for text in (ended.reason, line)), (ended, line)

@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
+from shlex import quote
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
@@ -131,7 +132,7 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, li
     """Compare scenes with their stored numbers; print and return the differences by scene."""
     for scene, file in files.items():
         if not file.is_file():
-            raise InputError(f"nothing is stored of {scene}: msmpetsc check --update {scene} stores {file}")
+            raise InputError(f"nothing is stored of {scene}: msmpetsc check --update {quote(str(scene))} stores {file}")
     stored = {scene: read(file) for scene, file in files.items()}
     for scene, numbers in stored.items():  # whose changes come with the scene, and name what lies beside it
         load_scene(scene, numbers.run.changes, by_user=False)

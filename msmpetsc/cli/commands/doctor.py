@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import msmpetsc
-from msmpetsc.app.ranks import environment, lines_said
+from msmpetsc.app.ranks import environment, last_error
 from msmpetsc.errors import EXTRAS
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
@@ -41,11 +41,17 @@ for number in range(cupy.cuda.runtime.getDeviceCount()):
     print(cupy.cuda.runtime.getDeviceProperties(number)["name"].decode())
 """,
     "HDF5": "import h5py; print(h5py.version.hdf5_version)",
+    "kernels": """
+from msmpetsc.backend.kernel_cache import writable
+if writable():
+    print(f"kept in {writable()}")
+""",
 }
 NOTHING = {  # what it means if they say nothing
     "PETSc": (BROKEN, "a PETSc of real double numbers is needed (--with-scalar-type=real)"),
     "MPI": (BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI"),
     "GPU": (MISSING, "no CUDA device on this machine"),
+    "kernels": (MISSING, "no folder can keep them: each process compiles them, a minute; NUMBA_CACHE_DIR names one"),
 }
 BRINGS = {  # of packages whose names alone do not say how to get them
     "petsc4py": "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'",
@@ -94,10 +100,9 @@ def probed(code: str, *launcher: str) -> tuple[str, str]:
         return BROKEN, f"does not answer within {PATIENCE} s: {' '.join(launcher)}"
     if done.returncode == 0:
         return OK, done.stdout.strip()
-    last = [f"ends with status {done.returncode}", *lines_said(done.stderr)][-1][:160]
     if gone := re.search(r"^ModuleNotFoundError: No module named '(\w+)'$", done.stderr, re.M):
         return MISSING, f"{gone[1]}: {BRINGS.get(gone[1], f'pip install {gone[1]}')}"
-    return BROKEN, last
+    return BROKEN, last_error(done.stderr)[:160] or f"ends with status {done.returncode}"
 
 
 def packages() -> Iterator[Finding]:

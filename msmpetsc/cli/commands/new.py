@@ -10,6 +10,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import trimesh
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     scene_of(args.scene, text, to_read=False)  # so that nothing is written that run would refuse
     write_whole(args.scene.with_name(SCHEMA_FILE), json.dumps(json_schema(), indent=1) + "\n")
     write_whole(args.scene, text)
-    print(f"{args.scene}\nto run it: msmpetsc run {args.scene} --picture")
+    print(f"{args.scene}\nto run it: msmpetsc run {quote(str(args.scene))} --picture")
     return 0
 
 
@@ -90,6 +91,9 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     log.info("%s: %s", mesh, measures.words)
     for warning in warnings:
         log.warning("%s: %s", mesh, warning)
+    log.info(
+        "%s, its longest side as %.4g m: mesh.size in the scene sets it", measures.unit_words, measures.sides.max()
+    )
     log.info("%s is taken for upwards: --up says another axis", up)
     return draft(source, scene.stem, measures)
 
@@ -144,6 +148,13 @@ class MeshMeasures:
         """The horizontal axis along which the body is a beam; None for any other."""
         along = int(np.argmax(self.sides))
         return along if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max() else None
+
+    @property
+    def unit_words(self) -> str:
+        """The unit of the file in words."""
+        if self.unit is None:
+            return "the unit of the file is unknown"
+        return f"the file is taken to be in {'mm' if self.unit == MILLIMETRE else 'm'}"
 
     @property
     def words(self) -> str:
@@ -245,10 +256,7 @@ def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
         lines.append('# open: the winding number decides what is inside; prepare = ["repair"] would close it')
     if len(mesh.parts) > 1 and '"largest_part"' not in steps:
         lines.append('# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap')
-    guess = {1.0: "as in the file, taken as metres", None: "unit of the file unknown: what is it?"}
-    lines.append(
-        line(f"size = {plain(mesh.sides.max(), 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}")
-    )
+    lines.append(line(f"size = {plain(mesh.sides.max(), 5)}", f"longest side [m]; {mesh.unit_words}"))
     if mesh.beam_axis is None:
         drop = plain(DROP * mesh.sides[2], 2)
         lines.append(

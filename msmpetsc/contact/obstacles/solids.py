@@ -8,11 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
-from msmpetsc.backend.kernel import kernel
+from msmpetsc.backend.kernel import kernel, njit
 
 TINY = 1e-300  # [m]
 OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other
@@ -76,7 +75,7 @@ class Ways(NamedTuple):
     sides: Indices
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
     """Return how far the position q[i] (3,) lies behind a face [m]; negative in front of it."""
     points, normals = planes
@@ -86,7 +85,7 @@ def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
     return distance
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
     """Return how deep q[i] (3,) lies behind the face of its ``side`` [m], and that face.
 
@@ -102,7 +101,7 @@ def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
     return least, face
 
 
-@numba.njit(cache=True)
+@njit()
 def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
     """Return whether q[i] lies behind a face and has not slid off it past another.
 
@@ -119,7 +118,7 @@ def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
     return True
 
 
-@numba.njit(cache=True)
+@njit()
 def side_of(q: Positions, end: Positions, i: int, planes: Planes, side: int) -> int:
     """Return 1 + the face by which a node is in contact on its straight way from q[i] to end[i], 0 if it meets none.
 

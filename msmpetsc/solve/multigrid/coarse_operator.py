@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask
+from msmpetsc.backend.kernel import njit
 
 
 class BlockRows(NamedTuple):
@@ -87,7 +87,7 @@ class CoarseOperator:
         self.ghosts.destroy()
 
 
-@numba.njit(cache=True)
+@njit()
 def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
     """Take the values of blocks from the ``given`` numbers of an AIJ, whose rows have that length."""
     for i in range(len(blocks.begin) - 1):
@@ -97,7 +97,7 @@ def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
                     blocks.values[k, 3 * r + c] = given[blocks.place[k] + r * length[i] + c]
 
 
-@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+@njit(fastmath={"reassoc", "contract", "nsz"})
 def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
     """y = H x of blocks whose column is greater than their row, the others being their transposes.
 
@@ -122,7 +122,7 @@ def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
         y[i, 0], y[i, 1], y[i, 2] = a, b, c
 
 
-@numba.njit(cache=True)
+@njit()
 def add_product(blocks: BlockRows, x: Array, ghosts: Array, y: Array) -> None:
     """y += H (ghosts - x), x that of each block's row."""
     begin, columns, _, h = blocks

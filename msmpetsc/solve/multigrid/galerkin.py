@@ -9,12 +9,11 @@ cell of a solid its Hessian, whose strains are taken of the coarse cell's corner
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
-from msmpetsc.backend.kernel import kernel
+from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import form_of, modes_forces, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
@@ -275,7 +274,7 @@ def add_solid(first: int, count: int, step: int, scratch: Array, into: CellSum, 
                         _add_block(values[places[i, pair]], own, cells.state, s, e[a], e[c])
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: int, s: int) -> None:
     """Write, of each coarse corner, the strain g, h of a cell (7), what the modes h push (4), and cof F g (3)."""
     n = kept_cofactors(cells.state, s)
@@ -290,7 +289,7 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
         row[11], row[12], row[13] = along_cofactors(n, e)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _add_block(block: Floats, own: float, state: Floats, s: int, g: Floats, h: Floats) -> None:
     """Add own I + U'' m n^T + U' [t]_x with t = F (h x g), what v . (F x (u (x) h)) g is of u and v."""
     f, slope, curvature = kept_gradient(state, s), state[s + 72], state[s + 80]
@@ -326,7 +325,7 @@ def add_resistance(first: int, count: int, step: int, q: Positions, into: CellSu
                     _add_corner(values, places[i], weights, ends, curvature, n)
 
 
-@numba.njit(cache=True)
+@njit()
 def _add_corner(values: Rows, places: Indices, weights: Rows, ends: Any, curvature: float, n: Any) -> None:
     """Add curvature G G^T to the blocks of a coarse cell; ``ends`` (4) are codes of the corner and its edges' ends."""
     pair = -1
@@ -341,7 +340,7 @@ def _add_corner(values: Rows, places: Indices, weights: Rows, ends: Any, curvatu
                         block[3 * r + c] += curvature * g[r] * h[c]
 
 
-@numba.njit(cache=True)
+@njit()
 def _slope(ends: Any, weights: Rows, a: int, n: Any) -> tuple[float, float, float]:
     """Slope of a corner's volume as corner a of the coarse cell moves."""
     x, y, z = 0.0, 0.0, 0.0

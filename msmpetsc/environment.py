@@ -265,14 +265,14 @@ class Environment:
         new = [p.state_at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
         return Contact(new, self.lattice.owned).energy(q) if new else 0.0
 
-    def friction_work_bound(self, before: Placed, after: Placed, time: float, time_step: float) -> float:
+    def friction_work_bound(self, before: Placed, after: Placed, time: float, time_step: float, frame: Floats) -> float:
         """Return no less than the work [J] that friction of moving obstacles does on this rank's nodes in a step.
 
-        It is mu N times how far they go.
+        It is mu N times how far they go, seen from a frame that goes by ``frame`` (3,) [m] itself.
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
-            way = float(np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time)))
+            way = float(np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time) - frame))
             if p.obstacle.acts_at(time) and p.friction > 0 and way > 0:
                 for state, when in ((before, time - time_step), (after, time)):
                     work += p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way

@@ -76,7 +76,8 @@ def any_scene(draw: Draw, path: Path) -> dict:
 
 def rubbing(draw: Draw, path: Path) -> dict:
     """A block that is led down onto a slab, then along it or round."""
-    step, bodies = log_uniform(draw, 1e-3, 2e-2), []
+    step: float = log_uniform(draw, 1e-3, 2e-2)
+    bodies: list[dict] = []
     for name, low, high in (("block", [-0.15, -0.15, 0.0015], [0.15, 0.15, 0.1515]), SLAB):
         box = trimesh.creation.box(bounds=[low, high]).subdivide().subdivide()
         box.export(mesh := path.with_name(f"{path.stem}_{name}.ply"))

@@ -23,7 +23,7 @@ from typing import SupportsFloat
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
@@ -108,11 +108,29 @@ class EnergyBalance:
         """
         result, after = integrator.advance(before, time)
         budget = self._examine(before, result, after, time, integrator.time_step)
-        if before.history is not None and budget.since_frame - before.budget.since_frame > MUCH * budget.put_in:
+        if before.history is not None and self._history_gains(before, result, after, time, integrator.time_step):
             again, after = self.step(integrator, replace(before, history=None), time)
             cost = replace(result.cost + again.cost, steps=1, step_error=again.cost.step_error)
             return replace(again, cost=cost), after
         return result, replace(after, budget=budget)
+
+    def _history_gains(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> bool:
+        """Return whether a solved step gains more than MUCH of all energy (collective).
+
+        A free body's energy is that in the frame of its mean velocity, so that no motion of all matters.
+        """
+        lattice, owned = self.lattice, slice(self.lattice.owned)
+        sums = self._sums(
+            lattice.mass.sum(),
+            *(lattice.mass @ before.velocity(time_step)[owned]),
+            *(lattice.mass @ (result.position - result.previous)[owned] / time_step),
+            self.environment.fixed_at(time)[owned].any(),
+        )
+        mass, momentum, at_end = sums[0], sums[1:4], sums[4:7]
+        frame = np.zeros(3) if sums[7] else momentum / mass
+        start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
+        ended = self.energies.inner - at_end @ frame + 0.5 * mass * frame @ frame
+        return bool(ended - start - work - struck > MUCH * max(start + max(work, 0.0), self.floor))
 
     def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> EnergyBudget:
         v = (result.position - result.previous) / time_step
@@ -161,11 +179,21 @@ class EnergyBalance:
             return "a smaller time.substep" if explicit else "a smaller time.step"
         return "a smaller time.step or a smaller solver.error"
 
-    def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Floats:
+    def _start(
+        self,
+        before: State,
+        result: StepResult,
+        after: State,
+        time: float,
+        time_step: float,
+        frame: Floats | float = 0.0,
+    ) -> Floats:
         """Return the terms (5,) [J] of the right side of the balance (collective).
 
         They are the energies, the push in them, the work of loads and of obstacles that drag,
         the work that the step counted itself, and its swing.
+
+        frame : velocity (3,) [m/s] of the frame in which energies and work are counted
         """
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
@@ -176,16 +204,17 @@ class EnergyBalance:
         contact = environment.push(when, sides)
         known = self.known[1] if self.known and q is self.known[0] else None
         ended = result.position[owned], after.sides
+        way = like(lattice.nodes, np.broadcast_to(time_step * np.asarray(frame), 3))
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
         sums = self._sums(
-            0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
+            0.5 * np.vdot((lattice.mass * free)[:, None] * (v - frame), v - frame),
             0.0 if known else self.elasticity.energy(q),
-            contact.energy(q[owned]) if contact else 0.0,
-            np.vdot(environment.load(time), result.position[owned] - q[owned])
-            + environment.friction_work_bound((q[owned], sides), ended, time, time_step)
+            contact.energy(q[owned] + way) if contact else 0.0,
+            np.vdot(environment.load(time), result.position[owned] - q[owned] - way)
+            + environment.friction_work_bound((q[owned], sides), ended, time, time_step, to_host(way))
             + result.viscous_work
-            + (surface.of_obstacles(result.position)[1] / self.comm.size if surface else 0.0)
+            + (surface.of_obstacles(result.position, to_host(way))[1] / self.comm.size if surface else 0.0)
             + (pressing.released(result.position) if pressing else 0.0),
             result.work,
             result.swing,

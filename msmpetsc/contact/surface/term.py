@@ -206,10 +206,12 @@ class SurfaceContact:
         barrier = self.contacts.barrier
         return barrier.gradient(moment.contacts, moment.points) if barrier else np.zeros_like(moment.points)
 
-    def of_obstacles(self, q: Positions) -> tuple[Rows, float]:
+    def of_obstacles(self, q: Positions, frame: Floats | float = 0.0) -> tuple[Rows, float]:
         """Return the pushes of obstacles (k, 3) [N] on the bodies, and their work [J] in the step that ends at q.
 
-        They do it with the push of its end: where the energy is convex, no less is what the step adds to it.
+        The push of the step's end does the work: where the energy is convex, the step adds no more to it.
+
+        frame : (3,) how far the frame goes [m] in which the work is counted
         """
         moment = self._acting(q)
         points, obstacles = self.contacts.points, self.contacts.obstacles
@@ -217,7 +219,7 @@ class SurfaceContact:
         if obstacles.total and moment is not None:
             if len(moment.points):
                 forces = self._gradient(moment)[points.bodies :]
-                way = obstacles.way(self.contacts.begin, self.contacts.time)
+                way = obstacles.way(self.contacts.begin, self.contacts.time) - frame
                 found = obstacles.sums(forces), float((forces * way).sum())
             found = self.comm.bcast(found)
         return found

@@ -173,7 +173,7 @@ class ErrorEstimate:
         least = LOWER * self._least(self.ksp)
         if not least > 0 or self.preconditioner.least_norm(self.residual) > residual / np.sqrt(least):
             return missing
-        return min(missing, residual / np.sqrt(least * self.lowest))
+        return min(missing, float(residual / np.sqrt(least * self.lowest)))
 
     def _least(self, ksp: PETSc.KSP) -> float:
         """The least eigenvalue of P^(-1) H that is known, that of a solve by CG included; 0 where there is none."""
@@ -214,7 +214,7 @@ class ErrorEstimate:
             return False
         if not self._left() < LEFT * self.lengths[ksp.its]:
             return False
-        return self.preconditioner.least_norm(self.residual) < CLOSE * np.sqrt(energy)
+        return bool(self.preconditioner.least_norm(self.residual) < CLOSE * np.sqrt(energy))
 
     def _left(self) -> float:
         """Bound on what is missing of |e|_M, where H is no less than ``lowest`` M: |r_k|_(M^-1) over that."""

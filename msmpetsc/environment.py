@@ -278,6 +278,15 @@ class Environment:
                     work += p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
         return work
 
+    def way_of_pressing(self, state: Placed, time: float, time_step: float) -> tuple[float, Floats]:
+        """Return the push of penalties on this rank's nodes [N], and the sum (3,) [N m] of each push times its way."""
+        push, led = 0.0, np.zeros(3)
+        for row, p in enumerate(self.penalties):
+            if p.obstacle.acts_at(time):
+                share = p.stiffness * float(self._pushed(row, state, time).sum())
+                push, led = push + share, led + share * p.obstacle.path.displacement_between(time - time_step, time)
+        return push, led
+
     def change_of_push(self, before: Placed, after: Placed, time: float, time_step: float) -> Floats:
         """Return how much penalties' push on this rank's nodes changes in a step, (owned,) [N]."""
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)

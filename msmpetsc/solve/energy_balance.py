@@ -117,19 +117,18 @@ class EnergyBalance:
     def _history_gains(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> bool:
         """Return whether a solved step gains more than MUCH of all energy (collective).
 
-        A free body's energy is that in the frame of its mean velocity, so that no motion of all matters.
+        Energy and work are those in a frame that goes with the obstacles that press, or with the body where none does:
+        so no motion of all matters.
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
-        sums = self._sums(
-            lattice.mass.sum(),
-            *(lattice.mass @ before.velocity(time_step)[owned]),
-            *(lattice.mass @ (result.position - result.previous)[owned] / time_step),
-            self.environment.fixed_at(time)[owned].any(),
-        )
-        mass, momentum, at_end = sums[0], sums[1:4], sums[4:7]
-        frame = np.zeros(3) if sums[7] else momentum / mass
+        way = result.position[owned] - result.previous[owned]
+        pressing, led = self.environment.way_of_pressing((result.position[owned], after.sides), time, time_step)
+        is_held = self.environment.fixed_at(time)[owned].any()
+        sums = self._sums(lattice.mass.sum(), pressing, is_held, *led, *(lattice.mass @ way / time_step))
+        mass, pressing, is_held, momentum = *sums[:3], sums[6:]
+        frame = sums[3:6] / (pressing * time_step) if pressing > 0 else np.where(is_held, 0.0, momentum / mass)
         start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
-        ended = self.energies.inner - at_end @ frame + 0.5 * mass * frame @ frame
+        ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
         return bool(ended - start - work - struck > MUCH * max(start + max(work, 0.0), self.floor))
 
     def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> EnergyBudget:

@@ -66,9 +66,11 @@ def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
     ring = trimesh.creation.annulus(r_min=0.1, r_max=0.16, height=0.06, sections=24).subdivide_to_size(0.06)
     cone = trimesh.creation.cone(radius=0.2, height=0.4, sections=32)
     cone.apply_translation([0, 0, -0.25])
-    ring.apply_translation([0, 0, 0.0])
     cone.export(tmp_path / "cone.ply")
-    plate = {"shape": "box", "box": [[-0.3, -0.3, 0.032], [0.3, 0.3, 0.1]], "response": "barrier"}
+    plate = trimesh.creation.annulus(r_min=0.11, r_max=0.2, height=0.04, sections=24)
+    plate.apply_translation([0, 0, 0.052])
+    plate.export(tmp_path / "plate.ply")
+    plate = {"shape": "mesh", "mesh": {"source": "plate.ply"}, "response": "barrier"}
     plate["path"] = [{"time": 0.05, "by": [0, 0, -0.05]}]
     obstacles = [{"shape": "mesh", "mesh": {"source": "cone.ply"}, "response": "barrier"}, plate]
     scene = block_scene(

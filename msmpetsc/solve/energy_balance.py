@@ -23,7 +23,7 @@ from typing import SupportsFloat
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
@@ -203,17 +203,18 @@ class EnergyBalance:
         contact = environment.push(when, sides)
         known = self.known[1] if self.known and q is self.known[0] else None
         ended = result.position[owned], after.sides
-        way = like(lattice.nodes, np.broadcast_to(time_step * np.asarray(frame), 3))
+        along = time_step * np.broadcast_to(frame, 3)
+        way, drift = like(lattice.nodes, along), like(lattice.nodes, along / time_step)
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
         sums = self._sums(
-            0.5 * np.vdot((lattice.mass * free)[:, None] * (v - frame), v - frame),
+            0.5 * np.vdot((lattice.mass * free)[:, None] * (v - drift), v - drift),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned] + way) if contact else 0.0,
             np.vdot(environment.load(time), result.position[owned] - q[owned] - way)
-            + environment.friction_work_bound((q[owned], sides), ended, time, time_step, to_host(way))
+            + environment.friction_work_bound((q[owned], sides), ended, time, time_step, along)
             + result.viscous_work
-            + (surface.of_obstacles(result.position, to_host(way))[1] / self.comm.size if surface else 0.0)
+            + (surface.of_obstacles(result.position, along)[1] / self.comm.size if surface else 0.0)
             + (pressing.released(result.position) if pressing else 0.0),
             result.work,
             result.swing,

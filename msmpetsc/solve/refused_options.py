@@ -31,6 +31,7 @@ NO_USE = {  # what PETSc would take, but not do here, or crash by; a name and it
     r"snes_type (newtontr(dc)?|aspin|nasm|patch|ms)": "a step goes by its energy, on no DM of PETSc's; newtonls can",
     r"snes_type ksp(transpose)?only": "a linear solve is no step; newtonls makes as many as it takes",
     r"(.*_)?ksp_type fetidp": "it is for a PC of type bddc, which the operator does not have; cg can",
+    r"(.*_)?pc_type deflation": "PETSc looks for a space of deflation without end; mg can",
     r"mg_\w*ksp_type pipelcg": "within a cycle it does not end; cg can",
     r"(.*_)?mat_ordering_type wbm": "PETSc aborts by it; qmd can",
     r"(.*_)?(snes|ksp|mg_\w*pc)_python_type .*": "no object of Python's can stand here",

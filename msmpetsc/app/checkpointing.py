@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from time import perf_counter
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -80,7 +80,8 @@ class Signals:
     """
 
     def __init__(self, comm: MPI.Comm):
-        self.comm, self._stepping = comm, False
+        self.comm = comm
+        self._abandon: Callable[[], None] | None = None  # once steps are taken
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Signals":
@@ -93,14 +94,15 @@ class Signals:
             signal.signal(number, handler)
         Stop.signal = 0
 
-    def begin(self) -> None:
-        """Mark that steps are taken from now on: before, a SIGINT has nothing to keep."""
-        self._stepping = True
+    def begin(self, abandon: Callable[[], None]) -> None:
+        """Keep the run's result from now on at a SIGINT; a second SIGINT calls ``abandon`` and ends the run."""
+        self._abandon = abandon
 
     def _note(self, number: int, _: FrameType | None) -> None:
-        if number == signal.SIGINT and not self._stepping:
+        if number == signal.SIGINT and self._abandon is None:
             raise KeyboardInterrupt
-        if number == Stop.signal == signal.SIGINT:
+        if number == Stop.signal == signal.SIGINT and self._abandon:
+            self._abandon()
             sys.stderr.write("msmpetsc: stopped at once\n")
             sys.stderr.flush()
             if self.comm.size > 1:

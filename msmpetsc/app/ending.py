@@ -4,7 +4,7 @@ import logging
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -38,26 +38,32 @@ def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO, timed: bool = Fa
 
 
 @contextmanager
-def ending_together(comm: "MPI.Comm", extra: str = "run") -> Iterator[None]:
+def ending_together(
+    comm: "MPI.Comm",
+    extra: str = "run",
+    abandon: Callable[[], None] = lambda: None,
+) -> Iterator[None]:
     """Let a failure of all ranks in the block pass, and end all ranks at a failure of some (collective to enter).
 
-    The others would wait for ever. It stands within whatever does collective work on leaving. A
-    package that is missing is named with this extra, if that brings it.
+    The other ranks would wait for ever. The block stands within each context whose exit is collective.
+
+    extra   : the extra that an error names if it brings a package that is missing
+    abandon : called on a failing rank before it ends all ranks, as no context is left then
     """
     meeting = comm.Dup() if comm.size > 1 else None  # its messages meet no others
     try:
         yield
     except KeyboardInterrupt:
-        _end_all(comm, f"rank {comm.rank}: interrupted", STATUS_INTERRUPTED)
+        _end_all(comm, f"rank {comm.rank}: interrupted", STATUS_INTERRUPTED, abandon)
         raise
     except Exception as raised:
         error = as_expected(raised, extra)
         if error is None:
-            _end_all(comm, f"rank {comm.rank}: {traceback.format_exc()}", STATUS_BUG)
+            _end_all(comm, f"rank {comm.rank}: {traceback.format_exc()}", STATUS_BUG, abandon)
             raise
         if meeting is not None and not error.on_all_ranks:
             if not _all_fail(meeting):
-                _end_all(comm, f"error: {error}", error.exit_status)
+                _end_all(comm, f"error: {error}", error.exit_status, abandon)
             error.on_all_ranks = True
         raise error from raised
     if meeting is not None:
@@ -78,8 +84,9 @@ def _all_fail(meeting: "MPI.Comm") -> bool:
     return False
 
 
-def _end_all(comm: "MPI.Comm", line: str, status: int) -> None:
+def _end_all(comm: "MPI.Comm", line: str, status: int, abandon: Callable[[], None]) -> None:
     """Print the line and end all ranks by MPI_Abort; a run of one rank ends by itself."""
     if comm.size > 1:
         print(f"msmpetsc: {line}", file=sys.stderr, flush=True)
+        abandon()
         comm.Abort(status)

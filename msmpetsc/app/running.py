@@ -95,7 +95,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
         TimeLoop(comm, plan.scene, model := described_model(comm, plan), plan.request.true_error) as simulation,
     ):
         try:
-            with ending_together(comm):
+            with ending_together(comm, abandon=file.abandon):
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
                 numbers = count(start_output(comm, plan, file, model, simulation))
@@ -105,7 +105,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:
                     observers = [cost.count, progress.update, *filter(None, [plan.request.on_frame])]
-                    signals.begin()
+                    signals.begin(file.abandon)
                     for frame in checkpoints.steps():
                         with cost.of_output():
                             if frame is not None and next(numbers) >= file.finished:  # a run that goes on has some

@@ -119,8 +119,20 @@ class Lock:
 
     def free(self) -> None:
         """Free the lock and remove its file."""
-        self.path.unlink(missing_ok=True)  # while it is locked: the name is still this file's
+        unlink_inode(self.path, self.inode)
         os.close(self._file)
+
+    @property
+    def inode(self) -> int:
+        """Return the number of the lock's file in its file system."""
+        return os.fstat(self._file).st_ino
+
+
+def unlink_inode(path: Path, inode: int) -> None:
+    """Remove the name ``path`` if it still belongs to the file of this inode."""
+    with suppress(OSError):
+        if path.stat().st_ino == inode:
+            path.unlink()
 
 
 def refuse_small_disk(path: Path, planned: int) -> None:

@@ -33,6 +33,7 @@ from msmpetsc.results.disk import (
     plain_errors,
     refuse_no_file,
     refuse_small_disk,
+    unlink_inode,
 )
 from msmpetsc.results.layout import (
     Layout,
@@ -92,19 +93,28 @@ class ResultFile:
         self._copied: int | None = None  # most frames to take over, all if None
         self._rows: dict[str, list[int]] = {}  # fields that ranks have rows of: how many each has
         self._failed = False  # to write
+        self._passing: dict[Path, int] = {}  # inodes of files that last no longer than the run, by name
         with self._together():
             if comm.rank == 0:
                 self._open(attributes)
+        self._passing = comm.bcast(self._passing)
 
     def __enter__(self) -> "ResultFile":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if kind is None:
             self.close()
         else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
             with suppress(InputError), plain_errors(self.path):
                 self._finish(trim=not self._failed)  # a full disk is no place to change metadata
+            if not getattr(error, "on_all_ranks", False):
+                self.abandon()
+
+    def abandon(self) -> None:
+        """Remove the lock and the temporary file, as MPI_Abort is about to end rank 0. Any rank may call it."""
+        for path, inode in self._passing.items():
+            unlink_inode(path, inode)
 
     def write(self, name: str, rows: Array) -> None:
         """Store the rows of all ranks, (n_local, ...) on each, in order as dataset `name`: "lattice/nodes".
@@ -208,6 +218,7 @@ class ResultFile:
         """
         with self._together():
             self._finish(trim)
+        self._passing = {}
 
     # On rank 0 alone
 
@@ -216,7 +227,8 @@ class ResultFile:
             self._refuse_to_replace()
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as opened:
-            opened.callback(Lock(self.path).free)
+            lock = Lock(self.path)
+            opened.callback(lock.free)
             opened.callback(self._part.unlink, missing_ok=True)
             if self._begin is Begin.IN_PLACE:
                 open_result(self.path).close()
@@ -226,7 +238,9 @@ class ResultFile:
                 self._storage = Storage(self._part, "w+")
                 self._file = open_to_write(self._storage, "w")
                 self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
+                self._passing[self._part] = self._part.stat().st_ino
             opened.callback(self._storage.close)
+            self._passing[lock.path] = lock.inode
             self._opened = opened.pop_all()
 
     def _flush(self, file: h5py.File) -> None:

@@ -120,13 +120,14 @@ FAILING_RANKS = [  # ranks that fail, where, and how
 
 @pytest.mark.parametrize(("ranks", "where", "what"), FAILING_RANKS)
 def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ranks, where, what):
-    """No other rank waits for them."""
+    """No other rank waits for them, and neither a lock nor a temporary file is left."""
     scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.1})
     worker = WORKERS / "alone_worker.py"
     done = run(3, worker, ranks, where, what, "run", scene, "-o", tmp_path / "x.h5")
     said = {"input": "it fails", "memory": "there is not enough memory (Unable"}[what]
     (line,) = errors(done.stderr)
     assert done.returncode == 2 and line.startswith(f"msmpetsc: error: {said}") and "Traceback" not in done.stderr
+    assert not [path.name for path in tmp_path.glob("*x.h5.*")]
 
 
 def test_completion_offers_public_names_alone():

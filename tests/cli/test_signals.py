@@ -125,6 +125,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
                 time.sleep(0.02)
         told = process.stderr.read()
     assert process.returncode == 130 and "stopped at once" in told
+    assert not list(tmp_path.glob("*x.h5.*"))
     with h5py.File(path) as file:
         assert finished(file) >= 1
 

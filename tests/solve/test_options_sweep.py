@@ -90,7 +90,7 @@ def fault_of(status: int | None, said: str) -> str:
 
 @pytest.mark.parametrize(
     ("name", "every"),
-    [("multigrid", 80), *(pytest.param(name, 7, marks=pytest.mark.slow) for name in SCENES)],
+    [("multigrid", 160), *(pytest.param(name, 7, marks=pytest.mark.slow) for name in SCENES)],
 )
 def test_each_option_is_obeyed_or_refused_in_one_line(tmp_path: Path, name: str, every: int):
     tables, objects = SCENES[name]

@@ -29,7 +29,7 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 Vectors: TypeAlias = tuple[PETSc.Vec, PETSc.Vec, PETSc.Vec]
 
 # Directions between looks at the progress: a press takes 5 to 30
-PATIENCE = 40
+PATIENCE = 20
 # Progress in s between looks: with less, the step is refused
 PROGRESS = 0.1
 # Directions at fixed s after each share: a direction doubles a gap that the share has closed

@@ -23,7 +23,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.nonlinear import preconditioning
-from msmpetsc.solve.nonlinear.curvature import Alarm
+from msmpetsc.solve.nonlinear.curvature import ALIKE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
@@ -127,12 +127,15 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
         load = 1 - eigh(dense, dense_hessian(stepper), eigvals_only=True)[0]
         assert 0.85 * load < curvature.load < load + 1e-9 and 0.5 <= found <= lowest
     else:
-        assert found == pytest.approx(direction @ dense @ direction / (direction**2 @ functional.mass))
+        # below 0 a direction is a mix of the modes that are nearly as low
+        rayleigh = direction @ dense @ direction / (direction**2 @ functional.mass)
+        assert found - 1e-9 <= rayleigh <= (ALIKE * found if found < 0 else found) + 1e-9
         assert found >= lowest - 1e-9 and (found < 0) == (lowest < 0)
     if lowest > 0 and direction is not None:
         assert found < lowest + 0.1
     assert (direction is None) == (multigrid and share > 0.5)
-    assert lowest >= curvature.compression(q).least_curvature - 1e-9
+    known = curvature.compression(q).least_curvature  # 0 for none
+    assert known == 0 or lowest >= known - 1e-9
     simulation.destroy()
 
 

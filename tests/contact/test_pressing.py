@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from block_scene import DENSITY, SIDES, G, block_scene, play
-from crossings import count_crossings
+from test_obstacle_surfaces import crossed
 
 from msmpetsc.build import Model
 from msmpetsc.errors import StepFailed
@@ -37,15 +37,6 @@ def pressed(folder: Path, plate: dict, steps: int, edge: float = 0.1, **tables) 
     return play(scene)
 
 
-def crossings(model: Model, frame: Frame) -> int:
-    """Return how many edges of body and obstacles cross triangles, by the model's own surfaces."""
-    obstacles = model.collision.points.obstacles
-    parts = [model.surface.triangles, *(solid.triangles for solid in obstacles.solids)]
-    firsts = np.cumsum([0, len(model.surface.points), *(len(s.points) for s in obstacles.solids)])
-    triangles = np.concatenate([part + first for part, first in zip(parts, firsts, strict=False)])
-    return count_crossings(np.concatenate([frame.surface, obstacles.points_at(frame.time)]), triangles)
-
-
 @pytest.mark.parametrize(
     "way", ["sheared", *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS if way != "sheared")]
 )
@@ -54,7 +45,7 @@ def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
     steps = 3
     plate = PLATE | {"center": CENTER, "path": [{"time": STEP * steps, **WAYS[way]}]}
     model, frames = pressed(tmp_path, plate, steps, self_contact={"friction": 0.4})
-    assert not any(crossings(model, frame) for frame in frames)
+    assert not any(crossed(model, frame) for frame in frames)
     weight = np.array([0, 0, -G * DENSITY * SIDES.prod()])
     for before, after in pairwise(frames):
         force = after.push.sum(axis=0) + weight
@@ -88,7 +79,7 @@ def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
     )
     ring.export(tmp_path / "scene.ply")
     model, frames = play(scene)
-    assert not any(crossings(model, frame) for frame in frames)
+    assert not any(crossed(model, frame) for frame in frames)
     radius = np.linalg.norm(frames[-1].surface[:, :2], axis=1)
     assert radius.min() > 1.02 * 0.1
 

@@ -4,47 +4,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host, to_host
-from msmpetsc.elasticity.cell_volume import Cells
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.springs import Product, SpringGather, SpringScatter
 from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.lattice.lattice import Lattice
 
-ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
-RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lung pressed to 30% torn
-
 
 class Elasticity:
     """E of this rank's part of a lattice, its gradient and its Hessian.
 
-    It is that of a neo-Hookean solid (elasticity.solid), or of Hooke's springs (elasticity.springs), or, where
-    that law stiffens, of stiffening ones and of cells that resist being turned inside out (elasticity.cell_volume).
+    It is that of a neo-Hookean solid (elasticity.solid), or of Hooke's springs (elasticity.springs).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the owned
-    nodes. ``springs``, ``cells``, ``solid`` and ``viscosity`` are None where the law has none. Where there is viscosity
+    nodes. ``springs``, ``solid`` and ``viscosity`` are None where the law has none. Where there is viscosity
     E has its D, of the step that it was given last.
     """
 
     def __init__(self, lattice: Lattice):
         self.owned, self.rest = lattice.owned, lattice.nodes
         self.springs: SpringScatter | SpringGather | None = None
-        self.cells: Cells | None = None
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
         self.viscosity: Viscosity | None = None
         if self.solid and lattice.viscous:
             self.viscosity = Viscosity(self.solid, lattice.viscous, lattice.owned, lattice.nodes)
         if self.solid is None:
             self.springs = (SpringScatter if on_host(lattice.nodes) else SpringGather).of_lattice(lattice)
-        if lattice.stiffening > 0:
-            volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
-            self.cells = Cells.of_lattice(lattice, RESISTANCE * resistance, ONSET * volume)
-        self.parts = [part for part in (self.solid, self.springs, self.cells, self.viscosity) if part]
+        self.parts = [part for part in (self.solid, self.springs, self.viscosity) if part]
 
     def energy(self, q: Positions) -> float:
         """Return E [J] of what this rank owns: laws' changes from rest, where E is 0, and D."""
         viscous = self.viscosity.energy(q) if self.viscosity else 0.0
-        return viscous + sum(law.change(q, self.rest) for law in (self.solid, self.springs, self.cells) if law)
+        return viscous + sum(law.change(q, self.rest) for law in (self.solid, self.springs) if law)
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of what this rank owns."""
@@ -58,9 +49,7 @@ class Elasticity:
     @property
     def corners(self) -> Indices:
         """Corner nodes (c, 8) of the cells of the law that this rank owns, in its order; (0, 8) of springs alone."""
-        if self.solid:
-            return self.solid.corners
-        return to_host(self.cells.law.cells)[: self.cells.owned] if self.cells else np.empty((0, 8), np.int64)
+        return self.solid.corners if self.solid else np.empty((0, 8), np.int64)
 
     @property
     def bound(self) -> float | None:
@@ -68,7 +57,7 @@ class Elasticity:
         return None if self.solid else 2.0
 
     def concavity(self, q: Positions) -> Floats:
-        """Return the diagonal (owned,) [N/m] of a matrix: the Hessian is no less than minus that where no cell resists.
+        """Return the diagonal (owned,) [N/m] of a matrix: the Hessian is no less than minus that.
 
         It is 0 at a node without compressed springs, and where no cell around it is strained.
         """
@@ -77,10 +66,6 @@ class Elasticity:
         assert law is not None
         law.add_concavity(q, concavity)
         return concavity[: self.owned]
-
-    def resists(self, q: Positions) -> bool:
-        """Return whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
-        return self.cells is not None and len(self.cells.resisting(q).cells) > 0
 
     def hessian_at(self, q: Positions, projected: bool = False, dtype: type = np.float64) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].
@@ -94,8 +79,8 @@ class Elasticity:
         """Add a block diagonal D, such that the projected Hessian at q is no more than ``bound`` D, to the
         owned rows of ``blocks`` (l, 9) [N/m].
 
-        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its diagonal, four of a
-        cell's corner, whose D is twice that, and eight of a cell, where it is seldom so much.
+        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its diagonal, and eight of
+        a cell, where it is seldom so much.
         """
         for part in self.parts:
             part.add_bound(q, blocks)

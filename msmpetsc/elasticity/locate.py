@@ -54,7 +54,7 @@ def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
     count, _ = worst_inverted(comm, lattice, q)
     if not count:
         return ""
-    resists = lattice.stiffening > 0 or lattice.solid is not None
+    resists = lattice.solid is not None
     law = "" if resists else ' (material.law = "neo-hookean" resists that)'
     return f", {count} cell{'s are' if count > 1 else ' is'} inside out{law}"
 

@@ -1,7 +1,6 @@
 """Elastic energy of springs, its gradient and its Hessian (paper Eq. 13-15): the law of one spring, then two loops.
 
-A spring of length l = r (1 + s) pulls with k r (s + b s^3), b its ``stiffening``: Hooke's law where b = 0, and
-the same stiffness k at small strain whatever b. Its energy is k r^2 (s^2 / 2 + b s^4 / 4).
+A spring of length l and rest length r pulls with k (l - r). Its energy is 1/2 k (l - r)^2.
 
 All positions are local, (l, 3) [m]: owned nodes then ghosts. Gradients and products are right at the owned nodes,
 for a rank has every spring of them; the ghosts' rows are not complete and not to be used.
@@ -42,49 +41,34 @@ def dot(a: Vector, b: Vector) -> float:
 
 
 @njit()
-def spring_change(before: Vector, d: Vector, r: float, k: float, b: float) -> float:
-    """Return the energy of a spring that changed by d less what it was ``before`` [J].
-
-    It is 1/2 k (|e| - r)^2 (Eq. 13) of a spring e, and what stiffening b adds.
-    """
+def spring_change(before: Vector, d: Vector, r: float, k: float) -> float:
+    """Return the change of 1/2 k (|e| - r)^2 (Eq. 13) [J] of a spring e = before + d."""
     e = before[0] + d[0], before[1] + d[1], before[2] + d[2]
     length, length_before = math.sqrt(dot(e, e)), math.sqrt(dot(before, before))
     total = length + length_before
     longer = (d[0] * (e[0] + before[0]) + d[1] * (e[1] + before[1]) + d[2] * (e[2] + before[2])) / max(total, TINY)
-    change = 0.5 * k * longer * (total - 2.0 * r)
-    if b > 0.0:  # s^4 / 4 changes by (s^2 + s_0^2) / 2 for each unit that s^2 / 2 does
-        strain, strain_before = length / r - 1.0, length_before / r - 1.0
-        change *= 1.0 + 0.5 * b * (strain * strain + strain_before * strain_before)
-    return change
+    return 0.5 * k * longer * (total - 2.0 * r)
 
 
 @njit()
-def spring_pull(e: Vector, r: float, k: float, b: float) -> float:
+def spring_pull(e: Vector, r: float, k: float) -> float:
     """Return f [N/m]: the gradient at the end that a spring e points to is f e."""
-    length = math.sqrt(dot(e, e))
-    f = k * (1.0 - r / max(length, TINY))
-    if b > 0.0:
-        strain = length / r - 1.0
-        f *= 1.0 + b * strain * strain
-    return f
+    return k * (1.0 - r / max(math.sqrt(dot(e, e)), TINY))
 
 
 @njit()
-def spring_block(spring: Vector, r: float, k: float, b: float, projected: bool) -> Four:
+def spring_block(spring: Vector, r: float, k: float, projected: bool) -> Four:
     """Return c, e of a spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
 
-    It is k (1 + 3 b s^2) along the spring and k (1 - r/l) (1 + b s^2) across it, l its length;
+    The Hessian is k along the spring and k (1 - r/l) across the spring, l its length.
     ``projected`` leaves out the negative part that a compressed spring has across.
     """
-    length, tangent = math.sqrt(max(dot(spring, spring), TINY)), 1.0
+    length = math.sqrt(max(dot(spring, spring), TINY))
     across = 1.0 - r / length
-    if b > 0.0:
-        strain = length / r - 1.0
-        tangent += 3.0 * b * strain * strain
-        across *= 1.0 + b * strain * strain
     if projected:
         across = max(across, 0.0)
-    along = math.sqrt(k * (tangent - across)) / length  # across is never the greater
+    # Across is at most 1.
+    along = math.sqrt(k * (1.0 - across)) / length
     return k * across, along * spring[0], along * spring[1], along * spring[2]
 
 
@@ -96,19 +80,16 @@ def block_product(c: float, e: Vector, d: Vector) -> Vector:
 
 
 class Springs(NamedTuple):
-    """Springs of one law: local ends (s, 2), rest lengths (s,) [m], stiffnesses (s,) [N/m], and b of the law [-]."""
+    """Local ends (s, 2), rest lengths (s,) [m] and stiffnesses (s,) [N/m] of springs."""
 
     ends: Indices
     rest_length: Floats
     stiffness: Floats
-    stiffening: float
 
     @classmethod
     def of_lattice(cls, lattice: Lattice, first: int | None = None) -> "Springs":
         """Return the first springs of a lattice, or all, in the memory that its nodes are in."""
-        arrays = (like(lattice.nodes, a[:first]) for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
-        ends, rest_length, stiffness = arrays
-        return cls(ends, rest_length, stiffness, lattice.stiffening)
+        return cls(*(like(lattice.nodes, a[:first]) for a in (lattice.springs, lattice.rest_length, lattice.stiffness)))
 
 
 class Way(NamedTuple):
@@ -132,14 +113,14 @@ def between(q: Positions, a: int, b: int) -> Vector:
 
 @kernel
 def _elastic_change(first: int, count: int, step: int, sums: Floats, springs: Springs, way: Way) -> None:
-    ends, rest_length, stiffness, stiffening = springs
+    ends, rest_length, stiffness = springs
     base, _, moved = way
     change = 0.0
     for s in range(first, count, step):
         before = between(base, ends[s, 1], ends[s, 0])
         # how the ends moved, from node to node: a difference of springs would keep only the digits of a spring
         d = between(moved, ends[s, 1], ends[s, 0])
-        change += spring_change(before, d, rest_length[s], stiffness[s], stiffening)
+        change += spring_change(before, d, rest_length[s], stiffness[s])
     if first < count:
         sums[first] = change
 
@@ -191,13 +172,13 @@ class SpringScatter(OwnedSprings):
 
 @njit()
 def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None:
-    """Add grad E [N] to ``gradient`` (l, 3); without stiffening it is L x - J d(x) (Eq. 14-15)."""
-    ends, rest_length, stiffness, stiffening = springs
+    """Add grad E = L x - J d(x) [N] (Eq. 14-15) to ``gradient`` (l, 3)."""
+    ends, rest_length, stiffness = springs
     for s in range(len(ends)):
         a = ends[s, 0]
         b = ends[s, 1]
         e = between(q, b, a)
-        f = spring_pull(e, rest_length[s], stiffness[s], stiffening)
+        f = spring_pull(e, rest_length[s], stiffness[s])
         gradient[a, 0] += f * e[0]
         gradient[a, 1] += f * e[1]
         gradient[a, 2] += f * e[2]
@@ -213,10 +194,10 @@ def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> N
     With d = v_a - v_b a spring's Hessian c I + e e^T makes, for c < 0,
     c |d|^2 + (e . d)^2 >= -2 |c| (|v_a|^2 + |v_b|^2).
     """
-    ends, rest_length, stiffness, stiffening = springs
+    ends, rest_length, stiffness = springs
     for s in range(len(ends)):
         e = between(q, ends[s, 1], ends[s, 0])
-        push = -2.0 * min(spring_pull(e, rest_length[s], stiffness[s], stiffening), 0.0)
+        push = -2.0 * min(spring_pull(e, rest_length[s], stiffness[s]), 0.0)
         concavity[ends[s, 0]] += push  # also where there is none: to step over these takes longer
         concavity[ends[s, 1]] += push
 
@@ -227,10 +208,10 @@ def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Row
 
     projected : makes the whole positive semidefinite
     """
-    ends, rest_length, stiffness, stiffening = springs
+    ends, rest_length, stiffness = springs
     for s in range(len(ends)):
         e = between(q, ends[s, 1], ends[s, 0])
-        block = spring_block(e, rest_length[s], stiffness[s], stiffening, projected)
+        block = spring_block(e, rest_length[s], stiffness[s], projected)
         for i in range(4):
             blocks[s, i] = block[i]
 
@@ -238,10 +219,10 @@ def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Row
 @njit()
 def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
-    ends, rest_length, stiffness, stiffening = springs
+    ends, rest_length, stiffness = springs
     for s in range(len(ends)):
         e = between(q, ends[s, 1], ends[s, 0])
-        c, ex, ey, ez = spring_block(e, rest_length[s], stiffness[s], stiffening, True)
+        c, ex, ey, ez = spring_block(e, rest_length[s], stiffness[s], True)
         for end in range(2):
             add_block(blocks[ends[s, end]], c, 1.0, (ex, ey, ez))
 
@@ -288,18 +269,16 @@ def add_block(block: Floats, c: float, factor: float, g: Vector) -> None:
 class Around(NamedTuple):
     """The springs around each owned node, a column of the arrays for each.
 
-    neighbour  : (w, owned) int32, local number of the node at the far end, -1 past the last
-    kind       : (w, owned) u1, which of the lengths
-    stiffness  : (w, owned) [N/m]
-    lengths    : (k,) rest lengths [m]
-    stiffening : b of their law [-]
+    neighbour : (w, owned) int32, local number of the node at the far end, -1 past the last
+    kind      : (w, owned) u1, which of the lengths
+    stiffness : (w, owned) [N/m]
+    lengths   : (k,) rest lengths [m]
     """
 
     neighbour: Indices
     kind: Array
     stiffness: Floats
     lengths: Floats
-    stiffening: float
 
 
 class AroundAt(NamedTuple):
@@ -327,7 +306,7 @@ class SpringGather(OwnedSprings):
         kinds = np.append(np.tile(kind, 2), 0).astype(np.uint8)[rows]
         stiffness = np.append(np.tile(to_host(lattice.stiffness), 2), 0.0)[rows]
         sent = partial(like, lattice.nodes)
-        around = Around(sent(neighbour), sent(kinds), sent(stiffness), sent(lengths), lattice.stiffening)
+        around = Around(sent(neighbour), sent(kinds), sent(stiffness), sent(lengths))
         return cls(Springs.of_lattice(lattice, lattice.springs_owned), around)
 
     def _sum_around(self, loop: Callable[..., None], rows: Array, q: Positions) -> None:
@@ -365,7 +344,7 @@ def rows_of(nodes: Indices, owned: int) -> Indices:
 
 @kernel
 def _gradient_around(first: int, count: int, step: int, gradient: Rows, springs: AroundAt) -> None:
-    (neighbour, kind, stiffness, lengths, stiffening), q, _ = springs
+    (neighbour, kind, stiffness, lengths), q, _ = springs
     for i in range(first, count, step):
         gx, gy, gz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):
@@ -373,7 +352,7 @@ def _gradient_around(first: int, count: int, step: int, gradient: Rows, springs:
             if j < 0:
                 break
             e = between(q, j, i)
-            f = spring_pull(e, lengths[kind[s, i]], stiffness[s, i], stiffening)
+            f = spring_pull(e, lengths[kind[s, i]], stiffness[s, i])
             gx += f * e[0]
             gy += f * e[1]
             gz += f * e[2]
@@ -384,20 +363,20 @@ def _gradient_around(first: int, count: int, step: int, gradient: Rows, springs:
 
 @kernel
 def _concavity_around(first: int, count: int, step: int, concavity: Floats, springs: AroundAt) -> None:
-    (neighbour, kind, stiffness, lengths, stiffening), q, _ = springs
+    (neighbour, kind, stiffness, lengths), q, _ = springs
     for i in range(first, count, step):
         total = 0.0
         for s in range(neighbour.shape[0]):
             j = neighbour[s, i]
             if j < 0:
                 break
-            total -= 2.0 * min(spring_pull(between(q, j, i), lengths[kind[s, i]], stiffness[s, i], stiffening), 0.0)
+            total -= 2.0 * min(spring_pull(between(q, j, i), lengths[kind[s, i]], stiffness[s, i]), 0.0)
         concavity[i] += total
 
 
 @kernel
 def _product_around(first: int, count: int, step: int, product: Rows, springs: AroundAt, v: Rows) -> None:
-    (neighbour, kind, stiffness, lengths, stiffening), q, projected = springs
+    (neighbour, kind, stiffness, lengths), q, projected = springs
     for i in range(first, count, step):
         px, py, pz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):
@@ -405,7 +384,7 @@ def _product_around(first: int, count: int, step: int, product: Rows, springs: A
             if j < 0:
                 break
             length, k = lengths[kind[s, i]], stiffness[s, i]
-            c, ex, ey, ez = spring_block(between(q, j, i), length, k, stiffening, projected)
+            c, ex, ey, ez = spring_block(between(q, j, i), length, k, projected)
             f = block_product(c, (ex, ey, ez), between(v, j, i))
             px += f[0]
             py += f[1]
@@ -417,12 +396,12 @@ def _product_around(first: int, count: int, step: int, product: Rows, springs: A
 
 @kernel
 def _diagonal_around(first: int, count: int, step: int, blocks: Rows, springs: AroundAt) -> None:
-    (neighbour, kind, stiffness, lengths, stiffening), q, _ = springs
+    (neighbour, kind, stiffness, lengths), q, _ = springs
     for i in range(first, count, step):
         for s in range(neighbour.shape[0]):
             j = neighbour[s, i]
             if j < 0:
                 break
             length, k = lengths[kind[s, i]], stiffness[s, i]
-            c, ex, ey, ez = spring_block(between(q, j, i), length, k, stiffening, True)
+            c, ex, ey, ez = spring_block(between(q, j, i), length, k, True)
             add_block(blocks[i], c, 1.0, (ex, ey, ez))

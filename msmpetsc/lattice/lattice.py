@@ -62,9 +62,8 @@ class Lattice:
     rest_length : (s,) distance of their ends at rest [m]
     stiffness   : (s,) [N/m]; with ``solid`` of springs of no rest length, whose L is no less than the Hessian at rest
     pinned      : (l,) bool, nodes that do not move
-    stiffening  : of the springs' law (elasticity.springs) [-]; 0 for Hooke's
     local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
-                  first ``cells_owned``; then, only where the law is of cells too, of all others around the owned nodes
+                  first ``cells_owned``; then, only of a solid, of all others around the owned nodes
     cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
     cell_share  : (c,) of each of ``cells`` that lies inside the surface, and so counts [-]
     first_of_body : (b,) global number of the first node of each body; a body's nodes follow each other
@@ -84,7 +83,6 @@ class Lattice:
     rest_length: Floats
     stiffness: Floats
     pinned: Mask
-    stiffening: float = 0.0
     local_cells: Indices = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
     cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
@@ -132,9 +130,8 @@ def build_lattice(
     """
     h, net = cages.grids.cell_size, topology or topology_of(cages)
     is_solid = material.poisson is not None
-    stiffening = material.stiffening * (material.law == "stiffening")  # b, 0 for Hooke's law
     first_owned = net.cells[:, 0] < len(net.octants)
-    others = ~first_owned & (stiffening > 0 or is_solid)  # matter where the law is of cells too
+    others = ~first_owned & is_solid
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])
     law = (_of_solid if is_solid else _of_springs)(net, h, material, of_cells)
     grids = cages.grids
@@ -153,7 +150,6 @@ def build_lattice(
         rest_length=h * np.sqrt(KIND[net.direction]),
         stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
         pinned=np.zeros(len(net.ijk), bool),
-        stiffening=stiffening,
         local_cells=net.cells[kept],
         cells_owned=int(first_owned.sum()),
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],

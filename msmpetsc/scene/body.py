@@ -99,13 +99,11 @@ class Material(Table):
     young_modulus: Positive | None = Field(None, description="Young's modulus [Pa]")
     stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
     density: Positive = Field(description="mass density [kg/m^3]")
-    law: Literal["neo-hookean", "linear", "stiffening"] = Field(
+    law: Literal["neo-hookean", "linear"] = Field(
         "linear",
-        description="neo-hookean: a solid; linear, stiffening: how springs pull, whose Poisson's ratio is 1/4",
+        description="neo-hookean: a solid; linear: springs, whose Poisson's ratio is 1/4",
     )
     poisson_ratio: PoissonRatio = Field(0.25, description='of law = "neo-hookean"; tissue has 0.45 to 0.49 [-]')
-    stiffening: Positive = Field(10.0, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s [-]')
-
     damping: NotNegative = Field(
         0.0, description="of velocities, by the mass: what nothing else moves slows down as exp(-damping t) [1/s]"
     )
@@ -113,7 +111,6 @@ class Material(Table):
         0.0, description='of law = "neo-hookean": its viscosity over its stiffness, as of Kelvin and Voigt\'s solid [s]'
     )
 
-    _has_a_use = field_validator("stiffening")(only_for("law", "stiffening"))
     _is_of_solids = field_validator("poisson_ratio", "retardation_time")(only_for("law", "neo-hookean"))
 
     @model_validator(mode="after")

@@ -121,7 +121,7 @@ class Monitors:
         self.now, worst = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
             remedy = "a smaller time.step or a smaller solver.error helps to keep them as they were"
-            if not self.lattice.stiffening > 0 and self.lattice.solid is None:
+            if self.lattice.solid is None:
                 remedy = 'springs cannot turn them back, material.law = "neo-hookean" can'
             are = "s are" if self.now > 1 else " is"
             self._warn(index, time, f"{self.now} cell{are} inside out, the worst {worst}; {remedy}")

@@ -2,12 +2,11 @@
 
 Each spring lies within one coarse cell of 2 x 2 x 2 cells. With w_a the weights (8,) of a cell's corners at the end a,
 zero where that is held, a spring of block B adds (w_a - w_b)(w_a - w_b)^T (x) t^2 B to the matrix (24 x 24) of its
-cell; a node of mass m with the block C of contact adds w w^T (x) (m I + t^2 C); the corner of a cell that resists
-being turned inside out, t^2 times its curvature times G G^T, G the slopes of its volume at the cell's corners; and a
-cell of a solid its Hessian, whose strains are taken of the coarse cell's corners (elasticity.neo_hookean).
+cell; a node of mass m with the block C of contact adds w w^T (x) (m I + t^2 C); and a cell of a solid adds its Hessian,
+whose strains are taken of the coarse cell's corners (elasticity.neo_hookean).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from petsc4py import PETSc
@@ -17,7 +16,6 @@ from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import form_of, modes_forces, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
-from msmpetsc.elasticity.cell_volume import FRAMES, Resistance, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
 from msmpetsc.elasticity.solid import CellHessians
@@ -164,7 +162,7 @@ class GalerkinSum:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes
         [N/m] (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
-        solid, viscosity, cells = self.elasticity.solid, self.elasticity.viscosity, self.elasticity.cells
+        solid, viscosity = self.elasticity.solid, self.elasticity.viscosity
         if self.elasticity.springs:
             of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
             add_springs(count, q, of_springs, self.elasticity.springs.owned)
@@ -178,8 +176,6 @@ class GalerkinSum:
         hessians: list[CellHessians] = [solid.hessian_at(q, True)] if solid else []
         for hessian in hessians + ([viscosity.hessian] if viscosity else []):
             add_solid(count, scratch, into, one_by_one(hessian.blocks, hessian.state))
-        if cells:
-            add_resistance(count, q, into, cells.law)
         values = into.values
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 
@@ -219,13 +215,13 @@ def _by_cell(
 @kernel
 def add_springs(first: int, count: int, step: int, q: Positions, into: PairSum, springs: Springs) -> None:
     values, places, (start, order, code), (begin, pair, factor) = into
-    ends, rest, k, b = springs
+    ends, rest, k = springs
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
             s, kind = order[at], 28 * code[at, 0] + code[at, 1]
             m, n = ends[s, 0], ends[s, 1]
             x, y, z = q[m, 0] - q[n, 0], q[m, 1] - q[n, 1], q[m, 2] - q[n, 2]
-            c, ex, ey, ez = spring_block((x, y, z), rest[s], k[s], b, True)
+            c, ex, ey, ez = spring_block((x, y, z), rest[s], k[s], True)
             xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
             for entry in range(begin[kind], begin[kind + 1]):
                 f, place = factor[entry], places[i, pair[entry]]
@@ -306,46 +302,3 @@ def _add_block(block: Floats, own: float, state: Floats, s: int, g: Floats, h: F
     block[6] -= b
     block[3] += c
     block[1] -= c
-
-
-@kernel
-def add_resistance(first: int, count: int, step: int, q: Positions, into: CellSum, law: Resistance) -> None:
-    """Add t^2 times what resists being turned inside out."""
-    values, places, by_cell, weights = into
-    for i in range(first, count, step):
-        for at in range(by_cell.start[i], by_cell.start[i + 1]):
-            cell, code = by_cell.order[at], by_cell.code[at]
-            for frame in range(8):
-                e = edges(q, law.cells[cell], frame)
-                n = cofactors(e)
-                curvature = corner_curvature(e, n[0], law.stiffness[cell], law.volume)
-                if curvature > 0.0:
-                    f = FRAMES[frame]
-                    ends = code[f[0]], code[f[1]], code[f[2]], code[f[3]]
-                    _add_corner(values, places[i], weights, ends, curvature, n)
-
-
-@njit()
-def _add_corner(values: Rows, places: Indices, weights: Rows, ends: Any, curvature: float, n: Any) -> None:
-    """Add curvature G G^T to the blocks of a coarse cell; ``ends`` (4) are codes of the corner and its edges' ends."""
-    pair = -1
-    for a in range(8):
-        g = _slope(ends, weights, a, n)
-        for b in range(a, 8):
-            pair += 1
-            if places[pair] >= 0:
-                h, block = _slope(ends, weights, b, n), values[places[pair]]
-                for r in range(3):
-                    for c in range(3):
-                        block[3 * r + c] += curvature * g[r] * h[c]
-
-
-@njit()
-def _slope(ends: Any, weights: Rows, a: int, n: Any) -> tuple[float, float, float]:
-    """Slope of a corner's volume as corner a of the coarse cell moves."""
-    x, y, z = 0.0, 0.0, 0.0
-    for role in range(4):
-        w = weights[ends[role], a]
-        g = vector_of(role, n)
-        x, y, z = x + w * g[0], y + w * g[1], z + w * g[2]
-    return x, y, z

@@ -1,7 +1,7 @@
 """Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
 
-F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H
-is positive definite for certain, which one pass over the springs tells.
+F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring or cell is compressed enough, H is
+positive definite for certain, which one pass over them tells.
 Elsewhere the load factor nu may say so, the greatest with H v = (1 - nu) H+ v, H+ the projected Hessian, which has
 nothing negative and all of M: no eigenvalue of M^(-1) H is below 1 - nu. It is 1 where a body buckles, and grows as
 what presses the body does (linear buckling analysis), so that one that was found serves for many steps. Where it is not
@@ -71,20 +71,19 @@ NEGLIGIBLE = 0.3  # of the greatest compression: nodes of less do not say how it
 
 @dataclass(frozen=True)
 class Compression:
-    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
+    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m."""
 
     greatest: float
     total: float
-    resists: bool
     inertia: bool = True  # M is part of H, which outweighs what is not positive in the rest
 
     @property
     def least_curvature(self) -> float:
         """No eigenvalue of M^(-1) H is less; 0 where M does not outweigh all that is negative for certain."""
-        return max(1 - self.greatest, 0.0) if self.inertia and not self.resists else 0.0
+        return max(1 - self.greatest, 0.0) if self.inertia else 0.0
 
 
-NONE = Compression(0.0, 0.0, False)
+NONE = Compression(0.0, 0.0)
 
 
 class LowestCurvature:
@@ -129,9 +128,8 @@ class LowestCurvature:
         if functional.surface:
             concavity = concavity + functional.surface.concavity(q)[free]
         self.ratios = ratios = functional.t2 * concavity / functional.lattice.mass[free]
-        gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
-        most, sums, resist = zip(*gathered, strict=True)
-        known = Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
+        most, sums = zip(*self.comm.allgather((greatest(ratios), float(ratios.sum()))), strict=True)
+        known = Compression(max(most), sum(sums), not self.unknowns.static)
         self.known = problem, q, known
         return known
 
@@ -146,7 +144,7 @@ class LowestCurvature:
         hint    : a direction that may have part in it
         """
         products = self.hessian.products + self.preconditioner.products
-        is_known = not (alarm or compression.resists or self.unknowns.static)
+        is_known = not (alarm or self.unknowns.static)
         least = 1 - self._load(q) if is_known else 0.0
         found = None if least >= 1 - LIGHT else self._lowest(q, compression, alarm, hint)
         self.products += self.hessian.products + self.preconditioner.products - products
@@ -172,7 +170,7 @@ class LowestCurvature:
         """The lowest curvatures (k,) and their modes (k, n), followed or searched for at length."""
         found, before = None, self.searched
         more = compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
-        if not (alarm or compression.resists or more):  # in which case modes may have come
+        if not (alarm or more):  # in which case modes may have come
             found = self._followed()
         if found is None:
             self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too

@@ -78,11 +78,11 @@ class TrueErrors:
 
 def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
     """Return |x - x*|_M and g(x) - g*."""
-    reference.unknowns.from_nodes(x - exact, reference.x)
-    distance = reference.functional.norm(reference.x)
-    reference.unknowns.from_nodes(x, reference.x)
-    q = reference.functional.positions(reference.x)
-    return np.array([distance, reference.functional.change(q, exact)[0]])
+    functional, vector = reference.functional, reference.unknowns.create_vector()
+    reference.unknowns.from_nodes(x - exact, vector)
+    distance = functional.norm(vector)
+    vector.destroy()
+    return np.array([distance, functional.change(functional.at(x).q, exact)[0]])
 
 
 def event_times() -> dict[str, float]:

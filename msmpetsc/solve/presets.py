@@ -54,12 +54,7 @@ LATTICE_MULTIGRID = {  # the cycle of -pc_type mg
     "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",  # PETSc's is absolute, and a light body's pivots are small
 }
 NEWTON = {
-    "snes_type": "newtonls",
-    "snes_linesearch_type": "bt",
-    "snes_linesearch_minlambda": "1e-6",  # of a way that climbs a smaller share may seem to fall, by rounding
     "snes_max_it": MANY,
-    **NO_STOP_BY_SIZE,
-    "snes_max_linear_solve_fail": MANY,  # of an indefinite Hessian: CG's direction leads down all the same
     **JACOBI_CG,
     "ksp_rtol": "3e-2",
     **LATTICE_MULTIGRID,

@@ -127,8 +127,7 @@ class LoadPath:
             if self.holding is None:
                 stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
                 functional.begin(replace(whole, y=self.base, prescribed=None))
-                stepper.unknowns.from_nodes(self.base, stepper.x)
-                f = functional.evaluate(stepper.x, stepper.work).f
+                f = functional.at(self.base).f
                 self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
                 self.holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
             load = load + (1 - share) * self.holding

@@ -15,7 +15,7 @@ on the third.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import ClassVar, NamedTuple
 
@@ -26,7 +26,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.solve.linear.operators import TrueHessian
-from msmpetsc.solve.nonlinear.functional import StepFunctional, StepProblem
+from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 MOST = 100  # iterations of a long search
@@ -70,12 +70,23 @@ NEGLIGIBLE = 0.3  # of the greatest compression: nodes of less do not say how it
 
 
 @dataclass(frozen=True)
-class Compression:
-    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m."""
+class Compressed:
+    """The greatest and the sum, over the free nodes of all ranks, of t^2 concavity / m."""
 
-    greatest: float
-    total: float
-    inertia: bool = True  # M is part of H, which outweighs what is not positive in the rest
+    greatest: float = 0.0
+    total: float = 0.0
+
+
+@dataclass(frozen=True)
+class Compression(Compressed):
+    """Compression of a body at some positions.
+
+    inertia : M is part of H, which outweighs what is not positive in the rest
+    ratios  : t^2 concavity / m (m,) of this rank's free nodes
+    """
+
+    inertia: bool = True
+    ratios: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def least_curvature(self) -> float:
@@ -83,7 +94,7 @@ class Compression:
         return max(1 - self.greatest, 0.0) if self.inertia else 0.0
 
 
-NONE = Compression(0.0, 0.0)
+NONE = Compression()
 
 
 class LowestCurvature:
@@ -99,15 +110,13 @@ class LowestCurvature:
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far
         self.products = 0  # of them with H, and at multigrid's finest level
-        self.known: tuple[StepProblem | None, Positions, Compression] = (None, np.empty(0), NONE)  # the last asked for
-        self.searched = NONE  # the compression that the last long search was at
+        self.searched = Compressed()  # the compression that the last long search was at
         self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
         self.value = 0.0  # its curvature when it was found
         self.knows_mode = False  # in the last checkpoint
         self.load = np.inf  # load factor found last; infinite where none was
         self.loads = np.zeros_like(functional.lattice.mass[self.unknowns.free])  # compression (m,) that it was found at
         self.load_mode: Floats | None = None  # and its mode (n,)
-        self.ratios = np.empty(0)  # compression (m,) of the free nodes, at the positions asked for last
         self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         self.rigid: Rows | None = None  # motions (6, n) that are left out
 
@@ -118,20 +127,14 @@ class LowestCurvature:
 
     def compression(self, q: Positions) -> Compression:
         """Compression at positions q (l, 3) [m] in the functional's problem."""
-        problem, (known_problem, at, known) = self.functional.problem, self.known
-        same = known_problem is problem and bool(np.array_equal(at, q))
-        if self.comm.allreduce(same, MPI.LAND):
-            return known
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
         concavity = elasticity.concavity(q)[free]
         if functional.surface:
             concavity = concavity + functional.surface.concavity(q)[free]
-        self.ratios = ratios = functional.t2 * concavity / functional.lattice.mass[free]
+        ratios = functional.t2 * concavity / functional.lattice.mass[free]
         most, sums = zip(*self.comm.allgather((greatest(ratios), float(ratios.sum()))), strict=True)
-        known = Compression(max(most), sum(sums), not self.unknowns.static)
-        self.known = problem, q, known
-        return known
+        return Compression(max(most), sum(sums), not self.unknowns.static, ratios)
 
     def lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
@@ -145,11 +148,11 @@ class LowestCurvature:
         """
         products = self.hessian.products + self.preconditioner.products
         is_known = not (alarm or self.unknowns.static)
-        least = 1 - self._load(q) if is_known else 0.0
+        least = 1 - self._load(q, compression.ratios) if is_known else 0.0
         found = None if least >= 1 - LIGHT else self._lowest(q, compression, alarm, hint)
         self.products += self.hessian.products + self.preconditioner.products - products
         if found is None:
-            self.searched = NONE  # so that a body that is loaded more has a long search
+            self.searched = Compressed()  # so that a body that is loaded more has a long search
             return least, None
         values, modes = found
         if not np.isfinite(values[0]):  # springs of no length: from a cusp any way leads down
@@ -173,22 +176,23 @@ class LowestCurvature:
         if not (alarm or more):  # in which case modes may have come
             found = self._followed()
         if found is None:
-            self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too
+            # What was doubtful is so in the next step, too
+            self.searched = Compressed() if alarm else Compressed(compression.greatest, compression.total)
             with self.preconditioner.searching(q, self.functional.problem.contact):
                 found = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
         return found
 
-    def _load(self, q: Positions) -> float:
+    def _load(self, q: Positions, ratios: Floats) -> float:
         """The load factor at positions q (l, 3) [m], at the most: as far as the body is loaded as it was when that was
         found, it grows as the compression does."""
         floor = NEGLIGIBLE * max(self.comm.allreduce(greatest(self.loads), MPI.MAX), DEPENDENT)
-        growth = self.comm.allreduce(greatest(self.ratios / np.maximum(self.loads, floor)), MPI.MAX)
+        growth = self.comm.allreduce(greatest(ratios / np.maximum(self.loads, floor)), MPI.MAX)
         load: float = UNSEEN * self.load * growth
         is_heavy = MORE * UNSEEN * self.load > LIGHT  # so nearly that a search would soon be due again
         if not np.isfinite(load) or (not is_heavy and (growth > GROWN or load > LIGHT)):
             with self.preconditioner.searching(q, self.functional.problem.contact):
                 self.load = self._load_factor(q) if self.preconditioner.is_uniform else np.inf
-            self.loads, load = self.ratios, UNSEEN * self.load
+            self.loads, load = ratios, UNSEEN * self.load
         return load
 
     def _load_factor(self, q: Positions) -> float:
@@ -343,7 +347,7 @@ class LowestCurvature:
         """Forget what a checkpoint does not hold; ``modes``: all else, too."""
         self.load_mode = None
         if modes:
-            self.searched, self.mode, self.load = NONE, None, np.inf
+            self.searched, self.mode, self.load = Compressed(), None, np.inf
 
     def destroy(self) -> None:
         for vector in self.vectors:

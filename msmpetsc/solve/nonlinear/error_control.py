@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.linear.cg_bound import SolveBound
-from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_estimate import FEW, LOWER, ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
@@ -68,6 +68,7 @@ class Outcome:
     alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
     at_rounding: bool = False  # F is nothing but rounding
     doubts: int = 0
+    compression: Compression | None = None  # of the last iterate, where it was asked for
 
     def known(self, lowest: float) -> float:
         """The relative error by what the linear solve left and what F is beside that, where M^(-1) H has no eigenvalue
@@ -75,6 +76,11 @@ class Outcome:
         if not min(lowest, self.distance) > 0:
             return np.inf
         return float((self.solved / np.sqrt(lowest) + self.beside / lowest) / self.distance)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether g is so near its minimum that changes of it have no digits."""
+        return self.bound < FULL_STEP_ERROR and (self.corrected or not self.doubts)
 
     @property
     def is_enough(self) -> bool:
@@ -104,7 +110,7 @@ class ErrorControl:
         at_rounding = self.rounding.is_all_of(iterate, self.functional.problem.contact if stays else None)
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm)
-        now = replace(now, corrected=False, beside=np.inf)
+        now = replace(now, corrected=False, beside=np.inf, compression=None)
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
             return replace(now, error=0.0 if at_rounding else np.inf)
         now = replace(now, bound=residual / distance)
@@ -121,7 +127,9 @@ class ErrorControl:
         if not seems_near and not at_rounding:
             return replace(now, error=now.bound)
         if now.bound <= now.goal:
-            lowest = self.curvature.compression(iterate.q).least_curvature
+            now = self.with_compression(iterate, now)
+            assert now.compression is not None
+            lowest = now.compression.least_curvature
             if lowest > 0 and now.bound <= now.goal * lowest:
                 return replace(now, error=now.bound / lowest)
         found = self.estimated(iterate, now, now.goal)
@@ -142,11 +150,16 @@ class ErrorControl:
         beside = self.functional.dual_norm(self.estimate.residual)
         if beside > PARABOLA * now.residual:
             return replace(now, error=np.inf)
-        now = replace(now, beside=beside)
-        error = now.known(self.curvature.compression(iterate.q).least_curvature or self.estimate.convexity)
+        now = self.with_compression(iterate, replace(now, beside=beside))
+        assert now.compression is not None
+        error = now.known(now.compression.least_curvature or self.estimate.convexity)
         if error > 0:
             self.ratio = max(now.bound / error, 1.0)
         return replace(now, error=error)
+
+    def with_compression(self, iterate: Iterate, now: Outcome) -> Outcome:
+        """Return what is known at an iterate, with its compression."""
+        return now if now.compression else replace(now, compression=self.curvature.compression(iterate.q))
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""

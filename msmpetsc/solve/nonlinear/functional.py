@@ -51,8 +51,14 @@ class StepProblem:
 
 @dataclass(frozen=True)
 class Iterate:
-    """Point of a solver: its positions q (l, 3) [m], ghosts included, and F there [kg m]."""
+    """A position of the step, with the residual there.
 
+    x : unknowns; no method writes to them
+    q : positions (l, 3) [m], ghosts included
+    f : F [kg m]
+    """
+
+    x: PETSc.Vec
     q: Positions
     f: PETSc.Vec
 
@@ -87,11 +93,12 @@ class StepFunctional:
         self.unknowns.to_nodes(x, q)
         return q
 
-    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec) -> Iterate:
-        """Positions of x, and F there, written into f [kg m]."""
+    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec | None = None, q: Positions | None = None) -> Iterate:
+        """Return the iterate of x; its F is written into f [kg m], or a new vector, and q (l, 3) are its positions."""
         problem, gradient, owned = self.problem, self._gradient, self.lattice.owned
+        f = x.duplicate() if f is None else f
         with GRADIENT:
-            q = self.positions(x)
+            q = self.positions(x) if q is None else q
             gradient[:] = 0
             self.elasticity.add_gradient(q, gradient)
             gradient[:owned] -= problem.load
@@ -99,7 +106,13 @@ class StepFunctional:
                 with CONTACT:
                     problem.contact.add_gradient(q, gradient)
             self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
-        return Iterate(q, f)
+        return Iterate(x, q, f)
+
+    def at(self, q: Positions) -> Iterate:
+        """Return the iterate whose free nodes are at q (l, 3) [m]."""
+        x = self.unknowns.create_vector()
+        self.unknowns.from_nodes(q, x)
+        return self.evaluate(x)
 
     def value(self, q: Positions, met: bool = False) -> float:
         """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart.

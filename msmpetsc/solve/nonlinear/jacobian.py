@@ -107,25 +107,24 @@ class FrictionDuals:
     """Forces of friction, which Newton's method has as unknowns beside positions (contact.obstacles.friction), in the
     step in progress.
 
-    contact    : of the step; None where there is none
-    duals      : of the next Hessian; None where there is no contact. Nodes begin with their secants
-    is_awaited : a full step comes next, from where the Hessian was taken
+    contact : of the step; None where there is none
+    duals   : of the next Hessian; None where there is no contact. Nodes begin with their secants
     """
 
     def __init__(self) -> None:
         self.contact: Contact | None = None
         self.duals: Duals | None = None
-        self.is_awaited = False
 
     def begin(self, contact: Contact | None) -> None:
         """Begin a step."""
-        self.contact, self.is_awaited = contact, False
+        self.contact = contact
         self.duals = contact.no_duals() if contact else None
 
-    def see(self, q: Positions, base: Positions) -> None:
+    def see(self, q: Positions, base: Positions, is_full: bool) -> None:
         """Look at the full step from base to q (l, 3) [m], or at a part of it: then the full one went too far."""
-        if self.contact and self.duals and self.is_awaited:
+        if self.contact is None or self.duals is None:
+            return
+        if is_full:
             self.duals = self.contact.duals_after(q, base, self.duals)
-        elif self.duals:
+        else:
             self.duals = [None if known is None else np.zeros_like(known) for known in self.duals]
-        self.is_awaited = False

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, greatest
-from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import KNOWN, Outcome
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
@@ -27,134 +27,128 @@ FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled while g falls, or 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a point x."""
+    """Verdict on an iterate."""
 
-    error: float  # relative, of x; infinite where no estimate can be had
+    error: float  # relative, of the iterate; infinite where no estimate can be had
+    nearer: Iterate  # the point that was looked at
     direction: Floats | None = None  # (n,) of negative curvature; None where there is none
     curvature: float = 1.0  # of it, an eigenvalue of M^(-1) H
     is_minimum: bool = False  # that will do
 
 
 class Minimum:
-    """Examines the points that a stepper comes to. All methods are collective."""
+    """Examines the iterates that a stepper comes to. All methods are collective."""
 
     def __init__(
         self, functional: StepFunctional, estimate: ErrorEstimate, curvature: LowestCurvature, rounding: Rounding
     ):
         self.functional, self.estimate, self.curvature, self.rounding = functional, estimate, curvature, rounding
-        self.unknowns, self.memory = functional.unknowns, functional.memory
-        self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
+        self.memory = functional.memory
 
-    def examine(self, x: PETSc.Vec, outcome: Outcome, compression: Compression, enough: float) -> Verdict:
-        """Examine x, or rather the point that is x less its estimated error.
+    def examine(self, at: Iterate, outcome: Outcome, enough: float) -> Verdict:
+        """Examine an iterate, or rather the point that is the iterate less its estimated error.
 
-        outcome : what is known at x; whether estimate.correction is of x
+        outcome : what is known there, its compression, too; whether estimate.correction is of it
         enough  : the length of an error that will do, |e|_M
         """
-        functional, estimate = self.functional, self.estimate
-        corrected, alarm = self._approach(x, outcome.corrected), outcome.alarm
-        nearer = functional.evaluate(self.nearer, self.f)
+        functional, estimate, compression = self.functional, self.estimate, outcome.compression
+        assert compression is not None
+        nearer = self._follow(at) if outcome.corrected else None
+        corrected, first = nearer is not None, estimate.correction.copy()
+        if nearer is None:
+            nearer = at
+            first.set(0.0)
         estimate.linearise(nearer.q)
-        estimate.residual.aypx(-1.0, self.f)
-        bent = functional.dual_norm(estimate.residual)  # what H at x did not know
-        hint = estimate.correction if alarm else None
+        estimate.residual.aypx(-1.0, nearer.f)
+        # What H at the iterate did not know
+        bent = functional.dual_norm(estimate.residual)
+        hint = estimate.correction if outcome.alarm else None
         value, direction = compression.least_curvature, None
         if value <= CONVEX:
-            value, direction = self.curvature.lowest(nearer.q, compression, alarm, hint)
+            value, direction = self.curvature.lowest(nearer.q, compression, outcome.alarm, hint)
         if value < 0:
-            return Verdict(np.inf, direction, value)
+            return Verdict(np.inf, nearer, direction, value)
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
         known = outcome.known(value)
         if value > CONVEX and np.isfinite(known) and known * outcome.distance <= enough:
-            return Verdict(known)
-        first, rest = functional.norm(self.first), functional.dual_norm(self.f) / value
-        if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
-            return Verdict(self.rounding.relative(first + rest, functional.distance(nearer.q)))
+            return Verdict(known, nearer)
+        length, rest = functional.norm(first), functional.dual_norm(nearer.f) / value
+        # A bound, if g is as convex from there on
+        if value > CONVEX and length + rest <= KNOWN * enough:
+            return Verdict(self.rounding.relative(length + rest, functional.distance(nearer.q)), nearer)
         if corrected and estimate.missing is not None and value <= CONVEX:
-            iterate = functional.evaluate(x, self.f)
-            closely = bool(np.isfinite(estimate(iterate, functional.dual_norm(self.f), np.inf)))
-            return self.examine(x, replace(outcome, corrected=closely), compression, enough)
+            closely = bool(np.isfinite(estimate(at, functional.dual_norm(at.f), np.inf)))
+            return self.examine(at, replace(outcome, corrected=closely), enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
-            return Verdict(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
-        return Verdict(self._second_estimate(nearer, first, rest, enough, value))
+            return Verdict(self.rounding.relative(estimate.length, functional.distance(nearer.q)), nearer)
+        return Verdict(self._second_estimate(nearer, first, rest, enough, value), nearer)
 
-    def _approach(self, x: PETSc.Vec, corrected: bool) -> bool:
-        """Make the point to look at x less its correction; whether it is, or x itself, for the surface meets itself."""
-        self.first.set(0.0)
-        if corrected and self._follow(x, self.nearer):
-            self.estimate.correction.copy(self.first)
-            return True
-        x.copy(self.nearer)
-        return False
+    def _follow(self, at: Iterate) -> Iterate | None:
+        """Return an iterate less its correction; None if the surface meets itself on the way."""
+        x = at.x.duplicate()
+        x.waxpy(-1.0, self.estimate.correction, at.x)
+        q = self.functional.positions(x)
+        if self.functional.surface is not None and self.functional.free_share(at.q, q) < 1.0:
+            return None
+        return self.functional.evaluate(x, q=q)
 
-    def _follow(self, x: PETSc.Vec, end: PETSc.Vec) -> bool:
-        """Write x less its correction into ``end``; return whether the surface meets itself nowhere on the way."""
-        x.copy(end)
-        end.axpy(-1.0, self.estimate.correction)
-        positions = self.functional.positions
-        return self.functional.surface is None or self.functional.free_share(positions(x), positions(end)) == 1.0
-
-    def _second_estimate(self, nearer: Iterate, first: float, bound: float, enough: float, lowest: float) -> float:
-        """Estimate the error of x by both corrections, of which the first has the length ``first``.
+    def _second_estimate(
+        self, nearer: Iterate, correction: PETSc.Vec, bound: float, enough: float, lowest: float
+    ) -> float:
+        """Estimate the error of the iterate by both corrections, of which the first is ``correction``.
 
         If the second leads through the surface, g is no parabola over it, and the error may be far larger.
         Where the second cannot be had, as CG breaks down on an F of little but rounding, what
         bounds it has its place if the curvature allows; else the error is infinite.
         """
-        functional, correction, relative = self.functional, self.estimate.correction, self.rounding.relative
-        distance = functional.distance(nearer.q)
+        functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
+        distance, first = functional.distance(nearer.q), functional.norm(correction)
         will_do = KNOWN * enough - first if lowest > CONVEX else 0.0
-        second = self.estimate(nearer, bound, enough, will_do, lowest)
+        second = estimate(nearer, bound, enough, will_do, lowest)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
-        if not self._follow(self.nearer, self.f):
+        if functional.surface is not None and self._follow(nearer) is None:
             return relative(first + DOUBTFUL * second, distance)
-        known = second - (self.estimate.missing or 0.0)
+        known = second - (estimate.missing or 0.0)
         if first > 0 and known > SMALL * first:
             return DOUBTFUL * relative(max(first, second), distance)
-        if self.estimate.missing is not None:
+        if estimate.missing is not None:
             return relative(first + second, distance)
-        self.first.axpy(second / max(functional.norm(correction), sys.float_info.min), correction)
-        return relative(functional.norm(self.first), functional.distance(nearer.q, correction))
+        correction.axpy(second / max(functional.norm(estimate.correction), sys.float_info.min), estimate.correction)
+        return relative(functional.norm(correction), functional.distance(nearer.q, estimate.correction))
 
-    def go_on(self, x: PETSc.Vec, verdict: Verdict) -> bool:
-        """Move x to the point examined if g is lower there; whether it has moved.
+    def go_on(self, at: Iterate, verdict: Verdict) -> Iterate | None:
+        """Return an iterate where g is lower than at one that is no minimum; None where there is none.
 
-        From there it goes on along a direction of negative curvature, as far as doubling the move lets g fall.
+        It is the point examined, or lies from there along a direction of negative curvature, as far as doubling the
+        move lets g fall.
         """
-        functional = self.functional
-        falls = functional.change(functional.positions(self.nearer), functional.positions(x))[0] < 0
-        if falls:
-            self.nearer.copy(x)
+        falls = self.functional.change(verdict.nearer.q, at.q)[0] < 0
+        lower = verdict.nearer if falls else None
         if verdict.direction is None:
-            return falls
-        return self._descend(x, verdict.direction, verdict.curvature) or falls
+            return lower
+        return self._descend(lower or at, verdict.direction, verdict.curvature) or lower
 
-    def _descend(self, x: PETSc.Vec, direction: Floats, curvature: float) -> bool:
-        """Move x along a direction (n,) of negative curvature; whether g falls that way."""
-        functional = self.functional
-        base = functional.evaluate(x, self.f).q
-        slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
+    def _descend(self, at: Iterate, direction: Floats, curvature: float) -> Iterate | None:
+        """Return an iterate along a direction (n,) of negative curvature; None if g does not fall that way."""
+        functional, base = self.functional, at.q
+        slope = functional.comm.allreduce(float(self.memory.read(at.f) @ direction))
         longest = float(functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
         if slope > SLOPE * abs(curvature) * move:  # else both ways lead down, and ranks must not differ
             move = -move
-        best = lowest = 0.0
+        best, lowest = None, 0.0
         for _ in range(MOVES):
-            self.memory.write(self.f)[:] = self.memory.read(x) + move * direction
-            q = functional.positions(self.f)
+            x = at.x.duplicate()
+            self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
+            q = functional.positions(x)
             change = functional.change(q, base)[0] if functional.free_share(base, q) == 1.0 else np.inf
             if change < lowest:
-                best, lowest = move, change
+                best, lowest = (x, q), change
                 move *= 2
-            elif best == 0.0:
+            elif best is None:
                 move /= 2
             else:
                 break
-        self.memory.write(x)[:] += best * direction
-        return best != 0.0
-
-    def destroy(self) -> None:
-        for owned in (self.nearer, self.f, self.first):
-            owned.destroy()
+        return functional.evaluate(best[0], q=best[1]) if best else None

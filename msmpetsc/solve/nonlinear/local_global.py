@@ -1,0 +1,117 @@
+"""Methods with the constant matrix A = M + t^2 L for the Jacobian: any of PETSc's SNES, whose callbacks these are.
+
+With A, Newton's method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). SNES accelerates it
+(anderson, ngmres), searches along it, or takes A for the first Hessian of L-BFGS.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from petsc4py import PETSc
+
+from msmpetsc.errors import InputError
+from msmpetsc.solve.nonlinear.error_control import Outcome
+from msmpetsc.solve.nonlinear.functional import Iterate
+from msmpetsc.solve.nonlinear.method import Method
+from msmpetsc.solve.petsc.events import LOCAL
+from msmpetsc.solve.refused_options import BY_ERROR
+
+
+@dataclass(eq=False)
+class LocalGlobal(Method):
+    """A SNES with A for its Jacobian. All methods are collective.
+
+    prefix  : of its options
+    has_npc : a plain iteration preconditions SNES
+    base    : iterate that changes of g are counted from
+    outcome : of SNES's last iterate
+    """
+
+    prefix: str
+    has_npc: bool
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.vectors = self.x, self.f = [self.functional.unknowns.create_vector() for _ in range(2)]
+        self.base: Iterate | None = None
+        self.outcome = Outcome()
+        self.snes.setFunction(self._residual, self.f)
+        self.snes.setJacobian(self._linearise, self.jacobian.operator)
+        self.snes.setObjective(self._objective)
+        if self.jacobian.touches:
+            self.snes.setLineSearchPreCheck(self._shorten)
+        self.snes.setConvergenceTest(self._converged)
+        if self.preset.start_from_b:
+            self.ksp.setInitialGuessNonzero(True)
+
+    def begin(self) -> None:
+        """Begin a step: there is nothing to forget."""
+
+    def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
+        self.base, self.outcome = start, replace(outcome, residual=np.inf)
+        if self.has_npc:
+            # It solves with A before SNES looks at its start
+            self.outcome = self.control.judge(start, self.outcome)
+            if self.outcome.is_enough:
+                return start, self.outcome
+            self.adapt(self.outcome)
+        if self.snes.getType() == PETSc.SNES.Type.QN:
+            # QN alone keeps what it has learnt; set anew it has nothing
+            self.snes.setType(PETSc.SNES.Type.KSPONLY)
+            self.snes.setType(PETSc.SNES.Type.QN)
+            self.snes.setFromOptions()
+        start.x.copy(self.x)
+        self.snes.solve(None, self.x)
+        self.iterations += self.snes.its
+        iterate = self.functional.evaluate(self.snes.getSolution().copy())
+        self.outcome = self.finish(iterate, self.outcome)
+        if not (self.outcome.is_enough or self.budget):
+            ends = f"-{self.prefix}snes_type {self.snes.getType()} ends by a rule of its own"
+            raise InputError(f"{ends}, {self.outcome.error:.2e} off: {BY_ERROR}")
+        return iterate, self.outcome
+
+    def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        with LOCAL:
+            self.functional.evaluate(x, f)
+
+    def _objective(self, _: PETSc.SNES, x: PETSc.Vec) -> float:
+        """Return g(x) - g(base), a difference that keeps its digits; -1 where it has none left, so that x is taken."""
+        assert self.base is not None
+        with LOCAL:
+            change, distance = self.functional.change(self.functional.positions(x), self.base.q)
+        return -1.0 if self.outcome.is_flat and distance > 0 else change
+
+    def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Shorten the way from x to x - y where the surface meets itself on it; return whether it was."""
+        if self.functional.surface is None:
+            return False
+        end = x.duplicate()
+        end.waxpy(-1.0, y, x)
+        with LOCAL:
+            share = self.functional.free_share(self.functional.positions(x), self.functional.positions(end))
+        if share < 1.0:
+            y.scale(share)
+        return share < 1.0
+
+    def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
+        """Take contact at x, and the start of the linear solve (SNES calls it before each)."""
+        with LOCAL:
+            self.base = Iterate(x, self.functional.positions(x), self.f)
+            self.jacobian.linearise(self.base.q, self.functional.problem.contact, False, None)
+        if self.preset.start_from_b:
+            # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
+            z = snes.getSolutionUpdate()
+            self.jacobian.operator.mult(x, z)
+            z.aypx(-1.0, x)
+            z.axpy(1.0, self.f)
+
+    def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int:
+        """Return PETSc's reason to end by the iterate's error or the budget; 0 to go on (its convergence test)."""
+        if its > 0 or not self.has_npc:
+            x = snes.getSolution()
+            iterate = self.functional.evaluate(x) if self.has_npc else Iterate(x, self.functional.positions(x), self.f)
+            self.outcome = self.control.judge(iterate, self.outcome)
+        reason = self.reason_to_end(its, self.outcome)
+        if not reason:
+            self.adapt(self.outcome)
+        return reason

@@ -1,0 +1,83 @@
+"""Minimisation of one step's g by a method: when its iterations end, and how closely it solves linear systems."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from petsc4py import PETSc
+
+from msmpetsc.comm import Stop
+from msmpetsc.errors import StepStopped
+from msmpetsc.solve.nonlinear.error_control import NOT_FINITE, ErrorControl, Outcome, not_converged, where_worst
+from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
+from msmpetsc.solve.nonlinear.jacobian import Jacobian
+from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
+from msmpetsc.solve.work import Work
+
+# Iterations of CG that the rest of an iteration of a method costs
+ITERATION = 10
+REASON = PETSc.SNES.ConvergedReason
+
+
+@dataclass(eq=False)
+class Method(ABC):
+    """A method that brings the residual F down to the goal of an outcome. All methods are collective.
+
+    snes, ksp : PETSc's, with the user's options
+    budget    : iterations after which the method ends; 0 for none
+    spent     : returns the work of the step in progress so far
+    """
+
+    functional: StepFunctional
+    jacobian: Jacobian
+    snes: PETSc.SNES
+    ksp: PETSc.KSP
+    control: ErrorControl
+    preset: Preset
+    options: SolverOptions
+    budget: int
+    spent: Callable[[], Work]
+
+    def __post_init__(self) -> None:
+        # Of all steps so far
+        self.iterations = 0
+
+    @abstractmethod
+    def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
+        """Return an iterate at the goal of an outcome, and its outcome. Raises StepFailed, StepStopped, InputError."""
+
+    def reason_to_end(self, its: int, outcome: Outcome) -> int:
+        """Return PETSc's reason why a method ends after so many iterations; 0 if it goes on."""
+        if not np.isfinite(outcome.residual):
+            return NOT_FINITE
+        if outcome.at_rounding:
+            return int(REASON.CONVERGED_FNORM_ABS)
+        if outcome.is_enough:
+            return int(REASON.CONVERGED_SNORM_RELATIVE if outcome.corrected else REASON.CONVERGED_FNORM_RELATIVE)
+        if self.budget and its >= self.budget:
+            return int(REASON.CONVERGED_ITS)
+        if Stop.agreed(self.functional.comm):
+            return int(REASON.DIVERGED_INNER)
+        spent = self.spent()
+        if spent.ksp_its + ITERATION * (spent.iterations + its) > MOST_ITERATIONS:
+            return int(REASON.DIVERGED_MAX_IT)
+        return int(REASON.ITERATING)
+
+    def adapt(self, outcome: Outcome) -> None:
+        """Let the next linear solve leave as much as the step can do with; the user's own tolerances win."""
+        if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
+            rtol, atol = self.control.tolerances(outcome)
+            self.ksp.setTolerances(rtol=rtol, atol=None if self.options.is_given("ksp_atol") else atol)
+
+    def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
+        """Return the outcome of a method that has ended by SNES's reason. Raises StepStopped and StepFailed."""
+        reason = self.snes.reason
+        if reason == REASON.CONVERGED_ITS and not (outcome.corrected or outcome.is_enough):
+            return self.control.estimated(iterate, outcome, 0.0)
+        if reason < 0:
+            if Stop.agreed(self.functional.comm):
+                raise StepStopped("stopped by a signal")
+            worst = where_worst(self.functional, iterate)
+            raise not_converged(self.snes, self.ksp, outcome, self.iterations, worst, self.preset.true_hessian)
+        return outcome

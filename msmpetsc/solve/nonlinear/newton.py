@@ -1,0 +1,195 @@
+"""Newton's method for one step, with the true Hessian H of g, CG, and a line search that asks for g:
+
+    H(x_k) y = F(x_k)                by CG, to the digits that the step still misses
+    y <- the part of y on which the surface meets nothing
+    x_(k+1) = x_k - s y              g(x_(k+1)) <= g(x_k) - ALPHA s y . F(x_k)     (Armijo)
+
+until the error of x_k is below the goal (error_control). Under compression H may be indefinite: CG then stops with the
+descent that it has. If CG's first direction has a negative curvature, s y climbs for each s; then H without its
+negative parts takes over for some iterations.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import Array, Positions
+from msmpetsc.solve.nonlinear.curvature import Alarm
+from msmpetsc.solve.nonlinear.error_control import Outcome
+from msmpetsc.solve.nonlinear.functional import Iterate
+from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
+from msmpetsc.solve.nonlinear.method import REASON, Method
+from msmpetsc.solve.petsc.events import LOCAL
+
+# Iterations with the projected Hessian, which comes in slowly, before the true one has another try
+PROJECTED = 5
+# Rise of |F| in the first iteration of a static state beyond which softer solids lead on
+SOFTER = 9.0
+# Armijo's share of the slope that a step must fall by
+ALPHA = 1e-4
+# Least and greatest share of a length that the line search tries next
+LEAST, MOST = 0.1, 0.5
+# Shortest share of a direction: of a way that climbs a smaller one may seem to fall, by rounding
+SHORTEST = 1e-6
+# Rise of |F| after a full step that no energy was asked for: friction and contact have kinks that g has no digits for
+RAISED = 2.0
+KSP = PETSc.KSP.ConvergedReason
+# Of KSP: no direction at all
+USELESS = (KSP.DIVERGED_NANORINF, KSP.DIVERGED_PCSETUP_FAILED, KSP.DIVERGED_BREAKDOWN, KSP.DIVERGED_NULL)
+
+
+@dataclass(eq=False)
+class Newton(Method):
+    """Newton's method, as the ``solve`` of a SNES of PETSc's type python. All methods are collective."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.vectors = self.y, self.end = [self.functional.unknowns.create_vector() for _ in range(2)]
+        self.friction = FrictionDuals()
+        self.most_its = self.ksp.getTolerances()[3]
+        # V U' of a softer solid's cells, for the first Hessian of the next solve
+        self.slopes: Array | None = None
+        # Whether the first iteration may end the solve, if |F| rises by SOFTER; and whether it did
+        self.watches = self.overshot = False
+        self._given: tuple[Iterate, Outcome] | None = None
+
+    def begin(self) -> None:
+        """Begin the step that the functional has begun."""
+        self.friction.begin(self.functional.problem.contact)
+        self.slopes = None
+
+    def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
+        self._given = start, outcome
+        self.snes.solve(None, self.end)
+        iterate, outcome = self._given
+        return iterate, outcome if self.overshot else self.finish(iterate, outcome)
+
+    def solve(self, snes: PETSc.SNES, _: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Run the loop of the method; PETSc calls it in SNESSolve."""
+        assert self._given is not None
+        now, outcome = self._given
+        outcome, first = self.control.judge(now, replace(outcome, residual=np.inf)), np.inf
+        projected, asks, its, most = self.preset.projected, False, 0, snes.getTolerances()[3]
+        while True:
+            snes.setIterationNumber(its)
+            snes.monitor(its, now.f.norm())
+            reason = self.reason_to_end(its, outcome)
+            self.overshot = self.watches and its == 1 and outcome.residual > SOFTER * first
+            if reason or self.overshot:
+                break
+            if its == most:
+                reason = REASON.DIVERGED_MAX_IT
+                break
+            self._linearise(now, outcome, projected > 0)
+            self._solve(now, outcome, projected > 0)
+            if self.ksp.reason in USELESS:
+                reason = REASON.DIVERGED_LINEAR_SOLVE
+                break
+            outcome = self._after_solve(outcome, self._limit(now) or projected > 0)
+            flat = not asks and outcome.is_flat
+            found = self._search(now, flat)
+            if found is None and projected:
+                reason = REASON.DIVERGED_LINE_SEARCH
+                break
+            if found is None:
+                projected = PROJECTED
+                continue
+            before, projected, its = outcome.residual, max(projected - 1, 0), its + 1
+            first = before if its == 1 else first
+            now, outcome = found, self.control.judge(found, outcome)
+            asks |= flat and outcome.residual > RAISED * before
+        self.iterations += its
+        self._given = now, outcome
+        now.x.copy(x)
+        snes.setConvergedReason(REASON.CONVERGED_ITS if self.overshot else reason)
+
+    def _linearise(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
+        """Take H at an iterate, and let CG begin with the correction that an estimate found there, if any."""
+        known = outcome.corrected and not projected
+        with LOCAL:
+            self.jacobian.linearise(now.q, self.functional.problem.contact, projected, self.friction.duals, known)
+            if self.slopes is not None and not (known or projected):
+                self.jacobian.hessian.take_slopes(self.slopes)
+            self.slopes = None
+        if not self.options.is_given("ksp_initial_guess_nonzero"):
+            # PREONLY starts from nothing
+            known = known and self.ksp.getType() != PETSc.KSP.Type.PREONLY
+            if known:
+                self.control.estimate.correction.copy(self.y)
+            self.ksp.setInitialGuessNonzero(known)
+
+    def _solve(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
+        """Solve H y = F."""
+        self.adapt(outcome)
+        rtol = self.ksp.getTolerances()[0]
+        if not self.options.is_given("ksp_max_it"):
+            most = self.jacobian.preconditioner.most_iterations(rtol)
+            self.ksp.setTolerances(max_it=most or self.most_its)
+        self.ksp.setOperators(self.jacobian.operator)
+        self.ksp.solve(now.f, self.y)
+        self.jacobian.preconditioner.learn(self.ksp.its, rtol, self.control.solve_bound.reduction)
+
+    def _after_solve(self, outcome: Outcome, detour: bool) -> Outcome:
+        """Return what the linear solve tells of the next iterate: nothing after a ``detour``."""
+        if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
+            outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
+        if detour:
+            return replace(outcome, left=np.inf, solved=np.inf)
+        return self.control.led_by(self.ksp, outcome)
+
+    def _search(self, now: Iterate, flat: bool) -> Iterate | None:
+        """Return the first iterate x - s y of enough descent; None if g falls for no s.
+
+        flat : g is so near its minimum that its change has no digits: the full step is taken
+        """
+        slope, s = -abs(self.y.dot(now.f)), 1.0
+        while s > SHORTEST:
+            x = now.x.duplicate()
+            x.waxpy(-s, self.y, now.x)
+            with LOCAL:
+                q = self.functional.positions(x)
+                self.friction.see(q, now.q, s == 1.0)
+                change, _ = (-np.inf, 0.0) if flat else self.functional.change(q, now.q)
+                if change <= ALPHA * s * slope:
+                    return self.functional.evaluate(x, x.duplicate(), q)
+            # The minimum of the parabola through g(0), its slope and g(s)
+            best = -slope * s / (2 * (change - s * slope)) if np.isfinite(change) else LEAST
+            s *= min(max(best, LEAST), MOST)
+        return None
+
+    def _limit(self, now: Iterate) -> bool:
+        """Shorten or bend y where it enters obstacles or crosses the surface; return whether it did."""
+        if self.functional.problem.contact is None:
+            return False
+        end = now.x.duplicate()
+        end.waxpy(-1.0, self.y, now.x)
+        with LOCAL:
+            after = self.functional.positions(end)
+            stopped = self._stop_at_obstacles(now, after, end)
+            if stopped is not None:
+                self.y.waxpy(-1.0, end, now.x)
+            share = self.functional.free_share(now.q, after if stopped is None else stopped)
+        if share < 1.0:
+            self.y.scale(share)
+        return stopped is not None or share < 1.0
+
+    def _stop_at_obstacles(self, now: Iterate, after: Positions, end: PETSc.Vec) -> Positions | None:
+        """Return where nodes that come into an obstacle on a way (l, 3) end at its surface, and write it into ``end``;
+        None where g is no less there.
+
+        H at x knows nothing of obstacles that are not touched yet: nodes run deep into them, and a line search that
+        shortens the whole way for it would let them come in one by one.
+        """
+        functional, contact = self.functional, self.functional.problem.contact
+        stopped = contact.stopped(after, now.q) if contact else None
+        if not functional.comm.allreduce(stopped is not None, MPI.LOR):
+            return None
+        functional.unknowns.from_nodes(after if stopped is None else stopped, end)
+        # Nodes that are led stay where they are led to
+        free = functional.positions(end)
+        # Without self-contact, which costs most
+        if functional.value(free) >= functional.value(after):
+            return None
+        return free if functional.change(free, now.q)[0] < 0 else None

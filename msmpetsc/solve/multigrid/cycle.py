@@ -58,6 +58,7 @@ class Multigrid:
     pc     : its options have the ``prefix``
     levels : the coarse ones, the finest of them first
     coarse : products with the matrix of each of them but the last; none on a GPU, where PETSc's serve
+    sizes  : nodes and nonzeros of all levels, the finest first, which would have so many; empty before ``update``
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -72,6 +73,7 @@ class Multigrid:
             self.owned.close()
             raise
         self.coarse: list[CoarseOperator] = []  # until ``update``
+        self.sizes: list[tuple[int, int]] = []
         self.bounds = [0.0] * len(self.levels)
         self.contact = CoarseContact(unknowns, [level.interpolation for level in self.levels], time_step**2)
         self.owned.callback(self.contact.destroy)
@@ -132,6 +134,27 @@ class Multigrid:
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), LEAST * bound, bound)
         if is_new:
             self._read_options()
+            self.sizes = self._sizes()
+
+    def _sizes(self) -> list[tuple[int, int]]:
+        """Return the nodes and the nonzeros of all levels, the finest first (collective)."""
+        unknowns, lattice = self.unknowns, self.unknowns.lattice
+        is_free = unknowns.numbers[to_host(lattice.springs)[: lattice.springs_owned]] >= 0
+        pairs = unknowns.comm.allreduce(int(is_free.all(axis=1).sum()))
+        total = PETSc.Mat.InfoType.GLOBAL_SUM
+        coarse = [(level.grid.table.total, int(level.matrix.getInfo(total)["nz_used"])) for level in self.levels]
+        return [(unknowns.total, 9 * (unknowns.total + 2 * pairs)), *coarse]
+
+    def __repr__(self) -> str:
+        """Return a table of the levels, as ``-ksp_view`` shows it."""
+        if not self.sizes:
+            return f"multigrid of {1 + len(self.levels)} levels, not built yet"
+        nonzeros = [number for _, number in self.sizes]
+        lines = [f"multigrid of {len(self.sizes)} levels, operator complexity {sum(nonzeros) / nonzeros[0]:.3f}"]
+        lines.append(f"{'level':>5} {'nodes':>10} {'nonzeros':>12}")
+        numbers = range(len(self.sizes) - 1, -1, -1)
+        lines += [f"{n:>5} {nodes:>10} {nz:>12}" for n, (nodes, nz) in zip(numbers, self.sizes, strict=True)]
+        return "\n".join(lines)
 
     def _finest_bound(self) -> float:
         """Greatest eigenvalue of D^-1 H on the finest level, at most, or as some iterations of CG know it."""

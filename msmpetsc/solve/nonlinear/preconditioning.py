@@ -306,6 +306,13 @@ class StepPreconditioner:
     def setUp(self, _: PETSc.PC) -> None:
         self.in_use.pc.setUp()
 
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        """Show the preconditioner of A, or multigrid and a table of its levels (PCView calls it)."""
+        if self.multigrid and self.is_chosen:
+            for line in repr(self.multigrid.multigrid).splitlines():
+                viewer.printfASCII(f"    {line}\n")
+        self.in_use.pc.view(viewer)
+
     @property
     def applied(self) -> Preconditioner | LatticePreconditioner:
         return self.for_searches if self.is_searching and self.for_searches else self.in_use
@@ -318,9 +325,6 @@ class StepPreconditioner:
         columns = self.applied.unknowns.columns(r)
         square = float(np.vdot(columns, self.applied.by_diagonal(columns)))
         return 0.5 * float(np.sqrt(max(self.applied.unknowns.comm.allreduce(square), 0.0)))
-
-    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        self.in_use.pc.view(viewer)
 
     def forget(self) -> None:
         """Forget what earlier steps showed: a preconditioner that was chosen by its iterations is chosen anew."""

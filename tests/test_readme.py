@@ -66,6 +66,17 @@ ALL_COMMANDS = [
 WITH_PYTHON = [path for path in READMES if blocks(path, "python")]
 
 
+def test_the_loops_of_a_step_are_printed_as_they_stand_in_the_files():
+    folder = ROOT / "msmpetsc" / "solve"
+    files = "\n".join(path.read_text() for path in (folder / "nonlinear").glob("*.py"))
+    files = "\n".join(line.strip() for line in files.splitlines())
+    printed = re.findall(r"^```\n(.*?)^```", (folder / "README.md").read_text(), re.M | re.S)
+    loops = [block for block in printed if "while not" in block]
+    assert len(loops) == 2
+    for loop in loops:
+        assert "\n".join(line.strip() for line in loop.splitlines()) in files
+
+
 def test_the_front_door_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 200
 

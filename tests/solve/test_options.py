@@ -1,5 +1,6 @@
 """PETSc's options are obeyed, or refused in one line before anything is built."""
 
+import re
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -172,6 +173,16 @@ def test_newton_refuses_options_of_the_loop_that_it_has_itself(petsc_options, op
     petsc_options(**{option: "newtonls"})
     with pytest.raises(InputError, match=f"-{option}: newton's presets have a loop"):
         Stepper(COMM, beam(), T, find_preset("newton"), 1e-9)
+
+
+def test_newtons_loop_keeps_what_options_of_snes_mean(tmp_path: Path):
+    path = block_scene(tmp_path, **SCENE | {"solver": {"preset": "newton-multigrid", "error": 1e-4}})
+    words = ["-snes_monitor", "-snes_converged_reason", "-snes_view", "-ksp_view"]
+    said = run(1, *COMMAND, path, "-o", tmp_path / "o.h5", *words, status=0).stdout
+    iterations = [int(number) for number in re.findall(r"(\d+) SNES Function norm", said)]
+    ends = [int(number) for number in re.findall(r"due to CONVERGED_\w+ iterations (\d+)", said)]
+    assert len(ends) > 1 and ends[-1] > 0 and len(iterations) == sum(ends) + len(ends)
+    assert "Newton" in said and "maximum iterations=3000" in said and "operator complexity" in said
 
 
 def test_a_solver_that_ends_by_a_rule_of_its_own_is_told(petsc_options):

@@ -51,8 +51,8 @@ class Newton(Method):
         self.most_its = self.ksp.getTolerances()[3]
         # V U' of a softer solid's cells, for the first Hessian of the next solve
         self.slopes: Array | None = None
-        # Whether the first iteration may end the solve, if |F| rises by SOFTER; and whether it did
-        self.watches = self.overshot = False
+        # Whether the first iteration may end the solve, if |F| rises by SOFTER from ``begun``; and whether it did
+        self.watches, self.overshot, self.begun = False, False, np.inf
         self._given: tuple[Iterate, Outcome] | None = None
 
     def begin(self) -> None:
@@ -70,25 +70,16 @@ class Newton(Method):
         """Run the loop of the method; PETSc calls it in SNESSolve."""
         assert self._given is not None
         now, outcome = self._given
-        outcome, first = self.control.judge(now, replace(outcome, residual=np.inf)), np.inf
-        projected, asks, its, most = self.preset.projected, False, 0, snes.getTolerances()[3]
-        while True:
-            snes.setIterationNumber(its)
-            snes.monitor(its, now.f.norm())
-            reason = self.reason_to_end(its, outcome)
-            self.overshot = self.watches and its == 1 and outcome.residual > SOFTER * first
-            if reason or self.overshot:
-                break
-            if its == most:
-                reason = REASON.DIVERGED_MAX_IT
-                break
+        outcome = self.control.judge(now, replace(outcome, residual=np.inf))
+        # Iterations left with the projected Hessian; whether g is asked for however near its minimum is
+        projected, asks, its = self.preset.projected, False, 0
+        while not (reason := self._reason(snes, its, now, outcome)):
             self._linearise(now, outcome, projected > 0)
-            self._solve(now, outcome, projected > 0)
-            if self.ksp.reason in USELESS:
+            if not self._solve(now, outcome):
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break
             outcome = self._after_solve(outcome, self._limit(now) or projected > 0)
-            flat = not asks and outcome.is_flat
+            flat = outcome.is_flat and not asks
             found = self._search(now, flat)
             if found is None and projected:
                 reason = REASON.DIVERGED_LINE_SEARCH
@@ -96,14 +87,26 @@ class Newton(Method):
             if found is None:
                 projected = PROJECTED
                 continue
-            before, projected, its = outcome.residual, max(projected - 1, 0), its + 1
-            first = before if its == 1 else first
+            before = outcome.residual
             now, outcome = found, self.control.judge(found, outcome)
             asks |= flat and outcome.residual > RAISED * before
+            projected, its = max(projected - 1, 0), its + 1
         self.iterations += its
         self._given = now, outcome
         now.x.copy(x)
-        snes.setConvergedReason(REASON.CONVERGED_ITS if self.overshot else reason)
+        snes.setConvergedReason(reason)
+
+    def _reason(self, snes: PETSc.SNES, its: int, now: Iterate, outcome: Outcome) -> int:
+        """Return PETSc's reason to end at an iterate; 0 to go on."""
+        snes.setIterationNumber(its)
+        snes.monitor(its, now.f.norm())
+        if its == 0:
+            self.begun = outcome.residual
+        self.overshot = self.watches and its == 1 and outcome.residual > SOFTER * self.begun
+        if self.overshot:
+            return int(REASON.CONVERGED_ITS)
+        most = snes.getTolerances()[3]
+        return self.reason_to_end(its, outcome) or (int(REASON.DIVERGED_MAX_IT) if its == most else 0)
 
     def _linearise(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
         """Take H at an iterate, and let CG begin with the correction that an estimate found there, if any."""
@@ -120,8 +123,8 @@ class Newton(Method):
                 self.control.estimate.correction.copy(self.y)
             self.ksp.setInitialGuessNonzero(known)
 
-    def _solve(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
-        """Solve H y = F."""
+    def _solve(self, now: Iterate, outcome: Outcome) -> bool:
+        """Solve H y = F; return whether y is a direction at all."""
         self.adapt(outcome)
         rtol = self.ksp.getTolerances()[0]
         if not self.options.is_given("ksp_max_it"):
@@ -130,6 +133,7 @@ class Newton(Method):
         self.ksp.setOperators(self.jacobian.operator)
         self.ksp.solve(now.f, self.y)
         self.jacobian.preconditioner.learn(self.ksp.its, rtol, self.control.solve_bound.reduction)
+        return self.ksp.reason not in USELESS
 
     def _after_solve(self, outcome: Outcome, detour: bool) -> Outcome:
         """Return what the linear solve tells of the next iterate: nothing after a ``detour``."""

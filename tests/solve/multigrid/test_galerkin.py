@@ -87,3 +87,18 @@ def test_a_new_hierarchy_takes_nothing_of_the_old_one():
         again = case.cycle()
     with hierarchy(COMM, build(COMM, LATTICES["limbs"], pins=True), SHAPES["twisted"], coarsest=10) as case:
         np.testing.assert_array_equal(case.cycle(), again)
+
+
+def test_a_hierarchy_says_what_its_levels_are():
+    """Nonzeros of the finest level, which is never assembled, are those of its dense matrix."""
+    lattice = build(COMM, LATTICES["block"], pins=True)
+    with hierarchy(COMM, lattice, SHAPES["twisted"], coarsest=10) as case:
+        blocks = case.hessian().reshape(-1, 3, len(case.hessian()) // 3, 3)
+        dense = 9 * int(np.abs(blocks).max(axis=(1, 3)).astype(bool).sum())
+        coarse = [np.count_nonzero(case.level(level)) for level in range(len(case.multigrid.levels))]
+        nodes, nonzeros = zip(*case.multigrid.sizes, strict=True)
+        assert nonzeros[0] == dense and nodes[0] == len(case.hessian()) // 3
+        assert all(stored >= needed for stored, needed in zip(nonzeros[1:], coarse, strict=True))
+        said = repr(case.multigrid).splitlines()
+        assert said[0] == f"multigrid of {len(nodes)} levels, operator complexity {sum(nonzeros) / dense:.3f}"
+        assert [int(line.split()[2]) for line in said[2:]] == list(nonzeros)

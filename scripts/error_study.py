@@ -137,7 +137,7 @@ def mesh_of(draw: Draw, sides: np.ndarray, path: Path) -> str:
 
 
 def material_of(draw: Draw) -> dict:
-    law = "linear" if draw.random() < 0.6 else "stiffening"
+    law = "linear" if draw.random() < 0.6 else "neo-hookean"
     return {"young_modulus": log_uniform(draw, 1e3, 1e9), "density": 1000.0, "law": law}
 
 

@@ -59,7 +59,7 @@ def lattice_of(
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
     bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
     cages = fill([BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)], h, boundary=boundary)
-    law = {} if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
+    law = {"law": "linear"} if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
     return build_lattice(cages, Material.model_validate({"density": DENSITY, "young_modulus": E} | law))
 
 

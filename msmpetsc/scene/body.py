@@ -100,8 +100,7 @@ class Material(Table):
     stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
     density: Positive = Field(description="mass density [kg/m^3]")
     law: Literal["neo-hookean", "linear"] = Field(
-        "linear",
-        description="neo-hookean: a solid; linear: springs, whose Poisson's ratio is 1/4",
+        SOLID, description="neo-hookean: a solid; linear: springs, whose Poisson's ratio is 1/4"
     )
     poisson_ratio: PoissonRatio = Field(0.25, description='of law = "neo-hookean"; tissue has 0.45 to 0.49 [-]')
     damping: NotNegative = Field(
@@ -116,7 +115,7 @@ class Material(Table):
     @model_validator(mode="after")
     def _solids_have_no_springs(self) -> Self:
         if self.law == SOLID and self.stiffness is not None:
-            raise rule('of law = "neo-hookean" takes young_modulus, not stiffness', "stiffness")
+            raise rule('is of springs: give law = "linear", or young_modulus in its place', "stiffness")
         return self
 
     @property

@@ -21,6 +21,7 @@ source = "ball.ply"
 count = 150
 [material]
 young_modulus = 1e5
+law = "linear"
 density = 1000
 [time]
 step = 0.01

@@ -33,7 +33,7 @@ def scene(ball: Path, tmp_path: Path) -> Path:
     path.write_text("""
         mesh = { source = "ball.ply" }
         cages = { count = 300 }
-        material = { young_modulus = 1e5, density = 1000 }
+        material = { young_modulus = 1e5, density = 1000, law = "linear" }
         time = { step = 0.01, duration = 0.1 }
         start = { scale = [1, 1, 0.8] }
     """)

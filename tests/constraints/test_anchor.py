@@ -121,7 +121,7 @@ def balls(tmp_path_factory) -> Path:
         """
         mesh.source = "ball.ply"
         cages.cell_size = 0.3
-        material = { young_modulus = 1e5, density = 1000 }
+        material = { young_modulus = 1e5, density = 1000, law = "linear" }
         time = { step = 0.01, duration = 0.01 }
         pin = [{ region.painted = [3, 17, 3, 101] }]
         """

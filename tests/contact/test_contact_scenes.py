@@ -23,7 +23,7 @@ GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response":
 def write(folder: Path, **tables: Any) -> Path:
     """A scene file; ``tables`` are added to it, or take a table's place."""
     scene = {
-        "material": {"young_modulus": 1e6, "density": 1000.0, "law": "stiffening"},
+        "material": {"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"},
         "gravity": {"acceleration": [0, 0, -G]},
         "safety": {"on_failure": "substep"},
         "solver": {"preset": "newton", "error": 1e-3},
@@ -96,7 +96,7 @@ def stack(folder: Path, duration: float) -> tuple[Model, list[Frame], np.ndarray
         folder,
         body=bodies,
         cages={"cell_size": SIDE / 2},
-        material={"young_modulus": 1e6, "density": 1000.0, "law": "stiffening", "damping": 5.0},
+        material={"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean", "damping": 5.0},
         obstacle=[GROUND],
         self_contact={"distance": 1e-3, "friction": 0.5},
         time={"step": 0.01, "duration": duration},
@@ -127,7 +127,7 @@ def test_links_of_a_chain_hang_in_each_other(tmp_path):
         tmp_path,
         body=bodies,
         cages={"cell_size": 0.008},
-        material={"young_modulus": 2e5, "density": 1000.0, "law": "stiffening", "damping": 2.0},
+        material={"young_modulus": 2e5, "density": 1000.0, "law": "neo-hookean", "damping": 2.0},
         self_contact={"distance": 5e-4, "friction": 0.3},
         time={"step": 0.01, "duration": 0.4},
     )
@@ -146,7 +146,7 @@ def test_a_bar_that_an_anchor_twists_does_not_cross_itself(tmp_path, turns: floa
         tmp_path,
         mesh={"source": "bar.ply"},
         cages={"cell_size": 0.025},
-        material={"young_modulus": 1e5, "density": 1000.0, "law": "stiffening", "damping": 2.0},
+        material={"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "damping": 2.0},
         gravity={"acceleration": [0, 0, 0]},
         pin=[{"region": ends[0]}],
         anchor=[{"region": ends[1], "path": path, "center": [0, 0, 0]}],
@@ -175,7 +175,7 @@ def test_a_ball_pressed_hard_into_a_hole_stays_out_of_its_rim(tmp_path):
         tmp_path,
         mesh={"source": "ball.ply", "base": [0, 0, -0.0185]},
         cages={"count": 300},
-        material={"young_modulus": 5e4, "density": 1000.0, "law": "stiffening", "damping": 1.0},
+        material={"young_modulus": 5e4, "density": 1000.0, "law": "neo-hookean", "damping": 1.0},
         force=[{"region": everywhere, "total": [0, 0, -60.0]}],
         obstacle=[washer],
         self_contact={"distance": 1e-3, "friction": 0.1},

@@ -107,7 +107,7 @@ def scene(folder: Path, **tables) -> Path:
     path = block_scene(
         folder,
         cages={"cell_size": 1 / 32},
-        material={"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
+        material={"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"},
         time={"step": 0.02, "duration": 0.4},
         pin=[{"region": {"box": [[0.3, 0, 0], [0.7, 1, 0.2]]} | half}],
         force=[

@@ -156,11 +156,11 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     assert 0 < term.contacts.free_share(q, far) < 1 / 500
 
 
-STIFFENING = {"young_modulus": 1e5, "density": 1000, "law": "stiffening"}  # or the arms' ends turn inside out
+SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}  # or the arms' ends turn inside out
 
 
 def test_arms_that_close_do_not_cross(tmp_path):
-    path = pinch_scene(tmp_path, material=STIFFENING, time={"step": 0.01, "duration": 0.11})
+    path = pinch_scene(tmp_path, material=SOLID, time={"step": 0.01, "duration": 0.11})
     model, frames = play(path)
     triangles = model.surface.triangles
     assert sum(count_crossings(frame.surface, triangles) for frame in frames) == 0
@@ -174,7 +174,7 @@ def test_arms_that_close_do_not_cross(tmp_path):
 def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path):
     friction = {"friction": 0.3, "distance": 1e-3}
     time = {"step": 0.01, "duration": 0.1}
-    path = pinch_scene(tmp_path, material=STIFFENING, self_contact=friction, time=time)
+    path = pinch_scene(tmp_path, material=SOLID, self_contact=friction, time=time)
     assert assert_goes_on_exactly(path, every=8)[9].self_contacts > 0
 
 
@@ -254,7 +254,7 @@ def sliding(folder: Path, angle: float, **given: float) -> Path:
     path = block_scene(
         folder,
         cages={"cell_size": cell},
-        material={"young_modulus": 1e6, "density": 1000.0, "law": "stiffening"},
+        material={"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"},
         time={"step": 0.01, "duration": 0.7},
         gravity={"acceleration": [g * np.sin(tilt), 0.0, -g * np.cos(tilt)]},
         pin=[{"region": {"box": [[-1, -1, -1], [2, 1, 1.5 * cell]]}}],

@@ -21,22 +21,22 @@ Q = RNG.normal(size=(N, 3))
 HOOKE = Springs(SPRINGS, REST, STIFFNESS)
 
 
-def energy(q: np.ndarray, elastic: Springs = HOOKE) -> float:
+def energy(q: np.ndarray, springs: Springs = HOOKE) -> float:
     """Return the energy, by its change from springs without length, which have k r^2 / 2."""
-    without_length = 0.5 * elastic.stiffness @ elastic.rest_length**2
-    return without_length + OwnedSprings(elastic).change(q, np.zeros_like(q))
+    without_length = 0.5 * springs.stiffness @ springs.rest_length**2
+    return without_length + OwnedSprings(springs).change(q, np.zeros_like(q))
 
 
-def gradient(q: np.ndarray, elastic: Springs = HOOKE) -> np.ndarray:
+def gradient(q: np.ndarray, springs: Springs = HOOKE) -> np.ndarray:
     g = np.zeros_like(q)
-    add_elastic_gradient(q, elastic, g)
+    add_elastic_gradient(q, springs, g)
     return g
 
 
-def hessian_times(q: np.ndarray, v: np.ndarray, projected: bool = False, elastic: Springs = HOOKE) -> np.ndarray:
-    product, blocks = np.zeros_like(q), np.empty((len(elastic[0]), 4))
-    elastic_hessian(q, elastic, projected, blocks)
-    add_elastic_product(elastic[0], blocks, v, product)
+def hessian_times(q: np.ndarray, v: np.ndarray, projected: bool = False) -> np.ndarray:
+    product, blocks = np.zeros_like(q), np.empty((len(SPRINGS), 4))
+    elastic_hessian(q, HOOKE, projected, blocks)
+    add_elastic_product(SPRINGS, blocks, v, product)
     return product
 
 

@@ -35,7 +35,7 @@ f 1 4 3 2\nf 5 6 7 8\nf 1/1 2/1 6/1 5/1\nf 2//1 3//1 7//1 6//1\nf 3 4 8 7\nf -8 
 SCENE = """
 mesh.source = "{}"
 cages.count = 50
-material = {{ density = 1e3, young_modulus = 1e5 }}
+material = {{ density = 1e3, young_modulus = 1e5, law = "linear" }}
 time = {{ step = 0.01, duration = 0.1 }}
 """
 

@@ -13,7 +13,7 @@ from msmpetsc.results.writer import Begin, ResultFile
 BARE = """
 mesh.source = "ball"
 cages.count = 1
-material = { stiffness = 1.0, density = 1.0 }
+material = { stiffness = 1.0, law = "linear", density = 1.0 }
 time = { step = 0.1, duration = 1.0 }
 """
 EAST_HELD = """

@@ -20,7 +20,10 @@ STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (lattice.material)
 
 
 def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **tables) -> Path:
-    """A scene file of a block with a corner at the origin; ``tables`` are added to it, or take a table's place."""
+    """A scene file of a block with a corner at the origin; ``tables`` are added to it, or take a table's place.
+
+    A material without a law is of springs.
+    """
     trimesh.creation.box(bounds=[[0, 0, 0], sides]).export(folder / f"{name}.ply")
     scene = {
         "mesh": {"source": f"{name}.ply"},
@@ -29,8 +32,10 @@ def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **
         "solver": {"preset": "newton", "error": 1e-9},
         "output": {"surface": False},
     }
+    scene |= tables
+    scene["material"] = {"law": "linear"} | scene["material"]
     path = folder / f"{name}.toml"
-    path.write_text(tomli_w.dumps(scene | tables))
+    path.write_text(tomli_w.dumps(scene))
     return path
 
 

@@ -83,7 +83,6 @@ def build(
     cells: np.ndarray,
     density: float = DENSITY,
     contrast: float = 1.0,
-    stiffening: float = 0.0,
     pins: bool = False,
     poisson: float | None = None,
 ) -> Lattice:
@@ -95,8 +94,7 @@ def build(
         uniform = CellMaterial(*(np.full(len(ijk), value) for value in (density, YOUNG, poisson or 0.25)))
         return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * YOUNG)
 
-    stiff = {"law": "stiffening", "stiffening": stiffening} if stiffening else {}
-    law = {"law": "neo-hookean", "poisson_ratio": poisson} if poisson else stiff
+    law = {"law": "neo-hookean", "poisson_ratio": poisson} if poisson else {"law": "linear"}
     material = Material(density=density, young_modulus=YOUNG, **law)
     lattice = build_lattice(cages_of(cells, CELL, comm), material, of_cells if contrast != 1 else None)
     low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
@@ -122,7 +120,7 @@ def twisted(nodes: np.ndarray) -> np.ndarray:
 
 
 def crushed(nodes: np.ndarray) -> np.ndarray:
-    """To a fifth of its height: the true Hessian is indefinite, cells resist."""
+    """To a fifth of its height: the true Hessian is indefinite."""
     return ORIGIN + (twisted(nodes) - ORIGIN) * [1.0, 1.1, 0.2]
 
 

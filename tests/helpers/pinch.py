@@ -41,7 +41,7 @@ def pinch_scene(folder: Path, **tables: dict) -> Path:
     scene = {
         "mesh": {"source": "u.ply"},
         "cages": {"cell_size": 0.0125},
-        "material": {"young_modulus": 1e5, "density": 1000},
+        "material": {"young_modulus": 1e5, "density": 1000, "law": "linear"},
         "time": {"step": 0.01, "duration": 0.3},
         "pin": [{"region": {"box": [[0, 0, 0], [1, 1, 0.15]]} | upper}],
         "force": [{"region": left, "total": [1.0, 0, 0]}, {"region": right, "total": [-1.0, 0, 0]}],

@@ -21,7 +21,7 @@ STAND_IN = ROOT / "tests" / "helpers" / "study_stand_in.py"
 SCENE = """
 mesh = { source = "box.ply" }
 cages = { count = 10 }
-material = { young_modulus = 1e5, density = 1000 }
+material = { young_modulus = 1e5, density = 1000, law = "linear" }
 time = { step = 0.01, duration = 0.1 }
 """
 

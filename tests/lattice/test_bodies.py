@@ -23,6 +23,7 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.metrics import distance_of_shapes, shape_error
 
 H = 0.125
+SPRINGS = {"young_modulus": 1e5, "density": 1000.0, "law": "linear"}
 UPPER = {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}
 GROUND = {"shape": "plane", "point": [0, 0, -0.06], "normal": [0, 0, 1], "response": "penalty", "stiffness": 2e3}
 # a ball that falls spinning on the ground, a bar in the same place that hangs and is pulled, a block half of lead
@@ -55,7 +56,7 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
     """A scene file; ``tables`` are added to it, or take a table's place."""
     scene = {
         "cages": {"cell_size": H},
-        "material": {"young_modulus": 1e5, "density": 1000.0},
+        "material": SPRINGS,
         "time": {"step": 0.01, "duration": 0.1},
         "gravity": {"acceleration": [0, 0, -9.81]},
         "obstacle": [GROUND],
@@ -69,7 +70,7 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
 def alone(folder: Path, number: int, **tables: Any) -> Path:
     """The scene of one of the bodies, which is then all there is."""
     body = dict(BODIES[number])
-    material = {"young_modulus": 1e5, "density": 1000.0} | body.pop("material", {})
+    material = SPRINGS | body.pop("material", {})
     return write(folder, f"alone{number}", **body, material=material, **tables)
 
 

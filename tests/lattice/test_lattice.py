@@ -34,7 +34,7 @@ def grid_index(lattice: Lattice, cages: Cages) -> list[tuple[int, ...]]:
 def test_springs_and_masses_follow_the_definition(cells: set):
     cells = np.array(sorted(cells))
     cages = cages_of(cells)
-    lattice = build_lattice(cages, Material(density=DENSITY, young_modulus=E))
+    lattice = build_lattice(cages, Material(density=DENSITY, young_modulus=E, law="linear"))
     place = grid_index(lattice, cages)
     wanted = springs_by_definition(cells)
     found = [frozenset([place[a], place[b]]) for a, b in lattice.springs]
@@ -52,14 +52,14 @@ def test_springs_and_masses_follow_the_definition(cells: set):
 
 def test_cells_name_their_corners_in_vtk_order():
     cages = cages_of(block(2, 3, 2))
-    lattice = build_lattice(cages, Material(density=DENSITY, stiffness=7.0))
+    lattice = build_lattice(cages, Material(density=DENSITY, stiffness=7.0, law="linear"))
     place = np.array(grid_index(lattice, cages))
     np.testing.assert_array_equal(place[lattice.cells] - place[lattice.cells][:, :1], np.tile(CORNERS, (12, 1, 1)))
     np.testing.assert_array_equal(lattice.stiffness, 7.0)
 
 
 def test_pins_are_kept_together():
-    lattice = build_lattice(cages_of(block(2, 1, 1)), Material(density=DENSITY, stiffness=1.0))
+    lattice = build_lattice(cages_of(block(2, 1, 1)), Material(density=DENSITY, stiffness=1.0, law="linear"))
     left, right = lattice.nodes[:, 0] < 1.1, lattice.nodes[:, 0] > 1.3
     np.testing.assert_array_equal(lattice.pin(left).pin(right).pinned, left | right)
     assert not lattice.pinned.any()

@@ -34,7 +34,7 @@ SCENES = {
     },
     "is pressed": {
         "time": {"step": 0.01, "duration": 0.2},
-        "material": {"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
+        "material": {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"},
         "obstacle": [FLOOR | {"response": "penalty", "friction": 0.5}, PLATE | {"response": "penalty"}],
     },
     "swings": {

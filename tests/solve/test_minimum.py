@@ -54,7 +54,7 @@ def write_case(folder: Path, name: str, **solver) -> Path:
     scene = {
         "mesh": {"source": "body.ply"},
         "cages": {"count": case.pop("cells"), "boundary": "whole"},  # as where the saddles were found
-        "material": {"young_modulus": case.pop("young"), "density": 1000.0},
+        "material": {"young_modulus": case.pop("young"), "density": 1000.0, "law": "linear"},
         "time": {"step": (step := case.pop("step")), "duration": case.pop("frames") * step},
         "solver": {"error": 1e-3} | solver,
         "output": {"surface": False},

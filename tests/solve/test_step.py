@@ -38,7 +38,7 @@ def reference() -> list:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_free_fall_is_the_schemes_own(preset: str):
     """q_n = q_0 + g t^2 n (n + 1) / 2: implicit Euler from rest, to the KSP's tolerance for ``paper``."""
-    lattice = build_lattice(cages_of(block(3, 2, 2), 0.1), Material(density=1000, young_modulus=2e5))
+    lattice = build_lattice(cages_of(block(3, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear"))
     fallen = swing(preset, 5, lattice)[-1].position - lattice.nodes
     tolerance = {"paper": 1e-8}.get(preset, 1e-12)
     np.testing.assert_allclose(fallen, np.tile(GRAVITY * T**2 * 15, (len(fallen), 1)), atol=tolerance)
@@ -153,7 +153,7 @@ def test_a_preset_leaves_no_options_behind():
 
 def test_A_is_M_plus_t2_L():
     """Against a dense sum over springs: symmetric, positive definite, its rows sum to the mass without pins."""
-    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5))
+    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear"))
     stepper = Stepper(COMM, lattice, T, find_preset("anderson"))
     rows = np.arange(lattice.owned, dtype=np.int32)
     A = stepper.jacobian.matrix.getValues(rows, rows)
@@ -168,7 +168,7 @@ def test_A_is_M_plus_t2_L():
 
 def test_a_plain_iteration_is_the_papers_global_step():
     """x <- x - A^(-1) F(x) from y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext) (Eq. 17), dense here."""
-    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5))
+    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear"))
     lattice = replace(lattice, rest_length=0.95 * lattice.rest_length)
     stepper = Stepper(COMM, lattice, T, find_preset("fast-msm"), max_iterations=1)
     rows = np.arange(lattice.owned, dtype=np.int32)
@@ -203,7 +203,7 @@ def test_a_strut_that_buckles_under_its_load():
 
 def test_a_body_pressed_to_half_still_gives_a_descent():
     """Springs under compression make the true Hessian indefinite; newton must come through."""
-    lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), Material(density=1000, young_modulus=2e6))
+    lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), Material(density=1000, young_modulus=2e6, law="linear"))
     pressed = lattice.nodes * [1, 1, 0.5] + 1e-3 * np.random.default_rng(1).normal(size=lattice.nodes.shape)
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-6)
     x = stepper.step(StepProblem(pressed, pressed, weight(lattice))).position

@@ -129,7 +129,7 @@ def greatest(lattice: Lattice, q: np.ndarray, projected: bool = False) -> float:
     return np.linalg.eigvalsh(scale[:, None] * H * scale)[-1]
 
 
-@pytest.mark.parametrize("law", ["linear", "stiffening"])
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
 @pytest.mark.parametrize("held", [False, True])
 def test_the_limit_is_that_of_the_greatest_eigenvalue(law: str, held: bool):
     lattice = cube(law)
@@ -155,9 +155,9 @@ def test_a_substep_beyond_the_limit_is_shortened_and_a_shorter_one_kept(tmp_path
 
 @pytest.mark.parametrize("response", ["reflect", "penalty"])
 def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Path, response: str):
-    """A soft block of a stiffening law, thrown down: omega at the impact is some times that of the flight."""
+    """A soft block, thrown down: omega at the impact is more than twice that of the flight."""
     floor = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": response}
-    material = {"young_modulus": 1e4, "density": 1000.0, "law": "stiffening"}
+    material = {"young_modulus": 1e4, "density": 1000.0, "law": "neo-hookean"}
     time = {"step": T, "duration": 0.4} | EXPLICIT
     scene = block_scene(
         tmp_path, time=time, material=material, gravity={"acceleration": [0, 0, -2 * G]}, obstacle=[floor],
@@ -166,8 +166,8 @@ def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Pa
     _, frames = play(scene)
     energy = np.array([f.kinetic + f.elastic + f.potential + f.contact for f in frames])
     steps = [f.iterations for f in frames[1:]]
-    assert max(steps) > 3 * steps[0]
-    assert np.abs(energy - energy[0]).max() < 0.15 * max(f.kinetic for f in frames)
+    assert max(steps) > 2 * steps[0]
+    assert np.abs(energy - energy[0]).max() < 0.025 * max(f.kinetic for f in frames)
 
 
 def test_a_body_that_folds_is_not_heated(tmp_path: Path, monkeypatch):

@@ -329,7 +329,7 @@ def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
 
 
 def test_a_law_is_not_advised_to_a_scene_that_has_it(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(sys.modules[__name__], "SCENE", SCENE.replace("1e5", '1e5, law = "stiffening"'))
+    monkeypatch.setattr(sys.modules[__name__], "SCENE", SCENE.replace("linear", "neo-hookean"))
     plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0)
     assert plan.bounds[-1].endswith("fewer --frames may help")
 

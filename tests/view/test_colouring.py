@@ -45,7 +45,7 @@ def test_stress_is_von_mises_at_the_nodes_in_a_unit_of_its_size(subject):
     assert shown.ticks == ((0, "0"), (0.25, "0.5"), (0.5, "1"), (0.75, "1.5"), (1, "2"))
     with pytest.raises(InputError, match="is of springs"):
         colouring_of(subject, "stress")
-    text = BARE.replace("stiffness = 1.0", 'young_modulus = 1.0, law = "neo-hookean"')
+    text = BARE.replace('stiffness = 1.0, law = "linear"', 'young_modulus = 1.0, law = "neo-hookean"')
     solid = SceneFile.model_validate(toml_of(text))
     with pytest.raises(InputError, match=r"output\.stress = true"):
         colouring_of(replace(subject, scene=solid), "stress")
@@ -117,7 +117,7 @@ def test_few_points_at_a_clamp_do_not_rule_the_scale_and_it_says_so():
 def test_a_body_at_rest_is_not_tinted_though_its_field_is_rounded(subject, name):
     """Shares of 1e-16 of its size, its age and its stiffness are no motion and no stress."""
     noise = np.random.default_rng(0).uniform(-1e-16, 1e-16, (3, *subject.rest.nodes.shape))
-    text = BARE.replace("stiffness = 1.0", 'young_modulus = 1e6, law = "neo-hookean"')
+    text = BARE.replace('stiffness = 1.0, law = "linear"', 'young_modulus = 1e6, law = "neo-hookean"')
     still = replace(
         subject,
         scene=SceneFile.model_validate(toml_of(text)),

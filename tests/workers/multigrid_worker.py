@@ -8,9 +8,9 @@ WORLD = MPI.COMM_WORLD
 CASES = {  # lattice, shape, contact, more
     "block": ("twisted", True, {"pins": True, "contrast": 1e6}),
     "two bodies": ("crushed", False, {}),
-    "thin sheet": ("crushed", True, {"stiffening": 2.0, "pins": True}),
+    "thin sheet": ("crushed", True, {"poisson": 0.25, "pins": True}),
     "limbs": ("rest", False, {"pins": True}),
-    "rod": ("twisted", False, {"stiffening": 2.0}),
+    "rod": ("twisted", False, {"poisson": 0.45}),
     "a cell": ("rest", False, {}),
 }
 

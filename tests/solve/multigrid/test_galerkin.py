@@ -11,13 +11,11 @@ CASES = {  # lattice, shape, contact, more
     "crushed": ("block that begins at odd indices", "crushed", False, {}),
     "of two materials": ("L", "twisted", False, {"contrast": 1e6, "pins": True}),
     "touching": ("tilted beam", "twisted", True, {"pins": True}),
-    "resisting": ("block", "crushed", False, {"stiffening": 2.0, "pins": True}),
-    "resisting, touching, of two materials": ("limbs", "crushed", True, {"stiffening": 2.0, "contrast": 1e3}),
-    "in two pieces": ("two bodies in one coarse cell", "crushed", True, {"stiffening": 2.0}),
+    "in two pieces": ("two bodies in one coarse cell", "crushed", True, {}),
     "many": ("many bodies", "twisted", True, {}),
     "thin": ("thin sheet", "twisted", False, {"pins": True}),
     "solid": ("block that begins at odd indices", "twisted", True, {"poisson": 0.45, "pins": True}),
-    "solid, crushed, of two materials": ("limbs", "crushed", False, {"poisson": 0.49, "contrast": 1e3}),
+    "solid, crushed, touching, of two materials": ("limbs", "crushed", True, {"poisson": 0.49, "contrast": 1e3}),
 }
 
 
@@ -61,8 +59,6 @@ def test_levels_are_galerkin_products(name: str):
     lattice, shape, contact, more = CASES[name]
     with hierarchy(COMM, build(COMM, LATTICES[lattice], **more), SHAPES[shape], contact=contact, coarsest=10) as case:
         assert len(case.multigrid.levels) > 1 or name == "many"  # of one cell each: no grid is coarser
-        if "stiffening" in more:
-            assert len(case.elasticity.cells.resisting(case.q).cells) > 10
         check_levels(case)
         np.testing.assert_allclose(case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y)), case.hessian(),
                                    rtol=0, atol=1e-5 * np.abs(case.hessian()).max())  # fmt: skip

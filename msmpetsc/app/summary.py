@@ -109,7 +109,7 @@ class Cost:
         self.output = self.stepping = 0.0
         self.products: dict[int, int] = {}
         model = simulation.model
-        free = int((~simulation.environment.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())
+        free = int((~simulation.environment.anchors.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())
         own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, free
         self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
 

@@ -84,14 +84,14 @@ class EnergyBalance:
         """Energies of positions (l, 3) [m] and velocities (l, 3) [m/s] with obstacles as at ``time`` (collective)."""
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
-        at, contact, v = q[owned], environment.push(time, sides), v[owned]
-        momenta, free = lattice.mass[:, None] * v, ~environment.fixed_at(time)[owned]
+        at, contact, v = q[owned], environment.obstacles.push(time, sides), v[owned]
+        momenta, free = lattice.mass[:, None] * v, ~environment.anchors.fixed_at(time)[owned]
         sums = self._sums(
             0.5 * np.vdot(momenta, v),
             0.5 * np.vdot(momenta * free[:, None], v),
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
-            -np.vdot(environment.given_load(time), at),
+            -np.vdot(environment.forces.given(time), at),
             *(lattice.mass @ v),
         )
         return Energies(
@@ -122,8 +122,10 @@ class EnergyBalance:
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
         way = result.position[owned] - result.previous[owned]
-        pressing, led = self.environment.way_of_pressing((result.position[owned], after.sides), time, time_step)
-        is_held = self.environment.fixed_at(time)[owned].any()
+        pressing, led = self.environment.obstacles.way_of_pressing(
+            (result.position[owned], after.sides), time, time_step
+        )
+        is_held = self.environment.anchors.fixed_at(time)[owned].any()
         sums = self._sums(lattice.mass.sum(), pressing, is_held, *led, *(lattice.mass @ way / time_step))
         mass, pressing, is_held, momentum = *sums[:3], sums[6:]
         frame = sums[3:6] / (pressing * time_step) if pressing > 0 else np.where(is_held, 0.0, momentum / mass)
@@ -140,7 +142,7 @@ class EnergyBalance:
         if result.static:  # which owes nothing to the state before
             return before.budget
         own = after.q is not result.position or after.q_previous is not result.previous
-        bounces = self.environment.strikes and self.comm.allreduce(own, MPI.LOR)  # once the step was solved
+        bounces = self.environment.obstacles.strikes and self.comm.allreduce(own, MPI.LOR)  # once the step was solved
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
@@ -150,7 +152,7 @@ class EnergyBalance:
                 f"gained {budget.gained:.2e} J from nowhere, of {budget.put_in:.2e} J that were there: "
                 f"{self._worst(v)}{describe_inverted(self.comm, self.lattice, result.position)}; "
                 f"try {self.remedy(result.explicit)}"
-                + ("" if self.environment.exchanges else ', or safety.on_failure = "fallback"'),
+                + ("" if self.environment.obstacles.exchanges else ', or safety.on_failure = "fallback"'),
                 "energy",
             )
         self.known = after.q, ended
@@ -172,7 +174,7 @@ class EnergyBalance:
 
     def remedy(self, explicit: bool) -> str:
         """Return a remedy, in words, for energy that comes from nowhere."""
-        if self.environment.exchanges:
+        if self.environment.obstacles.exchanges:
             return 'response = "reflect" in place of "exchange", which moves nodes against their springs'
         if explicit or self.credit:
             return "a smaller time.substep" if explicit else "a smaller time.step"
@@ -196,11 +198,11 @@ class EnergyBalance:
         """
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
-        prescribed = None if result.explicit else environment.prescribed(before.q, time)
+        prescribed = None if result.explicit else environment.anchors.prescribed(before.q, time)
         q, v = before.q if prescribed is None else prescribed, before.velocity(time_step)[owned]
-        free = ~environment.fixed_at(time)[owned]
+        free = ~environment.anchors.fixed_at(time)[owned]
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
-        contact = environment.push(when, sides)
+        contact = environment.obstacles.push(when, sides)
         known = self.known[1] if self.known and q is self.known[0] else None
         ended = result.position[owned], after.sides
         along = time_step * np.broadcast_to(frame, 3)
@@ -211,8 +213,8 @@ class EnergyBalance:
             0.5 * np.vdot((lattice.mass * free)[:, None] * (v - drift), v - drift),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned] + way) if contact else 0.0,
-            np.vdot(environment.load(time), result.position[owned] - q[owned] - way)
-            + environment.friction_work_bound((q[owned], sides), ended, time, time_step, along)
+            np.vdot(environment.forces.at(time), result.position[owned] - q[owned] - way)
+            + environment.obstacles.friction_work_bound((q[owned], sides), ended, time, time_step, along)
             + result.viscous_work
             + (surface.of_obstacles(result.position, along)[1] / self.comm.size if surface else 0.0)
             + (pressing.released(result.position) if pressing else 0.0),

@@ -145,10 +145,10 @@ class Monitors:
     def overlaps(self, index: int, time: float, q: Positions) -> None:
         """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3)
         [m] before it (collective)."""
-        for obstacle in self.environment.obstacles:
+        for obstacle in self.environment.obstacles.all:
             if not obstacle.acts_at(time) or (index and obstacle.acts_at(time - self.time_step)):
                 continue
-            fixed = self.environment.fixed_at(time)
+            fixed = self.environment.anchors.fixed_at(time)
             overlap = describe_overlap(self.comm, self.lattice, obstacle, q, fixed, time)
             if overlap:
                 self._warn(index, time, f'{overlap}; "exchange" leaves nodes inside, other responses push them out')

@@ -109,7 +109,7 @@ class TimeLoop:
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
-        sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
+        sides = self.environment.obstacles.contact_faces(q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0))
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
         self.awaits_solve = False  # a step that reads what options are left
         self.saved = Checkpoint()
@@ -167,7 +167,9 @@ class TimeLoop:
     def _save(self) -> Checkpoint:
         """Store the state, and forget what is no part of it: a resumed run would not have it."""
         checkpoint = Checkpoint(self.step)
-        self.state.save(checkpoint, self.model.lattice.owned, self.integrator.looks_back, self.environment.has_sides)
+        self.state.save(
+            checkpoint, self.model.lattice.owned, self.integrator.looks_back, self.environment.obstacles.has_sides
+        )
         self.integrator.save(checkpoint)
         self.environment.forget()
         for part in (self.recovery, self.monitors):
@@ -292,11 +294,11 @@ class Forces:
         """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
         environment, owned = self.environment, self.model.lattice.owned
         problem = step.problem if step else None
-        contact = problem.contact if problem else environment.push(time, sides)
-        load = environment.load(time)
+        contact = problem.contact if problem else environment.obstacles.push(time, sides)
+        load = environment.forces.at(time)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "reaction" in self.rows:
-            held = (self._held(q, contact, step) - load) * environment.fixed_at(time)[:owned, None]
+            held = (self._held(q, contact, step) - load) * environment.anchors.fixed_at(time)[:owned, None]
             sums["reaction"] = self.model.holders.totals(held)
             sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
         return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from obstacles import box
 
+from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
 from msmpetsc.contact.obstacles.penalty import Contact, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
-from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 
 INTEGRATORS = ["implicit-euler", "bdf2", "verlet"]
@@ -171,7 +171,7 @@ def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path):
 
 
 def test_a_step_whose_nodes_cannot_be_settled_fails_in_words(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(Environment, "same_push", lambda *_: False)
+    monkeypatch.setattr(NodeObstacles, "same_push", lambda *_: False)
     with pytest.raises(StepFailed, match="has nodes that pass through"):
         play(against_a_plate(tmp_path, "implicit-euler", "penalty", 20.0, False))
 

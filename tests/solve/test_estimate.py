@@ -11,8 +11,8 @@ from block_scene import GRAVITY, block_scene
 from conftest import run
 from lattices import COMM, T, beam, one_spring, weight
 from mpi4py import MPI
-from petsc4py import PETSc
 from one_process import assert_one_line
+from petsc4py import PETSc
 
 from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene

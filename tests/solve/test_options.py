@@ -203,7 +203,9 @@ def test_iterations_of_a_step_have_a_bound_that_no_option_lifts(petsc_options):
     problem = StepProblem(lattice.nodes, lattice.nodes, weight(lattice))
     with pytest.raises(StepFailed, match="DIVERGED_MAX_IT"):
         stepper.step(problem)
-    assert 0.5 * MOST_ITERATIONS < stepper.work_so_far().ksp_its + 10 * stepper.method.iterations < 1.1 * MOST_ITERATIONS
+    assert (
+        0.5 * MOST_ITERATIONS < stepper.work_so_far().ksp_its + 10 * stepper.method.iterations < 1.1 * MOST_ITERATIONS
+    )
     stepper.destroy()
 
 

@@ -267,7 +267,7 @@ class Adaptive(Integrator):
         q, v = state.q, state.velocity(self.time_step)
         if share > 0 and state.history:
             q, v = between(*state.history, q, v, self._length(self.last), 1 - share)
-            led = self.environment.prescribed(q, time)
+            led = self.environment.anchors.prescribed(q, time)
             q = q if led is None else led
         self.balance.show(q, v, time, state.sides)
         return replace(total, position=q, previous=q - self.time_step * v)
@@ -313,7 +313,7 @@ class Adaptive(Integrator):
         mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
         end = self._reached(self.tick + self.ticks.length(level))
-        free = mass * ~self.environment.fixed_at(end)[owned]
+        free = mass * ~self.environment.anchors.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
         local = self.mean(local_error(self.order, q, v, x, w, t) * (free > 0)[:, None])
         sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
@@ -321,9 +321,9 @@ class Adaptive(Integrator):
         if not self.control.motion:  # of a run that begins from rest: what will move until the next frame
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
         late = t * (free @ np.sqrt((struck**2).sum(axis=1)))
-        if self.environment.penalties:
+        if self.environment.obstacles.penalties:
             ends = (before.q[owned], before.sides), (x, after.sides)
-            late += t**2 * ((free > 0) @ self.environment.change_of_push(*ends, end, t))
+            late += t**2 * ((free > 0) @ self.environment.obstacles.change_of_push(*ends, end, t))
         sums += [mass @ (coming**2).sum(axis=1), late]
         error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))

@@ -81,14 +81,16 @@ class ContactFaces:
     def _crossed(self, end: Positions) -> Indices:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
         with CONTACT:
-            return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
+            obstacles, held = self.environment.obstacles, self.fixed
+            return obstacles.contact_faces(self.q, end, self.time, self.time_step, self.before, held)
 
     def problem(self) -> StepProblem:
         """Return the problem of the step with the faces as they are known now."""
         environment, time = self.environment, self.time
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
-        return StepProblem(self.q, self.y, environment.load(time), self.contact, environment.prescribed(self.q, time))
+        led = environment.anchors.prescribed(self.q, time)
+        return StepProblem(self.q, self.y, environment.forces.at(time), self.contact, led)
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the solution by ``step`` of the problem with the right faces. Raises StepFailed."""
@@ -107,11 +109,12 @@ class ContactFaces:
     def compare(self, x: Positions, left_out: float) -> None:
         """Update the faces from the solution x (l, 3) [m], at which pairs of the surface may be left out that store no
         more than ``left_out`` [J]. Raises StepFailed where none settle."""
-        crossed, pressing = self._crossed(x), self.environment.pressing
+        crossed, pressing = self._crossed(x), self.environment.obstacles.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1
         environment, contacts = self.environment, self.environment.contacts
-        self.is_settled = not environment.has_sides or environment.same_push(x, self.time, self.sides, sides)
+        obstacles = environment.obstacles
+        self.is_settled = not obstacles.has_sides or obstacles.same_push(x, self.time, self.sides, sides)
         if not self.is_settled:
             self.sides = sides
             if self.solves == MOST_SOLVES:
@@ -136,7 +139,7 @@ class ContactFaces:
             if narrow:
                 narrow.narrow(x, self.time)
             return
-        if environment.penalties:  # what reflects goes by the way to x alone
+        if obstacles.penalties:  # what reflects goes by the way to x alone
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
         self.sides = crossed
 
@@ -158,7 +161,7 @@ class ImplicitEuler(Integrator):
         self.time_step = time.step
         self.damping, self.retardation = environment.damping, environment.retardation
         self.tau = self._first_tau()
-        self.anchors = environment.anchors_at(self.time_step)
+        self.anchors = environment.anchors.acting(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
 
     def _first_tau(self) -> float:
@@ -186,12 +189,12 @@ class ImplicitEuler(Integrator):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)
         q, time_step = state.q, self.time_step
-        self.environment.begin_step(q, state.velocity(time_step), time - time_step)
+        self.environment.forces.begin_step(q, state.velocity(time_step), time - time_step)
         y = 2 * q - state.q_previous
         if self.damping:
             y = q + self._carried(time_step) / time_step * (q - state.q_previous)
         result, sides = self._solve(state, y, time, time_step)
-        after, before, work = self.environment.strike(
+        after, before, work = self.environment.obstacles.strike(
             result.position, result.previous, StepTaken(time, time_step, sides), self.stepper.lattice.pinned
         )
         return replace(result, work=work), State(after, before, sides=sides)
@@ -224,7 +227,7 @@ class ImplicitEuler(Integrator):
 
     def _new_stepper(self, time: float) -> Stepper:
         """Make the solver for the nodes that are free at a time [s]."""
-        solver, lattice = self.solver, self.environment.lattice.pin(self.environment.fixed_at(time))
+        solver, lattice = self.solver, self.environment.lattice.pin(self.environment.anchors.fixed_at(time))
         if self.retardation:
             factor = self.retardation / self.tau
             lattice = replace(lattice, stiffness=(1 + factor) * lattice.stiffness, viscous=factor)
@@ -242,7 +245,7 @@ class ImplicitEuler(Integrator):
 
     def _let_go(self, time: float) -> None:
         """Make another solver where an anchor's time has come (collective)."""
-        anchors = self.environment.anchors_at(time)
+        anchors = self.environment.anchors.acting(time)
         if len(anchors) < len(self.anchors):
             self.anchors = anchors
             self.destroy()
@@ -290,7 +293,7 @@ class Bdf2(ImplicitEuler):
         """
         self._let_go(time)
         q, v, begun = state.q, state.velocity(self.time_step), Work()
-        self.environment.begin_step(q, v, time - self.time_step)
+        self.environment.forces.begin_step(q, v, time - self.time_step)
         history = state.history
         if history is None:
             history, begun = self._history(state, time)
@@ -300,7 +303,7 @@ class Bdf2(ImplicitEuler):
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
         a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
-        _, before, work = self.environment.strike(
+        _, before, work = self.environment.obstacles.strike(
             result.position, previous, StepTaken(time, self.time_step, sides), self.stepper.lattice.pinned
         )
         cost = replace(begun + result.cost, step_error=result.cost.step_error, steps=1)

@@ -91,7 +91,7 @@ class LoadPath:
 
     def __post_init__(self) -> None:
         self.base = self.state.q
-        self.target = self.environment.prescribed(self.base, self.time)
+        self.target = self.environment.anchors.prescribed(self.base, self.time)
         self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
         self.sides = self.state.sides
         first, lattice = self.time < 1.5 * self.time_step, self.stepper.lattice
@@ -131,7 +131,7 @@ class LoadPath:
                 self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
                 self.holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
             load = load + (1 - share) * self.holding
-            prescribed = self.environment.prescribed(self.base, self.time, self.time - self.time_step, share)
+            prescribed = self.environment.anchors.prescribed(self.base, self.time, self.time - self.time_step, share)
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:

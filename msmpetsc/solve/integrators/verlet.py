@@ -71,7 +71,7 @@ class Verlet(Integrator):
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.elastic = self.gradient[:owned]  # grad E without what obstacles push
-        self.sides = environment.no_sides[:, :owned]
+        self.sides = environment.obstacles.no_sides[:, :owned]
         self.damping = environment.damping
         # [J] in a step: work on this rank's nodes, of obstacles without friction, of loads that change, of anchors
         self.work = 0.0
@@ -81,7 +81,7 @@ class Verlet(Integrator):
         self.end = 0.0  # of the step [s]
         self.known: Floats | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
         self.anchors: int | None = None  # how many hold
-        self.fixed = environment.fixed_at(self.time_step)[:owned]
+        self.fixed = environment.anchors.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
         self.most = TORN * comm.allreduce(crushing_energy(self.lattice))  # [J]
 
@@ -103,7 +103,7 @@ class Verlet(Integrator):
         stiffen a body, folds may heat it.
         """
         start, self.end = time - self.time_step, time
-        self.environment.begin_step(state.q, state.velocity(self.time_step), start)
+        self.environment.forces.begin_step(state.q, state.velocity(self.time_step), start)
         self._begin(state, start)
         pushed = self._pushed(start, time)
         squared = pushed + (self.highest.squared or self.highest.squared_at(self.position.values))
@@ -136,7 +136,7 @@ class Verlet(Integrator):
             before = state.sides
             if before is not None:
                 before = before[:, : self.lattice.owned]
-            self.sides = self.environment.contact_faces(self.q, self.q, start, 0.0, before, self.fixed)
+            self.sides = self.environment.obstacles.contact_faces(self.q, self.q, start, 0.0, before, self.fixed)
             self._pull(start)
             self.highest.squared = 0.0
 
@@ -150,7 +150,7 @@ class Verlet(Integrator):
             self._drift(begin, end)
             moved, held = self.q - before, held | self.fixed
             self._count_work(moved, held)
-            self.work += self.environment.energy_of_new_obstacles(self.q, begin, end, self.sides)
+            self.work += self.environment.obstacles.energy_of_new_obstacles(self.q, begin, end, self.sides)
             self._pull(end)
             self._count_work(moved, held)
             duration = end - begin
@@ -162,7 +162,7 @@ class Verlet(Integrator):
         Anchors lead ``held`` nodes (owned,) against all forces, with the load as the energy balance has it.
         """
         self.springs_work += 0.5 * np.vdot(self.elastic, moved)
-        against = self.gradient[: self.lattice.owned] - self.environment.load(self.end)
+        against = self.gradient[: self.lattice.owned] - self.environment.forces.at(self.end)
         self.work += 0.5 * float(np.vdot(against[held], moved[held]))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
@@ -174,7 +174,7 @@ class Verlet(Integrator):
         gain, kinetic = self.comm.allreduce(np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))]))
         most = energy + kinetic
         enough, gained = GAIN * most + ROUNDING * self.most, max(self.gained + gain, -CREDIT * most)
-        if min(gain, gained) > enough and self.halvings < HALVINGS and not self.environment.penalties:
+        if min(gain, gained) > enough and self.halvings < HALVINGS and not self.environment.obstacles.penalties:
             self.halvings += 1
             return True
         self.gained = gained
@@ -184,7 +184,7 @@ class Verlet(Integrator):
 
     def _squared_acceleration(self, time: float) -> float:
         """|M^(-1) (f_ext - grad E)|_M^2 of this rank's free nodes [J/s^2]."""
-        force = (self.environment.load(time) - self.gradient[: self.lattice.owned])[self.free]
+        force = (self.environment.forces.at(time) - self.gradient[: self.lattice.owned])[self.free]
         return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
 
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
@@ -199,7 +199,7 @@ class Verlet(Integrator):
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
         self.elastic = self.gradient[: self.lattice.owned]
-        contact = self.environment.push(time, self.sides)
+        contact = self.environment.obstacles.push(time, self.sides)
         if contact:
             self.elastic = self.elastic.copy()
             contact.add_gradient(self.q, self.gradient)
@@ -207,15 +207,15 @@ class Verlet(Integrator):
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
         """Change v by the forces at ``time``; obstacles move as in the substep to its end."""
         self._damp(0.5 * duration)
-        beyond = self.environment.load_beyond(time, self.end)
-        load = self.environment.load(time)
+        beyond = self.environment.forces.beyond(time, self.end)
+        load = self.environment.forces.at(time)
         before = None if beyond is None else self.v.copy()
         kick(len(self.free), load, duration, self._movers())
         if beyond is not None and before is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
             self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
         self._damp(0.5 * duration)
-        self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)
-        self.environment.apply_friction(self._movers(), time, duration, (begin, end), self.sides)
+        self.work += duration * self.environment.obstacles.power(self.q, time, begin, end, self.sides)
+        self.environment.obstacles.apply_friction(self._movers(), time, duration, (begin, end), self.sides)
 
     def _movers(self) -> Movers:
         return Movers(self.q, self.v, self.free, self.per_mass, self.gradient)
@@ -229,15 +229,15 @@ class Verlet(Integrator):
         """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
         self._hold(end)
         drift(len(self.free), self.q, end - begin, self._movers())
-        prescribed = self.environment.prescribed(self.position.values, end)
+        prescribed = self.environment.anchors.prescribed(self.position.values, end)
         if prescribed is not None:
             anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
-            freed = anchored[~self.environment.fixed_at(self.end)[anchored]]
+            freed = anchored[~self.environment.anchors.fixed_at(self.end)[anchored]]
             self.work -= self._kinetic(freed)
             self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
             self.q[anchored] = prescribed[anchored]
             self.work += self._kinetic(freed)
-        if self.environment.strikes or self.environment.has_sides:
+        if self.environment.obstacles.strikes or self.environment.obstacles.has_sides:
             self._strike(begin, end)
         self.position.update()
 
@@ -248,9 +248,9 @@ class Verlet(Integrator):
     def _strike(self, begin: float, end: float) -> None:
         """Find faces of contact; the velocity of a node that bounces off is what then led it there."""
         start = self.q - (end - begin) * self.v
-        self.sides = self.environment.contact_faces(start, self.q, end, end - begin, self.sides, self.fixed)
+        self.sides = self.environment.obstacles.contact_faces(start, self.q, end, end - begin, self.sides, self.fixed)
         step = StepTaken(end, end - begin, self.sides)
-        after, before, work = self.environment.strike(self.q, start, step, self.fixed)
+        after, before, work = self.environment.obstacles.strike(self.q, start, step, self.fixed)
         self.work += work
         if before is not start:
             struck = np.flatnonzero((before != start).any(axis=1))
@@ -259,19 +259,19 @@ class Verlet(Integrator):
 
     def _hold(self, time: float) -> None:
         """Update the free nodes where an anchor begins or ends."""
-        anchors = len(self.environment.anchors_at(time))
+        anchors = len(self.environment.anchors.acting(time))
         if anchors != self.anchors:
             self.anchors = anchors
-            self.fixed = self.environment.fixed_at(time)[: self.lattice.owned]
+            self.fixed = self.environment.anchors.fixed_at(time)[: self.lattice.owned]
             self.free = np.flatnonzero(~self.fixed)
             self.highest.hold(self.fixed)
 
     def _pushed(self, start: float, time: float) -> float:
         """Bound what obstacles may add to omega^2 [1/s^2] until ``time``, by Weyl (collective)."""
-        fall = self.environment.load(start) * self.per_mass[:, None] * self.time_step
+        fall = self.environment.forces.at(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
-        stiffness = self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)
+        stiffness = self.environment.obstacles.contact_stiffness_bound(self.q, speed, start, time, self.sides)
         squared = greatest(stiffness[self.free] * self.per_mass[self.free])
         return float(self.comm.allreduce(squared, MPI.MAX))
 

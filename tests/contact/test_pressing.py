@@ -84,6 +84,31 @@ def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
     assert radius.min() > 1.02 * 0.1
 
 
+@pytest.mark.slow
+def test_a_paddle_that_goes_by_half_a_ball_a_step_hits_it(tmp_path: Path):
+    """Its point goes at three times the speed of sound of the ball, of which light nodes swing far out."""
+    ball = trimesh.creation.icosphere(1, 0.1)
+    ball.apply_translation([0.2, 0.14, 0])
+    paddle = {"shape": "box", "box": [[-0.3, -0.01, -0.2], [0.3, 0.01, 0.2]], "center": [0, 0, 0]}
+    steps, step = 3, 0.002
+    paddle |= {"response": "barrier", "path": [{"time": steps * step, "turn": [0, 0, 14.4 * steps]}]}
+    scene = block_scene(
+        tmp_path,
+        material=SOLID,
+        solver={"preset": "newton", "error": 1e-3},
+        output={},
+        time={"step": step, "duration": steps * step},
+        obstacle=[paddle],
+        cages={"cell_size": 0.05},
+        start={"velocity": [0, -2, 0]},
+        self_contact={},
+    )
+    ball.export(tmp_path / "scene.ply")
+    model, frames = play(scene)
+    assert not any(crossed(model, frame) for frame in frames)
+    assert sum(frame.products for frame in frames) < 30_000
+
+
 def test_a_step_that_cannot_end_names_the_two_parts_that_meet(tmp_path: Path):
     plate = PLATE | {"path": [{"time": STEP, "by": [0, 0, -1.5 * HEIGHT]}]}
     with pytest.raises(StepFailed, match=r"the body and obstacle\.\d meet at|obstacle\.\d and the body meet at"):

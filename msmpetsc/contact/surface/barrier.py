@@ -12,6 +12,8 @@ them from its own (contact.surface.creases); so contacts are one set for each di
 ipctk is used on one thread, so that sums are the same each time; its arrays are of Fortran's order.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -64,7 +66,7 @@ class Barrier:
 
         ipctk.set_num_threads(1)
         ipctk.set_logger_level(ipctk.LoggerLevel.off)
-        self.ipctk, self.law = ipctk, law
+        self.ipctk, self.law, self._bodies = ipctk, law, bodies
         triangles = np.asfortranarray(surface.triangles, np.int32)
         edges = np.asfortranarray(ipctk.edges(triangles), np.int32)
         self.mesh = ipctk.CollisionMesh(np.asfortranarray(surface.points), edges, triangles)
@@ -142,7 +144,28 @@ class Barrier:
             ends += [np.asfortranarray(points + rest)]
             near += linear / (1 - linear) * (near + 2 * float(np.linalg.norm(rest, axis=1).max()))
         candidates.build(self.mesh, *ends, 0.5 * near, self.ipctk.LBVH())
-        return candidates, *self.creases[1:]
+        cushions = (self._cushion(points, distance + 2 * reach) for distance in self.distances[len(self.creases) :])
+        return candidates, *self.creases[1:], *cushions
+
+    @contextmanager
+    def cushioned(self, distance: float) -> Iterator[None]:
+        """Let obstacles push bodies from a farther ``distance`` [m], too; pairs found before lack its pairs."""
+        self.distances.append(distance)
+        self.potentials.append(self._potential(distance))
+        try:
+            yield
+        finally:
+            self.distances.pop()
+            self.potentials.pop()
+
+    def _cushion(self, points: Positions, distance: float) -> "ipctk.Candidates":
+        """Return the pairs of a body and an obstacle that may be nearer than this [m] at points (p, 3) [m]."""
+        mesh, pairs, usual = self.mesh, self.ipctk.Candidates(), self.mesh.can_collide
+        sides = np.repeat([0, 1], [self._bodies, len(points) - self._bodies])
+        mesh.can_collide = self.ipctk.make_vertex_patches_filter(sides)
+        pairs.build(mesh, np.asfortranarray(points), 0.5 * distance, self.ipctk.LBVH())
+        mesh.can_collide = usual
+        return pairs
 
     def around(self, touched: Mask, points: Positions, reach: float) -> PairSets:
         """Return, of points that have moved by no more than ``reach`` [m] from S (p, 3), the pairs whose edges and
@@ -255,7 +278,7 @@ class Barrier:
 
     def clearance(self, contacts: ContactSets, sets: PairSets, points: Positions) -> float:
         """Return no more than the least distance [m] of these pairs, of which contacts are all at points S (p, 3)."""
-        known = zip(contacts, sets, self.distances, strict=True)
+        known = zip(contacts, sets, self.distances, strict=False)  # a cushion has the same pairs
         least = (
             self._least(near, points) if len(near) else far for near, pairs, far in known if len(near) + len(pairs)
         )
@@ -280,7 +303,8 @@ class Barrier:
 
     def _share(self, start: Positions, end: Positions, sets: PairSets) -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
-        return min((pairs.compute_collision_free_stepsize(*ways) for pairs in sets if not pairs.empty()), default=1.0)
+        usual = [pairs for pairs in sets[: len(self.creases)] if not pairs.empty()]
+        return min((pairs.compute_collision_free_stepsize(*ways) for pairs in usual), default=1.0)
 
 
 def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:

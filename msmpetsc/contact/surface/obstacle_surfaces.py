@@ -16,8 +16,6 @@ from msmpetsc.scene.reading import Scene
 EDGES = 4.0  # of the bodies' surface: the longest of an obstacle, whose larger triangles would push stiffly
 MOST = 10_000  # triangles of an obstacle, from which on it is not split
 ROUND = 4  # times that an icosahedron's triangles are split: half a thousandth of its radius off the ball
-# Cells from an obstacle: the nodes that carry a surface beside it, which go as it does
-FIRST = 1.75
 # Cells, or ways where these are longer, beyond which nodes pass from an obstacle's way to their own
 BESIDE = 4.0
 # Cells: the least distance that inverse distances are of
@@ -69,19 +67,24 @@ class ObstacleSurfaces:
         owner = np.repeat(np.arange(len(self.solids)), [len(solid.points) for solid in self.solids])
         return np.stack([np.bincount(owner, along, len(self.solids)) for along in forces.T], axis=1)
 
-    def carried(self, q: Positions, moved: Rows, begin: float, end: float, cell: float) -> Rows:
-        """Return how far nodes q (n, 3) [m] go in a step, (n, 3) [m]: with obstacles near them, or by ``moved``.
+    def distances(self, x: Positions, time: float) -> Rows:
+        """Return lower bounds (n, k) [m] of the distances of x (n, 3) [m] from the obstacles at a time [s]."""
+        seen = [(o.solid, o.path.unmoved(x, o.path.value_at(time))) for o in self.obstacles]
+        return np.maximum(np.stack([-solid.depths(at)[0] for solid, at in seen], axis=1), 0.0)
 
-        Nodes of cells at an obstacle keep their place beside it. Between obstacles the ways are interpolated by inverse
+    def carried(self, q: Positions, moved: Rows, times: tuple[float, float], distances: Rows, cell: float) -> Rows:
+        """Return how far nodes q (n, 3) [m] go between two times [s], (n, 3) [m]: with obstacles or by ``moved``.
+
+        Nodes at an obstacle keep their place beside it. Between obstacles the ways are interpolated by inverse
         distances, so that a plate and a floor squeeze a body evenly; farther off, nodes pass to their own way.
+
+        distances : of each node from each obstacle (n, k) [m]; nodes at 0 keep their place
         """
         weights, near = np.zeros((len(q), 1)), np.zeros((len(q), 1))
         way = np.zeros_like(q)
-        for obstacle in self.obstacles:
-            path = obstacle.path
-            at_rest = path.unmoved(q, path.value_at(begin))
-            of_obstacle = path.moved(at_rest, path.value_at(end)) - q
-            distance = np.maximum(-obstacle.solid.depths(at_rest)[0] - FIRST * cell, 0.0)[:, None]
+        begin, end = times
+        for path, distance in zip((o.path for o in self.obstacles), distances.T[:, :, None], strict=True):
+            of_obstacle = path.moved(path.unmoved(q, path.value_at(begin)), path.value_at(end)) - q
             weight = 1 / np.maximum(distance, TOUCHING * cell)
             way, weights = way + weight * of_obstacle, weights + weight
             length = np.maximum(np.linalg.norm(of_obstacle, axis=1), cell)[:, None]

@@ -7,6 +7,8 @@ outlive a step (``NearPairs``); contacts at positions are known for as long as i
 touch, a step asks for the pairs around these alone, and for all of them once, where it has come to.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -224,6 +226,20 @@ class Contacts:
     def widen(self) -> None:
         """Ask for all pairs."""
         self.is_narrow, self.apart, self._moments = False, False, []
+
+    @contextmanager
+    def cushioned(self, distance: float) -> Iterator[None]:
+        """Let obstacles push bodies from a farther ``distance`` [m], too; all pairs are asked for from now on."""
+        with self.barrier.cushioned(distance) if self.barrier else nullcontext():
+            self._look_anew()
+            try:
+                yield
+            finally:
+                self._look_anew()
+
+    def _look_anew(self) -> None:
+        self.widen()
+        self.near.forget()
 
     def after_way(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
         """Return whether the way of a narrow step from q to x is free, and x right: other pairs store no more than

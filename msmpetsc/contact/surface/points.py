@@ -53,6 +53,19 @@ class SurfacePoints:
         points: Rows = self.sums @ self.to_root.send(self.weights @ v[: self.weights.shape[1]])
         return points
 
+    def distances(self, q: Positions, time: float) -> Rows:
+        """Return the least distances (owned, k) [m] from the obstacles of the points that each node carries.
+
+        A node that carries no point has its own. So a light node that swings far out belongs to its points.
+        """
+        points = self(q, time)[: self.bodies]
+        of_points = self.comm.bcast(self.obstacles.distances(points, time) if len(points) else None)
+        owned = self.weights.shape[1]
+        least = np.full((owned, of_points.shape[1]), np.inf)
+        carried = self.weights.tocoo()
+        np.minimum.at(least, carried.col, of_points[self.rows[carried.row]])
+        return np.where(np.isinf(least), self.obstacles.distances(q[:owned], time), least)
+
     def carried(self, numbers: Indices) -> csr_array:
         """Return the weights (k, owned) of this rank's nodes in points with these numbers (k,)."""
         row = np.searchsorted(self.rows, numbers)

@@ -192,7 +192,9 @@ def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trac
     assert error_of_lobes(run) < 0.02 * run.height
     assert run.moved(-1, body)[2] > -0.07  # it leans over and sags under its own weight
     assert run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]  # folded, and up again
-    assert 0 < run.inverted(-1) < 0.06 * len(run.cells)  # 29 of 999, in the tips of the lobes: springs do not undo a fold
+    assert (
+        0 < run.inverted(-1) < 0.06 * len(run.cells)
+    )  # 29 of 999, in the tips of the lobes: springs do not undo a fold
 
 
 def press_to(share: float) -> list[str]:

@@ -18,7 +18,6 @@ from crossings import count_crossings
 
 from msmpetsc.cli.main import main
 from msmpetsc.constraints.loads import Motion
-from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside
 from msmpetsc.geometry.registry import find
@@ -40,7 +39,7 @@ class Result:
             self.scene = SceneFile.model_validate(tomllib.loads(file.attrs["scene"]))
             self.time, self.q, self.kinetic = (file[f"frames/{name}"][:] for name in ("time", "position", "kinetic"))
             self.nodes, self.mass = file["lattice/nodes"][:], file["lattice/mass"][:]
-            self.cells = file["lattice/cells"][:]
+            self.cells, self.turned = file["lattice/cells"][:], file["frames/inverted"][:]
             self.gained = file["frames/energy_gained"][:]
             self.total = self.kinetic + sum(file[f"frames/{name}"][:] for name in ("elastic", "potential", "contact"))
             self.most = (self.kinetic + file["frames/elastic"][:]).max()
@@ -75,8 +74,8 @@ class Result:
         return np.diff(self.mean(self.q, np.ones(len(self.mass), bool)), axis=0) / self.time[1]
 
     def inverted(self, frame: int) -> int:
-        """Cells with a corner turned inside out."""
-        return int((least_volumes(self.q[frame], self.cells) <= 0).sum())
+        """Cells turned inside out: of springs a corner of them, of a solid their mean."""
+        return int(self.turned[frame])
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +192,9 @@ def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trac
     assert error_of_lobes(run) < 0.02 * run.height
     assert run.moved(-1, body)[2] > -0.07  # it leans over and sags under its own weight
     assert run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]  # folded, and up again
-    assert all(run.inverted(frame) == 0 for frame in range(0, len(run.q), 10))
+    assert (
+        0 < run.inverted(-1) < 0.06 * len(run.cells)
+    )  # 29 of 999, in the tips of the lobes: springs do not undo a fold
 
 
 def press_to(share: float) -> list[str]:
@@ -203,15 +204,13 @@ def press_to(share: float) -> list[str]:
 
 
 @pytest.mark.slow
-def test_pressed_to_30_percent_the_linear_law_inverts_cells_for_good_and_the_stiffening_one_does_not(result):
+def test_pressed_to_30_percent_springs_invert_cells_for_good_and_a_solid_does_not(result):
     """Section 6 of the paper: "its deformation effects will begin to distort"."""
     few = ["--set", "cages.count=500", "--set", "time.duration=2.4", "--set", "solver.error=1e-2"]
-    stiffening = result("lung_press", *press_to(0.3), *few)
-    linear = result("lung_press", *press_to(0.3), *few, "--set", "material.law=linear", may_fail=True)
-    assert linear.inverted(-1) > 0.05 * len(linear.cells)
-    inverted = [stiffening.inverted(frame) for frame in range(len(stiffening.q))]
-    assert max(inverted) < 0.01 * len(stiffening.cells) and inverted[-1] == 0  # two of the trachea, while it is crushed
-    assert error_of_lobes(stiffening) < 0.02 * stiffening.height
+    springs = result("lung_press", *press_to(0.3), *few, may_fail=True)
+    solid = result("lung_press", *press_to(0.3), *few, "--set", "material.law=neo-hookean")
+    assert springs.inverted(-1) > 0.05 * len(springs.cells)
+    assert solid.turned.max() == 0 and error_of_lobes(solid) < 0.02 * solid.height
 
 
 # ---- Figure 10
@@ -230,7 +229,7 @@ def test_the_heart_follows_the_pull_and_returns(result):
 
 
 def test_a_heart_of_tissue_keeps_its_volume_while_it_is_pulled_and_when_it_is_let_go(result):
-    """That of springs, whose Poisson's ratio is 1/4, gains 6% in the pull."""
+    """That of springs, whose Poisson's ratio is 1/4, gains 8% in the pull."""
     run = result("heart_tissue")
     triangles = run.body[1]
     volumes = [trimesh.Trimesh(points, triangles, process=False).volume for points in (run.body[0], *run.surface)]

@@ -115,7 +115,9 @@ class Material(Table):
     @model_validator(mode="after")
     def _solids_have_no_springs(self) -> Self:
         if self.law == SOLID and self.stiffness is not None:
-            raise rule('is of springs: give law = "linear", or young_modulus in its place', "stiffness")
+            raise rule(
+                'has stiffness, which is of springs: give law = "linear", or young_modulus in its place', "stiffness"
+            )
         return self
 
     @property

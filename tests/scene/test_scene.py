@@ -146,7 +146,6 @@ MISTAKES = [  # what is changed, into what, the key that is named, and its line
     ("young_modulus = 5e4", "young_modulus = 5e4\nstiffness = 1", "material", 12),
     ("density = 1000", "", "material.density", 12),
     ("density = 1000", 'density = 1000\nlaw = "linear"\npoisson_ratio = 0.3', "material.poisson_ratio", 16),
-    ("young_modulus = 5e4", "stiffness = 1", "material.stiffness", 13),
     ("[material]", "[materail]", "materail", 12),
     ("step = 0.0166667", 'step = "1e-3"', "time.step", 17),
     ("duration = 2.0", "duration = 0.001", "time.duration", 18),
@@ -179,6 +178,12 @@ MISTAKES = [  # what is changed, into what, the key that is named, and its line
 def test_a_mistake_is_named(tmp_path, old, new, key, line):
     (text,) = problems(tmp_path, changed(old, new))
     assert text.startswith(f"scene.toml: {key}: ") and text.endswith(f" (line {line})"), text
+
+
+def test_a_stiffness_without_a_law_is_refused_with_the_remedy(tmp_path):
+    (text,) = problems(tmp_path, changed("young_modulus = 5e4", "stiffness = 1"))
+    assert 'give law = "linear"' in text
+    assert load(tmp_path, changed("young_modulus = 5e4", 'law = "linear"\nstiffness = 1')).material.poisson is None
 
 
 def test_all_problems_at_once_each_with_its_line(tmp_path):

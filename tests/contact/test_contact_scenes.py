@@ -88,7 +88,7 @@ def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_p
 
 
 def test_bodies_side_by_side_are_not_thrown_apart_without_a_distance_given(tmp_path):
-    """Their gap of 0.4 mm is less than a fortieth of a cell, which would push them from the start."""
+    """Their gap of 0.4 mm is less than 1/64 of a cell, which would push them from the start."""
     gap, mesh = 0.4e-3, box(tmp_path, "block", [SIDE] * 3)
     scene = write(
         tmp_path,

@@ -26,7 +26,7 @@ from msmpetsc.scene.reading import Scene
 NEAR = 3e-4
 # Share of a cell; the distance, if a scene gives none and no parts are nearer at rest. A thinner barrier gives way
 # before a cell does, and cuts Newton's directions to a few hundredths (scripts/results/impact.md).
-SHARE = 1 / 40
+SHARE = 1 / 64
 MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
 LONG = 2.0  # cells
 FEWEST = 20  # triangles of a body

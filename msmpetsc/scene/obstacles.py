@@ -87,8 +87,9 @@ class SelfContactTable(Table):
 
     distance: Positive | None = Field(
         None,
-        description="parts nearer than this push each other [m]; if absent 3e-4 of the rest bounding box's diagonal, "
-        "or the median distance of a coarser surface from the body's own if that is more",
+        description="parts nearer than this push each other [m]; if absent the greatest of 3e-4 of the rest bounding "
+        "box's diagonal, the median distance of a coarser surface from the body's own, and 1/64 of a cell or "
+        "the least gap at rest if that is less",
     )
     friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
     friction_speed: Positive | None = Field(None, description=FRICTION_SPEED)

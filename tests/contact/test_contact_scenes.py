@@ -62,6 +62,48 @@ def middles(model: Model, frames: list[Frame], bodies: np.ndarray) -> np.ndarray
     return np.array([[own @ frame.position for own in each] for frame in frames])
 
 
+def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_path):
+    """With 3e-4 of the diagonal for a distance, 0.1 mm in cells of 80 mm, the median was 60 iterations."""
+    block = box(tmp_path, "block", [0.2] * 3)
+    trimesh.creation.icosphere(subdivisions=2, radius=0.11).export(tmp_path / "ball.ply")
+    meshes, places = [block, {"source": "ball.ply"}, block], [0.0, 0.05, -0.04]
+    bodies = [
+        {"mesh": mesh | {"base": [x, 0.3 * x, 0.03 + 0.25 * i]}, "start": {"velocity": [0, 0, -2.0 - i]}}
+        for i, (mesh, x) in enumerate(zip(meshes, places, strict=True))
+    ]
+    floor = {"shape": "box", "box": [[-1, -1, -0.2], [1, 1, 0]], "response": "barrier"}
+    scene = write(
+        tmp_path,
+        body=bodies,
+        cages={"cell_size": 0.08},
+        material={"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3},
+        time={"step": 0.01, "duration": 0.08},
+        self_contact={"friction": 0.3},
+        obstacle=[floor],
+    )
+    model, frames = play(scene)
+    hard = [frame.iterations for frame in frames if frame.self_contacts > 20]
+    assert len(hard) >= 6 and np.median(hard) <= 25  # 13
+    assert crossings(model, frames) == 0
+
+
+def test_bodies_side_by_side_are_not_thrown_apart_without_a_distance_given(tmp_path):
+    """Their gap of 0.4 mm is less than 1/64 of a cell, which would push them from the start."""
+    gap, mesh = 0.4e-3, box(tmp_path, "block", [SIDE] * 3)
+    scene = write(
+        tmp_path,
+        body=[{"mesh": mesh | {"base": [i * (SIDE + gap), 0, 0]}} for i in range(2)],
+        cages={"cell_size": SIDE / 2},
+        time={"step": 0.01, "duration": 0.01},
+        gravity={"acceleration": [0, 0, 0]},
+        self_contact={},
+    )
+    model, frames = play(scene)
+    assert model.collision is not None
+    assert model.collision.law.distance == pytest.approx(gap, rel=1e-3)
+    assert frames[-1].self_contact < 1e-12 and frames[-1].kinetic < 1e-12
+
+
 @pytest.mark.parametrize("beyond", [-1.0, 1.0])
 def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides_above_it(tmp_path, beyond: float):
     """On one of 1.2 m it crept at 6 to 9 mm/s, and had slid 2.3 mm before that."""

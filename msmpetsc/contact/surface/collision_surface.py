@@ -22,7 +22,11 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
 from msmpetsc.scene.reading import Scene
 
-NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
+# Share of the bounding box's diagonal; the least distance, if a scene gives none.
+NEAR = 3e-4
+# Share of a cell; the distance, if a scene gives none and no parts are nearer at rest. A thinner barrier gives way
+# before a cell does, and cuts Newton's directions to a few hundredths (scripts/results/impact.md).
+SHARE = 1 / 64
 MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
 LONG = 2.0  # cells
 FEWEST = 20  # triangles of a body
@@ -50,7 +54,10 @@ def collision_surface(
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
     sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)
-    distance = table.distance or max(NEAR * float(np.linalg.norm(sides)), off)
+    joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))
+    least, bodies_end = NEAR * float(np.linalg.norm(sides)), sum(map(len, points))
+    widest = min(SHARE * lattice.cell_size, edge / 2)
+    distance = table.distance or max(least, off, _gap(comm, joint, widest, bodies_end, meets_itself))
     # kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells, E / h, and what its
     # inertia adds in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness)
     # takes both of each contact; with those of the stiffest cell it, and the energy of a state, is always the same.
@@ -59,7 +66,6 @@ def collision_surface(
     stick = table.friction_speed or STICK * smallest(np.array([body.bounds for body in bodies]))
     law = BarrierLaw(distance, float(distance**2 * layer), table.friction, stick)
     carried = SurfacePoints(comm, lattice, embedding, met)
-    joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))
     names = [f"body.{number}" if len(bodies) > 1 else "the body" for number in range(len(bodies))]
     names += [f"obstacle.{number}" for number in met.numbers]
     counts = [len(part.points) for part in (*surfaces, *met.solids)]
@@ -91,6 +97,26 @@ def _prepared(
     if table.surface is None:
         _warn_of_long_triangles(edges.max(), max(cell_size, 2 * (table.distance or 0.0)))
     return bodies, off, float(edges.mean())
+
+
+def _gap(comm: MPI.Comm, surface: Surface | None, widest: float, bodies: int, meets_itself: bool) -> float:
+    """Return the least distance [m] at rest of parts that push each other, at most ``widest`` [m] (collective).
+
+    A wider barrier would throw apart bodies that a scene puts side by side.
+
+    surface : on rank 0
+    bodies  : number of its first points, those of bodies
+    """
+
+    def of_root() -> float:
+        assert surface is not None
+        barrier = Barrier(surface, BarrierLaw(widest, 1.0, 0.0, 1.0), bodies, meets_itself)
+        barrier.leave_out_neighbours(surface.points)
+        near = barrier.contacts(barrier.candidates(surface.points, 0.0), surface.points)
+        return min(barrier.least(near, surface.points), widest)
+
+    gap: float = comm.bcast(on_root(comm, of_root))
+    return gap
 
 
 def _refuse_touching(surface: CollisionSurface) -> None:

@@ -78,6 +78,15 @@ def test_a_block_that_touches_another_at_rest_lies_on_it(folder: Path, meshes: l
     assert abs(sunk[:2]).max() < 1e-4 and -DISTANCE < sunk[2] < 0.2 * free
 
 
+def test_cubes_side_by_side_in_the_same_plane_of_the_grid_stay_where_they_are(folder: Path):
+    """Without a distance given: the gap made must be more than what a coordinate may be off a plane."""
+    bodies = [body("block", [number * SIDE, 0, 0]) for number in range(2)]
+    tables = {"time": {"step": 0.01, "duration": 0.03}, "gravity": {"acceleration": [0, 0, 0]}}
+    model, frames = play(write(folder, "side_by_side", body=bodies, self_contact={}, **tables))
+    assert model.collision is not None
+    assert abs(frames[-1].position - frames[0].position).max() < model.collision.law.distance
+
+
 def test_bodies_that_overlap_at_rest_are_named(folder: Path):
     with pytest.raises(InputError, match=r"cut others at rest.* \(of body\.0, body\.1, which must be parted"):
         play(pile(folder, ["block", "block"], -0.1 * SIDE))

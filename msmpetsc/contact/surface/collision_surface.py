@@ -16,6 +16,7 @@ from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.grid import SAME
 from msmpetsc.geometry.prepare import simplify
 from msmpetsc.geometry.surface import Surface, compact, joined, outward
 from msmpetsc.lattice.lattice import Lattice
@@ -90,8 +91,10 @@ def _prepared(
         coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
-        sides = max((np.ptp(body.points, axis=0) for body in bodies), key=np.linalg.norm)
-        bodies = _without_cut(_parted(bodies, NEAREST * (table.distance or NEAR * float(np.linalg.norm(sides)))))
+        longest = max(float(np.linalg.norm(np.ptp(body.points, axis=0))) for body in bodies)
+        # Points nearer to a plane of the grid than SAME are on it: a lesser gap would be none.
+        gap = max(NEAREST * (table.distance or NEAR * longest), 2 * SAME * longest)
+        bodies = _without_cut(_parted(bodies, gap))
     ends = np.concatenate([b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies])
     edges = np.linalg.norm(ends, axis=2)
     if table.surface is None:

@@ -62,7 +62,7 @@ EFFORT = SearchEffort(4, 12, 2)
 # With multigrid smooth modes come at once. But not where something is alarming: one bent by 270 degrees had a lowest
 # curvature of 0.04, and seemed to have 0.35.
 UNIFORM_EFFORT = SearchEffort(2, 3, 1)
-UNCHANGED = 0.1  # of its curvature: a mode that is followed by multigrid is taken as it is
+UNCHANGED = 0.1  # of its curvature: a mode that is followed is taken as it is
 LIGHT = 0.5  # load factor: up to there no mode need be known
 UNSEEN = 1.2  # times the load factor that a few iterations find, which is no more than the true one
 GROWN = 4.0  # times the compression that it was found at: so far a body is taken to be loaded alike
@@ -213,10 +213,10 @@ class LowestCurvature:
         if self.mode is None:
             return None
         its = self.effort.followed
-        if self.preconditioner.is_uniform:
-            values, modes = self._iterate(self.mode[None], 1, 0, 0)
-            if abs(values[0] - self.value) <= UNCHANGED * self.value:
-                return np.array([self.value]), modes  # as it was, so that slow changes add up
+        values, modes = self._iterate(self.mode[None], 1, 0, 0)
+        if abs(values[0] - self.value) <= UNCHANGED * self.value:
+            # As it was, so that slow changes add up
+            return np.array([self.value]), modes
         values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)
 

@@ -1,6 +1,6 @@
 """Tables of what the body is: surface, cells, material, parts, and regions of it."""
 
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Final, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -21,7 +21,7 @@ from msmpetsc.scene.values import (
     only_for,
 )
 
-SOLID = "neo-hookean"
+SOLID: Final = "neo-hookean"
 
 PoissonRatio = Annotated[float, Field(ge=0, le=0.4999)]
 

@@ -79,5 +79,5 @@ class Method(ABC):
             if Stop.agreed(self.functional.comm):
                 raise StepStopped("stopped by a signal")
             worst = where_worst(self.functional, iterate)
-            raise not_converged(self.snes, self.ksp, outcome, self.iterations, worst, self.preset.true_hessian)
+            raise not_converged(self.snes, self.ksp, outcome, self.snes.its, worst, self.preset.true_hessian)
         return outcome

@@ -22,6 +22,7 @@ from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
 from msmpetsc.solve.nonlinear.method import REASON, Method
 from msmpetsc.solve.petsc.events import LOCAL
+from msmpetsc.solve.petsc.library import destroy_forgotten
 
 # Iterations with the projected Hessian, which comes in slowly, before the true one has another try
 PROJECTED = 5
@@ -88,6 +89,7 @@ class Newton(Method):
                 projected = PROJECTED
                 continue
             before = outcome.residual
+            destroy_forgotten(self.functional.comm)
             now, outcome = found, self.control.judge(found, outcome)
             asks |= flat and outcome.residual > RAISED * before
             projected, its = max(projected - 1, 0), its + 1

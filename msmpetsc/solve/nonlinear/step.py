@@ -26,7 +26,7 @@ from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.newton import SOFTER, Newton
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.petsc.events import LOCAL
-from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
+from msmpetsc.solve.petsc.library import destroy_forgotten, petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
@@ -198,6 +198,7 @@ class Stepper:
             distance = self.functional.distance(now.q)
             error = self.control.rounding.added_to(verdict.error, distance, outcome.at_rounding)
             cost = replace(self.spent(), step_error=error)
+            destroy_forgotten(self.comm)
             slack = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
             return StepResult(now.q, problem.q, cost, problem=problem, slack=slack)
 

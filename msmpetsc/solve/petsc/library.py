@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices

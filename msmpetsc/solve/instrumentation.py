@@ -78,10 +78,10 @@ class TrueErrors:
 
 def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
     """Return |x - x*|_M and g(x) - g*."""
-    functional, vector = reference.functional, reference.unknowns.create_vector()
+    functional, vector = reference.functional, reference.functional.vectors.take()
     reference.unknowns.from_nodes(x - exact, vector)
     distance = functional.norm(vector)
-    vector.destroy()
+    functional.vectors.give_back(vector)
     return np.array([distance, functional.change(functional.at(x).q, exact)[0]])
 
 

@@ -127,9 +127,9 @@ class LoadPath:
             if self.holding is None:
                 stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
                 functional.begin(replace(whole, y=self.base, prescribed=None))
-                f = functional.at(self.base).f
+                held = functional.at(self.base)
                 self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
-                self.holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
+                self.holding[stepper.unknowns.free] = stepper.unknowns.columns(held.f).T / functional.t2
             load = load + (1 - share) * self.holding
             prescribed = self.environment.anchors.prescribed(self.base, self.time, self.time - self.time_step, share)
         return replace(whole, y=self.base, load=load, prescribed=prescribed)

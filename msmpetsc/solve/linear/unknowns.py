@@ -6,6 +6,7 @@ can multiply at once.
 """
 
 from typing import NamedTuple
+from weakref import finalize
 
 import numpy as np
 from mpi4py import MPI
@@ -107,6 +108,39 @@ class Unknowns:
         """Collective."""
         self.scatter.destroy()
         self.ghost_values.destroy()
+
+
+class VectorPool:
+    """Vectors of unknowns that are lent to their users, until these give them back or are forgotten.
+
+    A vector of several ranks must be destroyed by all of them together. So the pool destroys its vectors itself,
+    once, and no vector is destroyed as Python forgets it.
+    """
+
+    def __init__(self, unknowns: Unknowns):
+        self.unknowns = unknowns
+        self._all: list[PETSc.Vec] = []
+        self._free: list[PETSc.Vec] = []
+
+    def take(self) -> PETSc.Vec:
+        """Return a vector of any values (collective)."""
+        if self._free:
+            return self._free.pop()
+        self._all.append(self.unknowns.create_vector())
+        return self._all[-1]
+
+    def lend(self, user: object, *vectors: PETSc.Vec) -> None:
+        """Take vectors back when nothing refers to their user any more."""
+        finalize(user, self._free.extend, vectors).atexit = False
+
+    def give_back(self, vector: PETSc.Vec) -> None:
+        """Take a vector back."""
+        self._free.append(vector)
+
+    def destroy(self) -> None:
+        """Collective."""
+        for vector in self._all:
+            vector.destroy()
 
 
 class Ghosted:

@@ -17,7 +17,7 @@ from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.initial_state import uniform
-from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.linear.unknowns import Unknowns, VectorPool
 from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
 
 ROUNDINGS = 3 * np.finfo(float).eps  # of a row of F: in free fall one eps was passed now and then
@@ -78,6 +78,7 @@ class StepFunctional:
         nodes = self.lattice.nodes
         self.problem = StepProblem(nodes, nodes, np.zeros((self.lattice.owned, 3), like=nodes))
         self.extent = 0.0  # greatest coordinate of the problem's q [m]
+        self.vectors = VectorPool(unknowns)
         self._gradient = np.empty_like(nodes)
 
     def begin(self, problem: StepProblem) -> None:
@@ -93,10 +94,9 @@ class StepFunctional:
         self.unknowns.to_nodes(x, q)
         return q
 
-    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec | None = None, q: Positions | None = None) -> Iterate:
-        """Return the iterate of x; its F is written into f [kg m], or a new vector, and q (l, 3) are its positions."""
+    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec, q: Positions | None = None) -> Iterate:
+        """Return the iterate of x; its F is written into f [kg m], and q (l, 3) [m] are its positions if known."""
         problem, gradient, owned = self.problem, self._gradient, self.lattice.owned
-        f = x.duplicate() if f is None else f
         with GRADIENT:
             q = self.positions(x) if q is None else q
             gradient[:] = 0
@@ -110,9 +110,15 @@ class StepFunctional:
 
     def at(self, q: Positions) -> Iterate:
         """Return the iterate whose free nodes are at q (l, 3) [m]."""
-        x = self.unknowns.create_vector()
+        x = self.vectors.take()
         self.unknowns.from_nodes(q, x)
-        return self.evaluate(x)
+        return self.iterate(x)
+
+    def iterate(self, x: PETSc.Vec, q: Positions | None = None) -> Iterate:
+        """Return the iterate of a vector of the pool, which the iterate keeps; q (l, 3) [m] as in ``evaluate``."""
+        iterate = self.evaluate(x, self.vectors.take(), q)
+        self.vectors.lend(iterate, iterate.x, iterate.f)
+        return iterate
 
     def value(self, q: Positions, met: bool = False) -> float:
         """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart.

@@ -32,7 +32,8 @@ class LocalGlobal(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.vectors = self.x, self.f = [self.functional.unknowns.create_vector() for _ in range(2)]
+        vectors = self.functional.vectors
+        self.x, self.f, self.own = vectors.take(), vectors.take(), vectors.take()
         self.base: Iterate | None = None
         self.outcome = Outcome()
         self.snes.setFunction(self._residual, self.f)
@@ -63,7 +64,9 @@ class LocalGlobal(Method):
         start.x.copy(self.x)
         self.snes.solve(None, self.x)
         self.iterations += self.snes.its
-        iterate = self.functional.evaluate(self.snes.getSolution().copy())
+        end = self.functional.vectors.take()
+        self.snes.getSolution().copy(end)
+        iterate = self.functional.iterate(end)
         self.outcome = self.finish(iterate, self.outcome)
         if not (self.outcome.is_enough or self.budget):
             ends = f"-{self.prefix}snes_type {self.snes.getType()} ends by a rule of its own"
@@ -85,10 +88,11 @@ class LocalGlobal(Method):
         """Shorten the way from x to x - y where the surface meets itself on it; return whether it was."""
         if self.functional.surface is None:
             return False
-        end = x.duplicate()
+        end = self.functional.vectors.take()
         end.waxpy(-1.0, y, x)
         with LOCAL:
             share = self.functional.free_share(self.functional.positions(x), self.functional.positions(end))
+        self.functional.vectors.give_back(end)
         if share < 1.0:
             y.scale(share)
         return share < 1.0
@@ -109,7 +113,10 @@ class LocalGlobal(Method):
         """Return PETSc's reason to end by the iterate's error or the budget; 0 to go on (its convergence test)."""
         if its > 0 or not self.has_npc:
             x = snes.getSolution()
-            iterate = self.functional.evaluate(x) if self.has_npc else Iterate(x, self.functional.positions(x), self.f)
+            # With an NPC, ``f`` is of another x
+            iterate = Iterate(x, self.functional.positions(x), self.own if self.has_npc else self.f)
+            if self.has_npc:
+                self.functional.evaluate(x, self.own, iterate.q)
             self.outcome = self.control.judge(iterate, self.outcome)
         reason = self.reason_to_end(its, self.outcome)
         if not reason:

@@ -43,7 +43,7 @@ class Minimum:
         self, functional: StepFunctional, estimate: ErrorEstimate, curvature: LowestCurvature, rounding: Rounding
     ):
         self.functional, self.estimate, self.curvature, self.rounding = functional, estimate, curvature, rounding
-        self.memory = functional.memory
+        self.memory, self.first = functional.memory, functional.vectors.take()
 
     def examine(self, at: Iterate, outcome: Outcome, enough: float) -> Verdict:
         """Examine an iterate, or rather the point that is the iterate less its estimated error.
@@ -54,7 +54,8 @@ class Minimum:
         functional, estimate, compression = self.functional, self.estimate, outcome.compression
         assert compression is not None
         nearer = self._follow(at) if outcome.corrected else None
-        corrected, first = nearer is not None, estimate.correction.copy()
+        corrected, first = nearer is not None, self.first
+        estimate.correction.copy(first)
         if nearer is None:
             nearer = at
             first.set(0.0)
@@ -86,12 +87,13 @@ class Minimum:
 
     def _follow(self, at: Iterate) -> Iterate | None:
         """Return an iterate less its correction; None if the surface meets itself on the way."""
-        x = at.x.duplicate()
+        functional, x = self.functional, self.functional.vectors.take()
         x.waxpy(-1.0, self.estimate.correction, at.x)
-        q = self.functional.positions(x)
-        if self.functional.surface is not None and self.functional.free_share(at.q, q) < 1.0:
+        q = functional.positions(x)
+        if functional.surface is not None and functional.free_share(at.q, q) < 1.0:
+            functional.vectors.give_back(x)
             return None
-        return self.functional.evaluate(x, q=q)
+        return functional.iterate(x, q)
 
     def _second_estimate(
         self, nearer: Iterate, correction: PETSc.Vec, bound: float, enough: float, lowest: float
@@ -138,17 +140,18 @@ class Minimum:
         move = FIRST_MOVE * functional.lattice.cell_size / longest
         if slope > SLOPE * abs(curvature) * move:  # else both ways lead down, and ranks must not differ
             move = -move
-        best, lowest = None, 0.0
+        x, best, lowest = functional.vectors.take(), 0.0, 0.0
         for _ in range(MOVES):
-            x = at.x.duplicate()
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
             q = functional.positions(x)
             change = functional.change(q, base)[0] if functional.free_share(base, q) == 1.0 else np.inf
             if change < lowest:
-                best, lowest = (x, q), change
+                best, lowest = move, change
                 move *= 2
-            elif best is None:
+            elif best == 0.0:
                 move /= 2
             else:
                 break
-        return functional.evaluate(best[0], q=best[1]) if best else None
+        self.memory.write(x)[:] = self.memory.read(at.x) + best * direction
+        lower = functional.iterate(x)
+        return lower if best != 0.0 else None

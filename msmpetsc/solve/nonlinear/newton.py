@@ -22,7 +22,6 @@ from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
 from msmpetsc.solve.nonlinear.method import REASON, Method
 from msmpetsc.solve.petsc.events import LOCAL
-from msmpetsc.solve.petsc.library import destroy_forgotten
 
 # Iterations with the projected Hessian, which comes in slowly, before the true one has another try
 PROJECTED = 5
@@ -47,7 +46,8 @@ class Newton(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.vectors = self.y, self.end = [self.functional.unknowns.create_vector() for _ in range(2)]
+        vectors = self.functional.vectors
+        self.y, self.end = vectors.take(), vectors.take()
         self.friction = FrictionDuals()
         self.most_its = self.ksp.getTolerances()[3]
         # V U' of a softer solid's cells, for the first Hessian of the next solve
@@ -89,7 +89,6 @@ class Newton(Method):
                 projected = PROJECTED
                 continue
             before = outcome.residual
-            destroy_forgotten(self.functional.comm)
             now, outcome = found, self.control.judge(found, outcome)
             asks |= flat and outcome.residual > RAISED * before
             projected, its = max(projected - 1, 0), its + 1
@@ -150,26 +149,26 @@ class Newton(Method):
 
         flat : g is so near its minimum that its change has no digits: the full step is taken
         """
-        slope, s = -abs(self.y.dot(now.f)), 1.0
+        slope, s, x = -abs(self.y.dot(now.f)), 1.0, self.functional.vectors.take()
         while s > SHORTEST:
-            x = now.x.duplicate()
             x.waxpy(-s, self.y, now.x)
             with LOCAL:
                 q = self.functional.positions(x)
                 self.friction.see(q, now.q, s == 1.0)
                 change, _ = (-np.inf, 0.0) if flat else self.functional.change(q, now.q)
                 if change <= ALPHA * s * slope:
-                    return self.functional.evaluate(x, x.duplicate(), q)
+                    return self.functional.iterate(x, q)
             # The minimum of the parabola through g(0), its slope and g(s)
             best = -slope * s / (2 * (change - s * slope)) if np.isfinite(change) else LEAST
             s *= min(max(best, LEAST), MOST)
+        self.functional.vectors.give_back(x)
         return None
 
     def _limit(self, now: Iterate) -> bool:
         """Shorten or bend y where it enters obstacles or crosses the surface; return whether it did."""
         if self.functional.problem.contact is None:
             return False
-        end = now.x.duplicate()
+        end = self.end
         end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
             after = self.functional.positions(end)

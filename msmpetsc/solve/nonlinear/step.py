@@ -26,7 +26,7 @@ from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.newton import SOFTER, Newton
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.petsc.events import LOCAL
-from msmpetsc.solve.petsc.library import destroy_forgotten, petsc_errors, total_iterations
+from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
@@ -93,6 +93,7 @@ class Stepper:
         of_rank = elasticity.solid.stiffest if elasticity.solid else 0.0
         self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)  # lambda of a cell, in mu
         self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
+        self.owned.callback(self.functional.vectors.destroy)
         self.first_guess = FirstGuess(self.functional, self.preset.iterations is None)
         self.options = SolverOptions(self.preset, self.prefix, self.budget)
         try:
@@ -101,8 +102,8 @@ class Stepper:
                 self.snes, self.ksp = self._create_solvers()
                 self.control, self.minimum = self._create_control()
                 self.method = self._create_method()
-                vectors = tuple(self._keep(self.unknowns.create_vector()) for _ in range(3))
-                self.led_start = LedStart(self.functional, self.jacobian, self.ksp, vectors)
+                take = self.functional.vectors.take
+                self.led_start = LedStart(self.functional, self.jacobian, self.ksp, (take(), take(), take()))
         except InputError:
             self.destroy()
             raise
@@ -164,8 +165,6 @@ class Stepper:
             self.ksp.setMonitor(self.control.solve_bound.watch)
         else:
             method = LocalGlobal(*given, self.prefix, self.options.is_given("npc_snes_type"))
-        for vector in method.vectors:
-            self._keep(vector)
         return method
 
     def set_up(self) -> None:
@@ -198,7 +197,6 @@ class Stepper:
             distance = self.functional.distance(now.q)
             error = self.control.rounding.added_to(verdict.error, distance, outcome.at_rounding)
             cost = replace(self.spent(), step_error=error)
-            destroy_forgotten(self.comm)
             slack = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
             return StepResult(now.q, problem.q, cost, problem=problem, slack=slack)
 
@@ -218,9 +216,10 @@ class Stepper:
 
     def _balanced(self, now: Iterate, multigrid: LatticePreconditioner) -> Iterate:
         """Return an iterate with bodies moved as wholes to where their forces balance, as far as they do not meet."""
-        x = now.x.copy()
+        x = self.functional.vectors.take()
+        now.x.copy(x)
         multigrid.balance(now.q, self.functional.problem.contact, now.f, x)
-        balanced = self.functional.evaluate(x)
+        balanced = self.functional.iterate(x)
         share = self.functional.free_share(now.q, balanced.q)
         return balanced if share == 1.0 else self.functional.at(now.q + share * (balanced.q - now.q))
 

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
@@ -112,12 +111,3 @@ def last_words(error: BaseException) -> str:
         return words
     types = vars(getattr(PETSc, wanted[1]).Type).values()
     return words + did_you_mean(wanted[2], [name for name in types if isinstance(name, str)])
-
-
-def destroy_forgotten(comm: MPI.Comm) -> None:
-    """Destroy PETSc's objects that nothing refers to any more (collective).
-
-    On several ranks petsc4py only lists these, since their destruction must be collective.
-    """
-    if comm.size > 1:
-        PETSc.garbage_cleanup(comm)

@@ -23,7 +23,7 @@ class LocalGlobal(Method):
 
     prefix  : of its options
     has_npc : a plain iteration preconditions SNES
-    base    : iterate that changes of g are counted from
+    base    : positions (l, 3) [m] that changes of g are counted from
     outcome : of SNES's last iterate
     """
 
@@ -34,7 +34,7 @@ class LocalGlobal(Method):
         super().__post_init__()
         vectors = self.functional.vectors
         self.x, self.f, self.own = vectors.take(), vectors.take(), vectors.take()
-        self.base: Iterate | None = None
+        self.base = self.functional.problem.q
         self.outcome = Outcome()
         self.snes.setFunction(self._residual, self.f)
         self.snes.setJacobian(self._linearise, self.jacobian.operator)
@@ -49,7 +49,7 @@ class LocalGlobal(Method):
         """Begin a step: there is nothing to forget."""
 
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
-        self.base, self.outcome = start, replace(outcome, residual=np.inf)
+        self.base, self.outcome = start.q, replace(outcome, residual=np.inf)
         if self.has_npc:
             # It solves with A before SNES looks at its start
             self.outcome = self.control.judge(start, self.outcome)
@@ -79,9 +79,8 @@ class LocalGlobal(Method):
 
     def _objective(self, _: PETSc.SNES, x: PETSc.Vec) -> float:
         """Return g(x) - g(base), a difference that keeps its digits; -1 where it has none left, so that x is taken."""
-        assert self.base is not None
         with LOCAL:
-            change, distance = self.functional.change(self.functional.positions(x), self.base.q)
+            change, distance = self.functional.change(self.functional.positions(x), self.base)
         return -1.0 if self.outcome.is_flat and distance > 0 else change
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
@@ -100,8 +99,8 @@ class LocalGlobal(Method):
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Take contact at x, and the start of the linear solve (SNES calls it before each)."""
         with LOCAL:
-            self.base = Iterate(x, self.functional.positions(x), self.f)
-            self.jacobian.linearise(self.base.q, self.functional.problem.contact, False, None)
+            self.base = self.functional.positions(x)
+            self.jacobian.linearise(self.base, self.functional.problem.contact, False, None)
         if self.preset.start_from_b:
             # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
             z = snes.getSolutionUpdate()

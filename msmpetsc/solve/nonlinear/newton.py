@@ -168,33 +168,35 @@ class Newton(Method):
         """Shorten or bend y where it enters obstacles or crosses the surface; return whether it did."""
         if self.functional.problem.contact is None:
             return False
-        end = self.end
-        end.waxpy(-1.0, self.y, now.x)
+        self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
-            after = self.functional.positions(end)
-            stopped = self._stop_at_obstacles(now, after, end)
-            if stopped is not None:
-                self.y.waxpy(-1.0, end, now.x)
+            after = self.functional.positions(self.end)
+            stopped = self._stop_at_obstacles(now, after)
             share = self.functional.free_share(now.q, after if stopped is None else stopped)
         if share < 1.0:
             self.y.scale(share)
         return stopped is not None or share < 1.0
 
-    def _stop_at_obstacles(self, now: Iterate, after: Positions, end: PETSc.Vec) -> Positions | None:
-        """Return where nodes that come into an obstacle on a way (l, 3) end at its surface, and write it into ``end``;
-        None where g is no less there.
+    def _stop_at_obstacles(self, now: Iterate, after: Positions) -> Positions | None:
+        """Bend y so that nodes that come into an obstacle on the way to ``after`` (l, 3) [m] end at its surface.
+
+        Return where they end; None where y stays, since g is no less there, or the bent way leads uphill.
 
         H at x knows nothing of obstacles that are not touched yet: nodes run deep into them, and a line search that
         shortens the whole way for it would let them come in one by one.
         """
-        functional, contact = self.functional, self.functional.problem.contact
+        functional, contact, bent = self.functional, self.functional.problem.contact, self.end
         stopped = contact.stopped(after, now.q) if contact else None
         if not functional.comm.allreduce(stopped is not None, MPI.LOR):
             return None
-        functional.unknowns.from_nodes(after if stopped is None else stopped, end)
+        functional.unknowns.from_nodes(after if stopped is None else stopped, bent)
         # Nodes that are led stay where they are led to
-        free = functional.positions(end)
+        free = functional.positions(bent)
         # Without self-contact, which costs most
         if functional.value(free) >= functional.value(after):
             return None
-        return free if functional.change(free, now.q)[0] < 0 else None
+        bent.aypx(-1.0, now.x)
+        if not bent.dot(now.f) > 0:
+            return None
+        bent.copy(self.y)
+        return free

@@ -33,6 +33,8 @@ ALPHA = 1e-4
 LEAST, MOST = 0.1, 0.5
 # Shortest share of a direction: of a way that climbs a smaller one may seem to fall, by rounding
 SHORTEST = 1e-6
+# Share of its slope that a direction keeps as it is bent at obstacles
+DOWNHILL = 0.1
 # Rise of |F| after a full step that no energy was asked for: friction and contact have kinks that g has no digits for
 RAISED = 2.0
 KSP = PETSc.KSP.ConvergedReason
@@ -180,7 +182,7 @@ class Newton(Method):
     def _stop_at_obstacles(self, now: Iterate, after: Positions) -> Positions | None:
         """Bend y so that nodes that come into an obstacle on the way to ``after`` (l, 3) [m] end at its surface.
 
-        Return where they end; None where y stays, since g is no less there, or the bent way leads uphill.
+        Return where they end; None where y stays, since g is no less there, or the bent way hardly leads downhill.
 
         H at x knows nothing of obstacles that are not touched yet: nodes run deep into them, and a line search that
         shortens the whole way for it would let them come in one by one.
@@ -196,7 +198,7 @@ class Newton(Method):
         if functional.value(free) >= functional.value(after):
             return None
         bent.aypx(-1.0, now.x)
-        if not bent.dot(now.f) > 0:
+        if not bent.dot(now.f) > DOWNHILL * self.y.dot(now.f):
             return None
         bent.copy(self.y)
         return free

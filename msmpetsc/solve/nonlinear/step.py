@@ -34,6 +34,8 @@ from msmpetsc.solve.work import Work
 DOUBTS = 100
 # Options of SNES that the loop of Newton's method (nonlinear.newton) has no use for
 OF_SNES = ("snes_type", "snes_linesearch", "snes_ksp_ew", "npc_snes")
+# What the loop is, in PETSc's words: a run that goes on from another method may say so
+LOOP = {"snes_type": "newtonls", "snes_linesearch_type": "bt"}
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,6 @@ class Stepper:
         has_npc = self.options.is_given("npc_snes_type")
         if self.preset.true_hessian:
             self._refuse_of_snes()
-            snes.setType(PETSc.SNES.Type.PYTHON)
         inner = self._keep(snes.getNPC()) if has_npc else snes
         ksp = self._keep(inner.getKSP())
         ksp.setOptionsPrefix(prefix)
@@ -129,15 +130,19 @@ class Stepper:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
         snes.setFromOptions()
+        if self.preset.true_hessian:
+            snes.setType(PETSc.SNES.Type.PYTHON)
         ksp.setComputeEigenvalues(ksp.getType() == PETSc.KSP.Type.CG)
         return snes, ksp
 
     def _refuse_of_snes(self) -> None:
         """Raise InputError for options of SNES that Newton's method has no use for."""
-        for name in PETSc.Options().getAll():
-            if name.startswith(tuple(self.prefix + option for option in OF_SNES)):
+        given = PETSc.Options().getAll().items()
+        options = {name.removeprefix(self.prefix): value for name, value in given if name.startswith(self.prefix)}
+        for name, value in options.items():
+            if name.startswith(OF_SNES) and LOOP.get(name) != value:
                 raise InputError(
-                    f"-{name}: newton's presets have a loop and a line search of their own; "
+                    f"-{self.prefix}{name}: newton's presets have a loop and a line search of their own; "
                     "presets anderson and lbfgs take it"
                 )
 

@@ -93,7 +93,7 @@ class LedStart:
         """Return the distance [m] from which obstacles push bodies that are led: the farthest way of a held part."""
         problem, obstacles = self.functional.problem, contacts.obstacles.way(contacts.begin, contacts.time)
         held = self.functional.comm.allreduce(greatest(np.abs(problem.fixed - problem.q)), MPI.MAX)
-        return max(held, greatest(np.abs(obstacles)), contacts.law.distance)
+        return float(max(held, greatest(np.abs(obstacles)), contacts.law.distance))
 
     def _lead(self, contacts: Contacts, end: float) -> Positions:
         """Return the start at s = 1. Raises StepFailed."""

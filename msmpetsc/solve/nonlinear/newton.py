@@ -152,6 +152,7 @@ class Newton(Method):
         flat : g is so near its minimum that its change has no digits: the full step is taken
         """
         slope, s, x = -abs(self.y.dot(now.f)), 1.0, self.functional.vectors.take()
+        longer = None
         while s > SHORTEST:
             x.waxpy(-s, self.y, now.x)
             with LOCAL:
@@ -160,9 +161,7 @@ class Newton(Method):
                 change, _ = (-np.inf, 0.0) if flat else self.functional.change(q, now.q)
                 if change <= ALPHA * s * slope:
                     return self.functional.iterate(x, q)
-            # The minimum of the parabola through g(0), its slope and g(s)
-            best = -slope * s / (2 * (change - s * slope)) if np.isfinite(change) else LEAST
-            s *= min(max(best, LEAST), MOST)
+            s, longer = shorter(slope, (s, change), longer), (s, change)
         self.functional.vectors.give_back(x)
         return None
 
@@ -202,3 +201,24 @@ class Newton(Method):
             return None
         bent.copy(self.y)
         return free
+
+
+def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:
+    """Return the next length of a line search from the slope of g and its changes at the lengths tried last.
+
+    It is the minimum of the cubic through g(0), its slope and both changes, of the parabola if there is but one, kept
+    within LEAST and MOST of the last length (Dennis and Schnabel 1996, Numerical Methods for Unconstrained
+    Optimization, A6.3.1).
+    """
+    s, change = tried
+    if not np.isfinite(change):
+        return LEAST * s
+    bend = (change - s * slope) / s**2
+    best = -slope / (2 * bend)
+    if longer is not None and np.isfinite(longer[1]):
+        t, far = longer
+        of_far = (far - t * slope) / t**2
+        a, b = (bend - of_far) / (s - t), (s * of_far - t * bend) / (s - t)
+        if a != 0:
+            best = (-b + np.sqrt(max(b**2 - 3 * a * slope, 0.0))) / (3 * a)
+    return float(min(max(best, LEAST * s), MOST * s))

@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Positions
 from msmpetsc.build import Model
-from msmpetsc.constraints.acting import Anchors, Forces
+from msmpetsc.constraints.acting import ActingForces, Anchors
 from msmpetsc.constraints.loads import Anchor
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
@@ -28,7 +28,7 @@ class Environment:
         self.lattice = model.lattice
         self.damping = model.damping  # of velocities, by the mass [1/s]
         self.retardation = model.retardation  # viscosity over stiffness [s]
-        self.forces = Forces(model.lattice, model.loads, model.own_forces)
+        self.forces = ActingForces(model.lattice, model.loads, model.own_forces)
         self.anchors = Anchors(model.lattice, model.anchors)
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
@@ -69,7 +69,7 @@ class Environment:
         end  : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
         """
         before, surface = self._before(q), None
-        states = self.obstacles.during(q, last, time, time_step, sides, end, before)
+        states = self.obstacles.during(q, last, end, (time, time_step), sides, before)
         if self.contacts and not self.contacts.apart:
             surface = SurfaceContact(self.contacts, q, time_step, last, end, before.surface if before else None)
         return Contact(states, self.lattice.owned, surface) if states or surface else None

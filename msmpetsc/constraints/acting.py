@@ -11,7 +11,7 @@ from msmpetsc.constraints.loads import Anchor, Load, OwnForce
 from msmpetsc.lattice.lattice import Lattice
 
 
-class Forces:
+class ActingForces:
     """External forces on the nodes. Positions are local, (l, 3) [m], ghosts included; times are in [s]."""
 
     def __init__(self, lattice: Lattice, loads: Sequence[Load], own_forces: Sequence[OwnForce]):

@@ -67,14 +67,18 @@ class NodeObstacles:
         self,
         q: Positions,
         last: Positions | None,
-        time: float,
-        time_step: float,
-        sides: Indices | None,
         end: Positions | None,
+        step: tuple[float, float],
+        sides: Indices | None,
         before: Contact | None,
     ) -> list[ContactState]:
-        """Return what presses in a step from q, with friction (Environment.contact), after the step ``before``."""
-        owned, states, held = self.lattice.owned, [], before.states if before else []
+        """Return the penalties that press in a step from q, with friction that goes on from the contact ``before``.
+
+        last, end : as Environment.contact has them
+        step      : the time of its end and its length [s]
+        """
+        (time, time_step), owned, states = step, self.lattice.owned, []
+        held = before.states if before else []
         ended = None if end is None else end[:owned]
         for p, side in self._pressing(time, sides):
             states.append(p.during(q[:owned], time, time_step, side[:owned], last, ended).after(held, q[:owned]))

@@ -12,13 +12,13 @@ from petsc4py import PETSc
 from msmpetsc.errors import InputError
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
-from msmpetsc.solve.nonlinear.method import Method
+from msmpetsc.solve.nonlinear.method import StepMethod
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.refused_options import BY_ERROR
 
 
 @dataclass(eq=False)
-class LocalGlobal(Method):
+class LocalGlobal(StepMethod):
     """A SNES with A for its Jacobian. All methods are collective.
 
     prefix  : of its options

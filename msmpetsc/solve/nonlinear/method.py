@@ -21,7 +21,7 @@ REASON = PETSc.SNES.ConvergedReason
 
 
 @dataclass(eq=False)
-class Method(ABC):
+class StepMethod(ABC):
     """A method that brings the residual F down to the goal of an outcome. All methods are collective.
 
     snes, ksp : PETSc's, with the user's options

@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Floats, greatest
+from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import KNOWN, Outcome
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
@@ -87,13 +87,19 @@ class Minimum:
 
     def _follow(self, at: Iterate) -> Iterate | None:
         """Return an iterate less its correction; None if the surface meets itself on the way."""
+        x, q, is_free = self._end(at)
+        if not is_free:
+            self.functional.vectors.give_back(x)
+            return None
+        return self.functional.iterate(x, q)
+
+    def _end(self, at: Iterate) -> tuple[PETSc.Vec, Positions, bool]:
+        """Return the unknowns of an iterate less its correction, their positions (l, 3) [m], and whether the way there
+        is free. The caller gives the vector of unknowns back."""
         functional, x = self.functional, self.functional.vectors.take()
         x.waxpy(-1.0, self.estimate.correction, at.x)
         q = functional.positions(x)
-        if functional.surface is not None and functional.free_share(at.q, q) < 1.0:
-            functional.vectors.give_back(x)
-            return None
-        return functional.iterate(x, q)
+        return x, q, functional.free_share(at.q, q) == 1.0
 
     def _second_estimate(
         self, nearer: Iterate, correction: PETSc.Vec, bound: float, enough: float, lowest: float
@@ -110,8 +116,11 @@ class Minimum:
         second = estimate(nearer, bound, enough, will_do, lowest)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
-        if functional.surface is not None and self._follow(nearer) is None:
-            return relative(first + DOUBTFUL * second, distance)
+        if functional.surface is not None:
+            end, _, is_free = self._end(nearer)
+            functional.vectors.give_back(end)
+            if not is_free:
+                return relative(first + DOUBTFUL * second, distance)
         known = second - (estimate.missing or 0.0)
         if first > 0 and known > SMALL * first:
             return DOUBTFUL * relative(max(first, second), distance)
@@ -152,6 +161,8 @@ class Minimum:
                 move /= 2
             else:
                 break
+        if best == 0.0:
+            functional.vectors.give_back(x)
+            return None
         self.memory.write(x)[:] = self.memory.read(at.x) + best * direction
-        lower = functional.iterate(x)
-        return lower if best != 0.0 else None
+        return functional.iterate(x)

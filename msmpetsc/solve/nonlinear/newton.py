@@ -20,7 +20,7 @@ from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
-from msmpetsc.solve.nonlinear.method import REASON, Method
+from msmpetsc.solve.nonlinear.method import REASON, StepMethod
 from msmpetsc.solve.petsc.events import LOCAL
 
 # Iterations with the projected Hessian, which comes in slowly, before the true one has another try
@@ -43,7 +43,7 @@ USELESS = (KSP.DIVERGED_NANORINF, KSP.DIVERGED_PCSETUP_FAILED, KSP.DIVERGED_BREA
 
 
 @dataclass(eq=False)
-class Newton(Method):
+class Newton(StepMethod):
     """Newton's method, as the ``solve`` of a SNES of PETSc's type python. All methods are collective."""
 
     def __post_init__(self) -> None:

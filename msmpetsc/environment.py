@@ -1,4 +1,4 @@
-"""What acts on a body from outside: forces, anchors, obstacles, and contact of the surface."""
+"""Actions on a body from outside: forces, anchors, obstacles, and contact of the surface."""
 
 from typing import Any
 

@@ -59,7 +59,7 @@ class NodeObstacles:
         return bool(self.lattice.table.comm.allreduce(all(map(np.array_equal, *pushed)), MPI.LAND))
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
-        """Return what presses at a time, without friction; None if nothing does."""
+        """Return the contact with penalties at a time, without friction; None if no penalty acts."""
         states = [p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
         return Contact(states, self.lattice.owned) if states else None
 
@@ -89,7 +89,7 @@ class NodeObstacles:
     ) -> None:
         """Apply friction of obstacles at a time, for a ``duration`` [s], to this rank's nodes.
 
-        substep : its begin and end [s], between which an obstacle carries along what it holds
+        substep : its begin and end [s], between which an obstacle carries nodes along
         """
         begin, end = substep
         for p, side in self._pressing(time, sides):
@@ -99,7 +99,7 @@ class NodeObstacles:
                 apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
 
     def contact_stiffness_bound(self, q: Positions, speed: float, start: float, time: float, sides: Indices) -> Floats:
-        """Return a bound (owned,) [N/m] of what obstacles add to a node's stiffness from start to ``time``.
+        """Bound the stiffness (owned,) [N/m] that obstacles add to each node from start to ``time``.
 
         q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
             makes good is counted as inside already

@@ -158,7 +158,7 @@ class ErrorControl:
         return replace(now, error=error)
 
     def with_compression(self, iterate: Iterate, now: Outcome) -> Outcome:
-        """Return what is known at an iterate, with its compression."""
+        """Return the outcome of an iterate, with its compression."""
         return now if now.compression else replace(now, compression=self.curvature.compression(iterate.q))
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:

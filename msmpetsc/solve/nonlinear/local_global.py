@@ -57,7 +57,7 @@ class LocalGlobal(StepMethod):
                 return start, self.outcome
             self.adapt(self.outcome)
         if self.snes.getType() == PETSc.SNES.Type.QN:
-            # QN alone keeps what it has learnt; set anew it has nothing
+            # QN alone keeps its secants of the solve before; a new type has none
             self.snes.setType(PETSc.SNES.Type.KSPONLY)
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()

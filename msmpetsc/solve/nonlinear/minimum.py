@@ -48,7 +48,7 @@ class Minimum:
     def examine(self, at: Iterate, outcome: Outcome, enough: float) -> Verdict:
         """Examine an iterate, or rather the point that is the iterate less its estimated error.
 
-        outcome : what is known there, its compression, too; whether estimate.correction is of it
+        outcome : of the iterate, with its compression; corrected if estimate.correction is of the iterate
         enough  : the length of an error that will do, |e|_M
         """
         functional, estimate, compression = self.functional, self.estimate, outcome.compression
@@ -61,7 +61,7 @@ class Minimum:
             first.set(0.0)
         estimate.linearise(nearer.q)
         estimate.residual.aypx(-1.0, nearer.f)
-        # What H at the iterate did not know
+        # Change of F that H at the iterate does not predict
         bent = functional.dual_norm(estimate.residual)
         hint = estimate.correction if outcome.alarm else None
         value, direction = compression.least_curvature, None

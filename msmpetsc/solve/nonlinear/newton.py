@@ -139,7 +139,7 @@ class Newton(StepMethod):
         return self.ksp.reason not in USELESS
 
     def _after_solve(self, outcome: Outcome, detour: bool) -> Outcome:
-        """Return what the linear solve tells of the next iterate: nothing after a ``detour``."""
+        """Return an outcome with the bounds of the linear solve; after a ``detour`` there are none."""
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
             outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
         if detour:

@@ -34,7 +34,7 @@ from msmpetsc.solve.work import Work
 DOUBTS = 100
 # Options of SNES that the loop of Newton's method (nonlinear.newton) has no use for
 OF_SNES = ("snes_type", "snes_linesearch", "snes_ksp_ew", "npc_snes")
-# What the loop is, in PETSc's words: a run that goes on from another method may say so
+# PETSc's names of this loop, which a run that goes on from another method may give
 LOOP = {"snes_type": "newtonls", "snes_linesearch_type": "bt"}
 
 
@@ -295,7 +295,7 @@ class Stepper:
         return replace(verdict, is_minimum=bool(self.budget) or will_do)
 
     def _leave(self, now: Iterate, verdict: Verdict, outcome: Outcome) -> tuple[Iterate, Outcome] | None:
-        """Return an iterate to go on from where one is no minimum, and what is then known (collective).
+        """Return an iterate of lower g to go on from, and its outcome so far (collective).
 
         None where g has no digits left to tell the two apart: the step is as good as the verdict says.
         Raises StepFailed.

@@ -2,6 +2,7 @@
 
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -92,10 +93,10 @@ def test_killed_at_any_moment(tmp_path: Path, ranks: int, kills: int, steps: int
 
 def test_a_killed_run_leaves_its_xdmf_file(tmp_path: Path):
     path = tmp_path / "x.h5"
-    command = [sys.executable, "-m", "msmpetsc", "run", hanging(tmp_path, 2000), "-o", path]
+    command = [sys.executable, "-m", "msmpetsc", "run", hanging(tmp_path, 100_000), "-o", path]
     with subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as process:
-        assert any(line.startswith("frame 1") for line in process.stderr)
+        assert any(re.match(r"frame [1-9]", line) for line in process.stderr)
         process.kill()
     with h5py.File(path) as file:
         grids = ET.parse(path.with_suffix(".xdmf")).findall(".//Time")
-        assert 1 <= len(grids) / 2 <= finished(file) < 2001
+        assert 1 <= len(grids) / 2 <= finished(file) < 33_334

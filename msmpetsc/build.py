@@ -26,7 +26,15 @@ from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
-from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
+from msmpetsc.geometry.surface import (
+    Surface,
+    SurfaceReport,
+    bounds_of,
+    check_encloses,
+    compact,
+    examine,
+    joined,
+)
 from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, Topology, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
@@ -74,7 +82,9 @@ class Model:
     retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
-    holders: Holders = field(default_factory=lambda: Holders((), np.zeros(0, np.int64), np.zeros((0, 3))))
+    holders: Holders = field(
+        default_factory=lambda: Holders((), np.zeros(0, np.int64), np.zeros((0, 3)))
+    )
 
     @property
     def body_of_point(self) -> Indices:
@@ -86,13 +96,20 @@ class Model:
     def solids(self) -> dict[int, Surface]:
         """Return the surfaces of obstacles that are meshes or functions, by number, on rank 0 (collective at first)."""
         solids = {number: obstacle.solid for number, obstacle in enumerate(self.obstacles)}
-        drawn = {number: solid for number, solid in solids.items() if isinstance(solid, DistanceSolid)}
+        drawn = {
+            number: solid for number, solid in solids.items() if isinstance(solid, DistanceSolid)
+        }
         if not drawn:
             return {}
         low = np.min([body.bounds[0] for body in self.bodies], axis=0)
         high = np.max([body.bounds[1] for body in self.bodies], axis=0)
         comm = self.lattice.table.comm
-        return on_root(comm, lambda: {number: solid.surface(low, high) for number, solid in drawn.items()}) or {}
+        return (
+            on_root(
+                comm, lambda: {number: solid.surface(low, high) for number, solid in drawn.items()}
+            )
+            or {}
+        )
 
 
 class Geometry:
@@ -115,7 +132,10 @@ class Geometry:
     @cached_property
     def embedding(self) -> csr_array:
         """Return how the surfaces follow the nodes (collective)."""
-        points = [np.empty((0, 3)) if body.surface is None else body.surface.points for body in self.bodies]
+        points = [
+            np.empty((0, 3)) if body.surface is None else body.surface.points
+            for body in self.bodies
+        ]
         _, _, cages = self.source
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
 
@@ -158,7 +178,9 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
     points = shape.nearest if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
-    lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
+    lattice = lattice.pin(
+        reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned)
+    )
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
@@ -206,8 +228,12 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
         loads=[replace(load, share=send(load.share)) for load in model.loads],
         anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],
         holders=replace(model.holders, number=send(model.holders.number)),
-        exchanges=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.exchanges],
-        penalties=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.penalties],
+        exchanges=[
+            replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.exchanges
+        ],
+        penalties=[
+            replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.penalties
+        ],
         start=(send(positions), send(velocities)),
     )
 
@@ -217,7 +243,9 @@ def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
     found = on_root(comm, lambda: [*_prepared(scene)]) or []
     facts = comm.bcast([(report, bounds_of(surface)) for surface, report in found])
     surfaces: list[Surface | None] = [surface for surface, _ in found] or [None] * len(facts)
-    return tuple(BodySurface(comm, surface, *known) for surface, known in zip(surfaces, facts, strict=True))
+    return tuple(
+        BodySurface(comm, surface, *known) for surface, known in zip(surfaces, facts, strict=True)
+    )
 
 
 def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
@@ -256,18 +284,24 @@ def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
     if size is not None or USUAL[0] <= side <= USUAL[1]:
         return []
     unit = "millimetres" if side > USUAL[1] else "another unit than metres"
-    return [f"the body is {side:.3g} m long, and the scene gives no mesh.size: is the mesh in {unit}?"]
+    return [
+        f"the body is {side:.3g} m long, and the scene gives no mesh.size: is the mesh in {unit}?"
+    ]
 
 
 def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     """Return the scene's valid cells (collective)."""
     cages = scene.cages  # which have a cell size or a count
-    cell_size = cages.cell_size or choose_cell_size(bodies, cages.count or 0, cages.max_cells, cages.boundary)
+    cell_size = cages.cell_size or choose_cell_size(
+        bodies, cages.count or 0, cages.max_cells, cages.boundary
+    )
     warn_of_thin_bodies(bodies, cell_size)
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 
-def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders) -> list[Anchor]:
+def _anchors(
+    tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders
+) -> list[Anchor]:
     """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first (collective).
 
     Raises InputError where pins and anchors leave no node to move.
@@ -288,7 +322,11 @@ def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders
 
 
 def _loads(
-    comm: MPI.Comm, gravity: Gravity | None, forces: Iterable[OfBody], lattice: Lattice, masks: Regions
+    comm: MPI.Comm,
+    gravity: Gravity | None,
+    forces: Iterable[OfBody],
+    lattice: Lattice,
+    masks: Regions,
 ) -> tuple[list[Load], tuple[OwnForce, ...]]:
     """Return the forces, and those that are functions.
 
@@ -311,7 +349,11 @@ def _loads(
 
 
 def _contacts(
-    comm: MPI.Comm, tables: Sequence[ObstacleTable], lattice: Lattice, bounds: Rows, obstacles: list[Obstacle]
+    comm: MPI.Comm,
+    tables: Sequence[ObstacleTable],
+    lattice: Lattice,
+    bounds: Rows,
+    obstacles: list[Obstacle],
 ) -> tuple[list[Exchange], list[Penalty]]:
     """Return how nodes meet the obstacles, by their tables (collective).
 
@@ -321,7 +363,9 @@ def _contacts(
     usual, stick = PENALTY * lattice.stiffest(comm), STICK * smallest(bounds)
     for obstacle, table in zip(obstacles, tables, strict=True):
         if table.response == "exchange":
-            exchanges.append(Exchange(obstacle, 1.0 if table.restitution is None else table.restitution))
+            exchanges.append(
+                Exchange(obstacle, 1.0 if table.restitution is None else table.restitution)
+            )
         elif table.response != BARRIER:
             given = table.stiffness or usual, table.friction or 0.0, table.friction_speed or stick
             slows = None if table.restitution == 1 else table.restitution

@@ -58,7 +58,9 @@ class Checkpoint:
     rows: dict[str, Array] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
 
-    def keep(self, rows: dict[str, Array] | None = None, numbers: dict[str, float] | None = None) -> None:
+    def keep(
+        self, rows: dict[str, Array] | None = None, numbers: dict[str, float] | None = None
+    ) -> None:
         """Store a part's rows and numbers."""
         self.rows |= rows or {}
         self.numbers |= numbers or {}
@@ -72,7 +74,10 @@ class Checkpoint:
         for attribute, bounds in part.state.items():
             value, name = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
             if is_dataclass(value) and not isinstance(value, type):
-                inner = {each: self._like(f"{name}.{each}", number, bounds) for each, number in vars(value).items()}
+                inner = {
+                    each: self._like(f"{name}.{each}", number, bounds)
+                    for each, number in vars(value).items()
+                }
                 setattr(part, attribute, replace(value, **inner))
             else:
                 setattr(part, attribute, self._like(name, value, bounds))
@@ -92,7 +97,9 @@ class Checkpoint:
             raise InputError(f"the checkpoint is damaged: it lacks {name}")
         return self.rows[name]
 
-    def number(self, name: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
+    def number(
+        self, name: str, default: float, least: float = -math.inf, most: float = math.inf
+    ) -> float:
         """Return the number of a name. Raises InputError for one that no run can have had."""
         value = self.numbers.get(name, default)
         if not least <= value <= most:

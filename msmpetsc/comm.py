@@ -86,10 +86,13 @@ class Route:
 
         rows = np.ascontiguousarray(rows)
         result = np.empty((int(in_counts.sum()), *rows.shape[1:]), rows.dtype)
-        row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
+        row = MPI.BYTE.Create_contiguous(
+            rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
+        ).Commit()
         try:
             self.comm.Alltoallv(
-                [rows, out_counts, starts(out_counts), row], [result, in_counts, starts(in_counts), row]
+                [rows, out_counts, starts(out_counts), row],
+                [result, in_counts, starts(in_counts), row],
             )
         finally:
             row.Free()
@@ -121,7 +124,9 @@ class SortedKeys:
         step = max(1, comm.allreduce(len(keys)) // (comm.size * SAMPLES))
         sample = np.sort(np.concatenate(comm.allgather(keys[step // 2 :: step])))
         # the keys at which the next rank's part begins: at equal steps of all ranks' samples
-        self.splitters = sample[np.arange(1, comm.size) * len(sample) // comm.size] if len(sample) else sample
+        self.splitters = (
+            sample[np.arange(1, comm.size) * len(sample) // comm.size] if len(sample) else sample
+        )
         route = Route(comm, self.owner(keys))
         self.keys = np.unique(route.send(keys))
         counts = np.array(comm.allgather(len(self.keys)), np.int64)

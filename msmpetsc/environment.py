@@ -32,12 +32,18 @@ class Environment:
         self.anchors = Anchors(model.lattice, model.anchors)
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
-        self.self_contact = NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
-        self.contacts = Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None  # of the last step begun
+        self.self_contact = (
+            NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
+        )
+        self.contacts = (
+            Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None
+        )  # of the last step begun
         self.has_friction = self.obstacles.has_friction or bool(
             self.self_contact and self.self_contact.law.friction > 0
         )
-        self._ended: tuple[Positions, Contact] | None = None  # the last step, if it had contact, and what there was
+        self._ended: tuple[Positions, Contact] | None = (
+            None  # the last step, if it had contact, and what there was
+        )
         self.touches = bool(model.penalties or self.self_contact)
 
     def events(self) -> list[float]:
@@ -50,7 +56,9 @@ class Environment:
 
         def at(time: float) -> list[Any]:
             loads: list[Any] = [load.state_at(time) for load in self.forces.all]
-            return loads + [moving.acts_at(time) and tuple(moving.path.value_at(time)) for moving in self.moving]
+            return loads + [
+                moving.acts_at(time) and tuple(moving.path.value_at(time)) for moving in self.moving
+            ]
 
         return at(begin) == at(end)
 
@@ -71,7 +79,9 @@ class Environment:
         before, surface = self._before(q), None
         states = self.obstacles.during(q, last, end, (time, time_step), sides, before)
         if self.contacts and not self.contacts.apart:
-            surface = SurfaceContact(self.contacts, q, time_step, last, end, before.surface if before else None)
+            surface = SurfaceContact(
+                self.contacts, q, time_step, last, end, before.surface if before else None
+            )
         return Contact(states, self.lattice.owned, surface) if states or surface else None
 
     def begin_contacts(self, q: Positions, time: float, time_step: float) -> None:

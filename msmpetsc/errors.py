@@ -40,7 +40,19 @@ class StepStopped(MsmpetscError):
 PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
 NO_ROOM = ENOSPC, EDQUOT, EFBIG
 EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by
-    "run": ("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w", "trimesh", "igl", "pooch", "psutil", "tqdm"),
+    "run": (
+        "petsc4py",
+        "mpi4py",
+        "scipy",
+        "numba",
+        "pydantic",
+        "tomli_w",
+        "trimesh",
+        "igl",
+        "pooch",
+        "psutil",
+        "tqdm",
+    ),
     "mesh": ("meshio", "manifold3d", "fast_simplification"),
     "render": ("pyvista", "scipy", "pydantic", "tomli_w", "trimesh", "igl", "tqdm"),
     "study": ("pandas", "vl_convert", "jinja2", "tomlkit"),
@@ -60,10 +72,14 @@ def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
     """
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
-        return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
+        return InputError(
+            f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less"
+        )
     if isinstance(error, OSError) and error.errno in NO_ROOM:  # in a folder of temporary files, say
         return InputError(f"{error.filename or 'the output'} cannot be written: {error.strerror}")
-    if isinstance(error, OSError) and error.filename:  # an mpiexec that is not there, a folder that cannot be made
+    if (
+        isinstance(error, OSError) and error.filename
+    ):  # an mpiexec that is not there, a folder that cannot be made
         return InputError(f"{error.filename}: {error.strerror}")
     if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
         return missing_package(error.name or "", extra)
@@ -72,7 +88,9 @@ def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
 
 def missing_package(name: str, extra: str = "run") -> InputError:
     """Return the error that says which extra brings a package that is not installed."""
-    return InputError(f"{name} is not installed: pip install 'msmpetsc[{extra_of(name, extra)}]' brings it")
+    return InputError(
+        f"{name} is not installed: pip install 'msmpetsc[{extra_of(name, extra)}]' brings it"
+    )
 
 
 def extra_of(module: str, first: str = "run") -> str | None:

@@ -42,11 +42,15 @@ class Extensions(Generic[T]):
         points = entry_points(group=self.group, name=name)
         if not points:
             near = did_you_mean(name, self.names())
-            raise InputError(f"no {self.kind} {name!r} is registered, or installed under {self.group}{near}")
+            raise InputError(
+                f"no {self.kind} {name!r} is registered, or installed under {self.group}{near}"
+            )
         try:
             value: T = next(iter(points)).load()
         except Exception as error:  # of whatever was installed
-            raise InputError(f"the {self.kind} {name!r} that is installed cannot be imported: {error}") from error
+            raise InputError(
+                f"the {self.kind} {name!r} that is installed cannot be imported: {error}"
+            ) from error
         return value
 
 
@@ -58,7 +62,9 @@ register_force = FORCES.register
 register_obstacle = OBSTACLES.register
 
 
-def register_preset(name: str, options: Mapping[str, Any], based_on: str = "newton", about: str = "") -> None:
+def register_preset(
+    name: str, options: Mapping[str, Any], based_on: str = "newton", about: str = ""
+) -> None:
     """Give PETSc options a name, which ``solver.preset`` and ``preset=`` then mean; on all ranks.
 
     options  : {"ksp_rtol": 1e-4, ...}, without the dash; None or True for one without a value

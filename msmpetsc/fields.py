@@ -59,8 +59,12 @@ class Frame:
 
     index: int
     time: Annotated[float, _number("f8", "s", "simulated time")]
-    position: Annotated[Positions, Field("f8", ("T", "n", 3), "m", "node positions", "lattice/nodes")]
-    surface: Annotated[Positions | None, Field("f8", ("T", "v", 3), "m", "surface points", "surface/points")]
+    position: Annotated[
+        Positions, Field("f8", ("T", "n", 3), "m", "node positions", "lattice/nodes")
+    ]
+    surface: Annotated[
+        Positions | None, Field("f8", ("T", "v", 3), "m", "surface points", "surface/points")
+    ]
     step_error: Annotated[float, _number("f8", "1", "estimated relative error of a step")]
     iterations: Annotated[int, _number("i8", "1", "outer iterations")]
     ksp_its: Annotated[int, _number("i8", "1", "iterations of the linear solver")]
@@ -70,40 +74,74 @@ class Frame:
     contact: Annotated[float, _number("f8", "J", "energy in the push of obstacles")]
     momentum: Annotated[Floats, Field("f8", ("T", 3), "kg m/s", "momentum")]
     wall_time: Annotated[float, _number("f8", "s", "computing time")]
-    true_error: Annotated[float, _number("f8", "1", "true relative error of a step, in position")] = math.nan
-    energy_error: Annotated[float, _number("f8", "1", "true relative error of a step, in energy")] = math.nan
+    true_error: Annotated[
+        float, _number("f8", "1", "true relative error of a step, in position")
+    ] = math.nan
+    energy_error: Annotated[
+        float, _number("f8", "1", "true relative error of a step, in energy")
+    ] = math.nan
     inverted: Annotated[int, _number("i8", "1", "cells turned inside out")] = 0
-    products: Annotated[int, _number("i8", "1", "products with the Hessian, and at multigrid's finest level")] = 0
-    proof_products: Annotated[int, _number("i8", "1", "of these, to estimate errors and to search for saddles")] = 0
+    products: Annotated[
+        int, _number("i8", "1", "products with the Hessian, and at multigrid's finest level")
+    ] = 0
+    proof_products: Annotated[
+        int, _number("i8", "1", "of these, to estimate errors and to search for saddles")
+    ] = 0
     substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0
     fallbacks: Annotated[int, _number("i8", "1", "steps solved by the robust method")] = 0
     energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0
     steps: Annotated[int, _number("i8", "1", "time steps taken")] = 0
-    time_error: Annotated[float, _number("f8", "1", "estimated relative error of the motion so far")] = math.nan
+    time_error: Annotated[
+        float, _number("f8", "1", "estimated relative error of the motion so far")
+    ] = math.nan
     self_contacts: Annotated[int, _number("i8", "1", "contacts of the surface with itself")] = 0
-    self_distance: Annotated[float, _number("f8", "m", "least distance of a contact with itself")] = math.nan
-    self_contact: Annotated[float, _number("f8", "J", "energy in the push of the surface on itself")] = 0.0
+    self_distance: Annotated[
+        float, _number("f8", "m", "least distance of a contact with itself")
+    ] = math.nan
+    self_contact: Annotated[
+        float, _number("f8", "J", "energy in the push of the surface on itself")
+    ] = 0.0
     load: Annotated[Floats, Field("f8", ("T", 3), "N", "gravity and forces on all bodies")] = field(
         default_factory=lambda: np.zeros(3)
     )
-    reaction: Annotated[Rows | None, Field("f8", ("T", "a", 3), "N", "force of a pin or anchor")] = None
-    torque: Annotated[Rows | None, Field("f8", ("T", "a", 3), "N m", "torque of a pin or anchor")] = None
-    push: Annotated[Rows | None, Field("f8", ("T", "o", 3), "N", "force of an obstacle, blows left out")] = None
-    contact_push: Annotated[Rows | None, Field("f8", ("T", "b", 3), "N", "force on a body where surfaces meet")] = None
+    reaction: Annotated[
+        Rows | None, Field("f8", ("T", "a", 3), "N", "force of a pin or anchor")
+    ] = None
+    torque: Annotated[
+        Rows | None, Field("f8", ("T", "a", 3), "N m", "torque of a pin or anchor")
+    ] = None
+    push: Annotated[
+        Rows | None, Field("f8", ("T", "o", 3), "N", "force of an obstacle, blows left out")
+    ] = None
+    contact_push: Annotated[
+        Rows | None, Field("f8", ("T", "b", 3), "N", "force on a body where surfaces meet")
+    ] = None
     probe: Annotated[Rows | None, Field("f8", ("T", "w", 3), "m", "position of a probe")] = None
-    stress: Annotated[Rows | None, Field("f4", ("T", "n", 6), "Pa", "Cauchy stress: xx, yy, zz, xy, yz, xz")] = None
-    von_mises: Annotated[Floats | None, _of_nodes("Pa", "von Mises' stress, of /frames/stress")] = None
+    stress: Annotated[
+        Rows | None, Field("f4", ("T", "n", 6), "Pa", "Cauchy stress: xx, yy, zz, xy, yz, xz")
+    ] = None
+    von_mises: Annotated[Floats | None, _of_nodes("Pa", "von Mises' stress, of /frames/stress")] = (
+        None
+    )
     pressure: Annotated[Floats | None, _of_nodes("Pa", "pressure")] = None
-    strain_energy: Annotated[Floats | None, _of_nodes("J/m^3", "elastic energy in a volume at rest")] = None
-    cell_stress: Annotated[Rows | None, Field("f4", ("T", "c", 6), "Pa", "Cauchy stress of a cell")] = None
+    strain_energy: Annotated[
+        Floats | None, _of_nodes("J/m^3", "elastic energy in a volume at rest")
+    ] = None
+    cell_stress: Annotated[
+        Rows | None, Field("f4", ("T", "c", 6), "Pa", "Cauchy stress of a cell")
+    ] = None
     cell_von_mises: Annotated[Floats | None, _of_cells("Pa", "von Mises' stress of a cell")] = None
     cell_pressure: Annotated[Floats | None, _of_cells("Pa", "pressure of a cell")] = None
-    cell_strain_energy: Annotated[Floats | None, _of_cells("J/m^3", "elastic energy of a cell in its volume")] = None
+    cell_strain_energy: Annotated[
+        Floats | None, _of_cells("J/m^3", "elastic energy of a cell in its volume")
+    ] = None
 
     def __repr__(self) -> str:
         """Return one line, for the arrays would fill the screen."""
         solved = f"its {self.ksp_its}, error {self.step_error:.1e}"
-        return f"Frame({self.index}: t = {self.time:.6g} s, {solved}, position {self.position.shape})"
+        return (
+            f"Frame({self.index}: t = {self.time:.6g} s, {solved}, position {self.position.shape})"
+        )
 
 
 FRAME_FIELDS: dict[str, Field] = {
@@ -111,7 +149,11 @@ FRAME_FIELDS: dict[str, Field] = {
     for name, hint in get_type_hints(Frame, include_extras=True).items()
     if hasattr(hint, "__metadata__")
 }
-STRESS = tuple(name for name in FRAME_FIELDS if name.endswith(("stress", "von_mises", "pressure", "strain_energy")))
+STRESS = tuple(
+    name
+    for name in FRAME_FIELDS
+    if name.endswith(("stress", "von_mises", "pressure", "strain_energy"))
+)
 # HDF5 dimension scales of frames, by letters and lengths of shapes. None has the name of a field
 # with several axes: netCDF's readers would take that for its coordinates.
 DIMENSIONS: dict[int | str, str] = {
@@ -166,7 +208,9 @@ GROUPS = {
     "frames": FRAME_FIELDS,
     "checkpoint": CHECKPOINT,
 }
-FIELDS = {f"{group}/{name}": field for group, fields in GROUPS.items() for name, field in fields.items()}
+FIELDS = {
+    f"{group}/{name}": field for group, fields in GROUPS.items() for name, field in fields.items()
+}
 
 
 def unit_of(name: str) -> str:

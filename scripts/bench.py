@@ -100,16 +100,25 @@ def means(runs: Sequence[Sample], number: str) -> list[float]:
 
 def row(name: str, runs: dict[str, list[Sample]]) -> lab.Row:
     """Return a row of the table; the last method is the one that is held against the others."""
-    times = {method: [1e3 * mean for mean in means(repeats, "wall_time")] for method, repeats in runs.items()}
+    times = {
+        method: [1e3 * mean for mean in means(repeats, "wall_time")]
+        for method, repeats in runs.items()
+    }
     found: dict[str, object] = {"scene": name}
     found |= {f"{method} [ms]": lab.spread(of) if of else None for method, of in times.items()}
     for number in ("ksp_its", "products"):
-        found[number] = " / ".join(lab.shown(means(of, number)[0]) if of else "-" for of in runs.values())
+        found[number] = " / ".join(
+            lab.shown(means(of, number)[0]) if of else "-" for of in runs.values()
+        )
     *others, last = runs
     if not runs[last]:
         return found
     best = min((median(times[method]) for method in others if times[method]), default=None)
-    return found | {"times as fast": best / median(times[last]) if best else None} | of_method(name, runs[last])
+    return (
+        found
+        | {"times as fast": best / median(times[last]) if best else None}
+        | of_method(name, runs[last])
+    )
 
 
 def of_method(name: str, runs: Sequence[Sample]) -> dict[str, object]:
@@ -128,8 +137,11 @@ def of_method(name: str, runs: Sequence[Sample]) -> dict[str, object]:
         "proof": f"{means(runs, 'proof_products')[0] / products:.1%}" if products else None,
         "coarse": f"{1 - median(finest):.1%}" if finest else None,
         "us a cell": 1e6 * seconds / cost["cells"],
-        "slowest tenth [ms]": 1e3 * median(slowest_tenth(run.frames["wall_time"][1:]) for run in runs),
-        "frames/s (paper's CPU, GPU)": f"{1 / seconds:.3g} ({paper[4]}, {paper[5]})" if paper else 1 / seconds,
+        "slowest tenth [ms]": 1e3
+        * median(slowest_tenth(run.frames["wall_time"][1:]) for run in runs),
+        "frames/s (paper's CPU, GPU)": f"{1 / seconds:.3g} ({paper[4]}, {paper[5]})"
+        if paper
+        else 1 / seconds,
         "set-up [s]": median(run.cost["time"]["setup"] for run in runs),
         "kB a node": memory if cost["nodes"] > SMALL else None,
     }
@@ -140,7 +152,10 @@ def rows(methods: dict[str, Method], args: Namespace) -> lab.Rows:
     asked = (name for name in (*SCENES, *BEAMS) if any(word in name for word in args.only))
     names = [name for name in asked if name != LARGE or args.large]
     for name, law in product(names, args.laws or LAWS):
-        kinds = {kind: partial(measured, name, method, args.frames, law) for kind, method in methods.items()}
+        kinds = {
+            kind: partial(measured, name, method, args.frames, law)
+            for kind, method in methods.items()
+        }
         runs = lab.alternated(kinds, args.repeats)
         if any(runs.values()):
             yield {**row(name, runs), "scene": name if law == LAWS[0] else f"{name}, {law}"}
@@ -149,24 +164,39 @@ def rows(methods: dict[str, Method], args: Namespace) -> lab.Rows:
 def methods_of(args: Namespace) -> dict[str, Method]:
     """Return what is run, the last of them held against the others."""
     today = METHODS[TODAY]
-    more = {f"{TODAY}, {args.ranks} ranks": Method(today.words, args.ranks)} if args.ranks > 1 else {}
+    more = (
+        {f"{TODAY}, {args.ranks} ranks": Method(today.words, args.ranks)} if args.ranks > 1 else {}
+    )
     if args.gpu:
         return {TODAY: today, **more, "GPU": Method((*today.words, "--device", "cuda"))}
-    others = {} if args.alone else {name: method for name, method in METHODS.items() if name != TODAY}
+    others = (
+        {} if args.alone else {name: method for name, method in METHODS.items() if name != TODAY}
+    )
     return others | more | {TODAY: today}
 
 
 def main() -> int:
     options = lab.parser(__doc__)
     options.add_argument(
-        "--only", nargs="+", default=[""], metavar="NAME", help="rows whose name contains one of these"
+        "--only",
+        nargs="+",
+        default=[""],
+        metavar="NAME",
+        help="rows whose name contains one of these",
     )
     options.add_argument(
-        "--laws", nargs="+", metavar="LAW", help="of materials; own, the scene's, and neo-hookean if absent"
+        "--laws",
+        nargs="+",
+        metavar="LAW",
+        help="of materials; own, the scene's, and neo-hookean if absent",
     )
     options.add_argument("--alone", action="store_true", help="no other methods beside newton")
-    options.add_argument("--frames", type=int, metavar="N", help="steps of each run; all of the scene's if absent")
-    options.add_argument("--repeats", type=int, default=5, metavar="N", help="runs of each method (%(default)s)")
+    options.add_argument(
+        "--frames", type=int, metavar="N", help="steps of each run; all of the scene's if absent"
+    )
+    options.add_argument(
+        "--repeats", type=int, default=5, metavar="N", help="runs of each method (%(default)s)"
+    )
     options.add_argument("--ranks", type=int, default=1, metavar="N", help="on so many ranks, too")
     options.add_argument("--gpu", action="store_true", help="on a GPU beside the CPU")
     options.add_argument("--large", action="store_true", help=f"{LARGE}, too, which takes hours")

@@ -47,7 +47,9 @@ def read_beam(path: Path) -> Beam:
     """Return the lattice of a result."""
     with Result(path) as result:
         names = ("nodes", "mass", "springs", "rest_length", "stiffness")
-        nodes, mass, springs, rest_length, stiffness = (result[f"lattice/{name}"][:] for name in names)
+        nodes, mass, springs, rest_length, stiffness = (
+            result[f"lattice/{name}"][:] for name in names
+        )
         pinned = np.zeros(len(nodes), bool)
         pinned[result["lattice/pinned"][:]] = True
     corner = np.rint((nodes - nodes.min(axis=0)) / rest_length.min()).astype(int)
@@ -67,10 +69,14 @@ class Newton:
         self.time_step = time_step
         builder: Any = newton.ModelBuilder(gravity=(0.0, 0.0, -G))
         still = [(0.0, 0.0, 0.0)] * len(beam.nodes)
-        builder.add_particles(beam.nodes.tolist(), still, np.where(beam.pinned, 0, beam.mass).tolist())
+        builder.add_particles(
+            beam.nodes.tolist(), still, np.where(beam.pinned, 0, beam.mass).tolist()
+        )
         for (i, j), stiffness in zip(beam.springs.tolist(), beam.stiffness.tolist(), strict=True):
             builder.add_spring(i, j, ke=stiffness, kd=0.0, control=0.0)
-        colour = beam.corner % 2 @ [4, 2, 1]  # no spring joins two nodes of one; its own coloring does not see springs
+        colour = (
+            beam.corner % 2 @ [4, 2, 1]
+        )  # no spring joins two nodes of one; its own coloring does not see springs
         builder.set_coloring([np.flatnonzero(colour == of) for of in range(8)])
         model: Any = builder.finalize(device="cpu")
         model.spring_rest_length.assign(beam.rest_length)
@@ -168,7 +174,15 @@ def positions(path: Path) -> np.ndarray:
 def theirs(case: Case, setup: Setup) -> Trajectory | str:
     """Run Newton in a process of its own; why it failed if it did."""
     path = FOLDER / "newton.npz"
-    words = ["--frames", setup.frames, "--play", setup.reference, path, case.substeps, case.iterations]
+    words = [
+        "--frames",
+        setup.frames,
+        "--play",
+        setup.reference,
+        path,
+        case.substeps,
+        case.iterations,
+    ]
     ended = lab.python([Path(__file__), *words], path.with_suffix(".log"), timeout=TIMEOUT)
     if ended.reason:
         return ended.reason
@@ -197,7 +211,9 @@ def rows(cases: list[Case], setup: Setup) -> lab.Rows:
         if isinstance(found, str):
             yield {"program": case.program, "method": case.method, "note": found}
             continue
-        low, middle, high = (float(time) for time in np.percentile(1e3 * found.seconds[1:], (10, 50, 90)))
+        low, middle, high = (
+            float(time) for time in np.percentile(1e3 * found.seconds[1:], (10, 50, 90))
+        )
         yield {
             "program": f"{case.program} {found.version}".strip(),
             "method": case.method,
@@ -205,16 +221,22 @@ def rows(cases: list[Case], setup: Setup) -> lab.Rows:
             "10%": low,
             "90%": high,
             "step error": found.step_error,
-            "trajectory error": float(np.linalg.norm(found.position - true) / np.linalg.norm(true - true[0])),
+            "trajectory error": float(
+                np.linalg.norm(found.position - true) / np.linalg.norm(true - true[0])
+            ),
             "note": "",
         }
 
 
 def main() -> None:
     options = lab.parser(__doc__)
-    options.add_argument("--cells", type=int, nargs=3, default=[40, 15, 15], metavar="N", help="along x, y, z")
+    options.add_argument(
+        "--cells", type=int, nargs=3, default=[40, 15, 15], metavar="N", help="along x, y, z"
+    )
     options.add_argument("--frames", type=int, default=30, metavar="N")
-    options.add_argument("--only", default="", metavar="WORD", help="cases whose program or method has this word")
+    options.add_argument(
+        "--only", default="", metavar="WORD", help="cases whose program or method has this word"
+    )
     options.add_argument("--play", nargs=4, help=SUPPRESS)  # what theirs() starts
     args = options.parse_args()
     if args.play:

@@ -20,5 +20,7 @@ def _use_own_python() -> None:
 
 
 _use_own_python()
-sys.path.insert(0, str(ROOT))  # the clone's package goes before an installed one, here and in child processes
+sys.path.insert(
+    0, str(ROOT)
+)  # the clone's package goes before an installed one, here and in child processes
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))

@@ -68,7 +68,13 @@ def any_scene(draw: Draw, path: Path) -> dict:
         scene["time"]["integrator"] = "bdf2"
     if draw.random() < 0.8:
         scene["gravity"] = {"acceleration": [0.0, 0.0, -9.81]}
-    for chance, add in ((0.7, add_start), (0.4, add_pin), (0.45, add_plates), (0.3, add_part), (0.2, add_anchor)):
+    for chance, add in (
+        (0.7, add_start),
+        (0.4, add_pin),
+        (0.45, add_plates),
+        (0.3, add_part),
+        (0.2, add_anchor),
+    ):
         if draw.random() < chance:
             add(draw, scene, sides)
     return scene
@@ -83,17 +89,27 @@ def rubbing(draw: Draw, path: Path) -> dict:
         box.export(mesh := path.with_name(f"{path.stem}_{name}.ply"))
         bodies.append({"mesh": {"source": mesh.name}})
     down = [0.0, 0.0, -float(draw.uniform(0.005, 0.03))]
-    along = {"by": [*draw.normal(0, 0.1, 2).tolist(), down[2]], "turn": [0.0, 0.0, float(draw.normal(0, 60))]}
+    along = {
+        "by": [*draw.normal(0, 0.1, 2).tolist(), down[2]],
+        "turn": [0.0, 0.0, float(draw.normal(0, 60))],
+    }
     poses = [{"time": step, "by": down}, {"time": 4 * step} | along]
-    bodies[0]["anchor"] = [{"region": {"box": [[-0.1, -0.1, 0.85], [1.1, 1.1, 1.1]], "relative": True}, "path": poses}]
-    bodies[1]["pin"] = [{"region": {"box": [[-0.1, -0.1, -0.1], [1.1, 1.1, 0.3]], "relative": True}}]
+    bodies[0]["anchor"] = [
+        {"region": {"box": [[-0.1, -0.1, 0.85], [1.1, 1.1, 1.1]], "relative": True}, "path": poses}
+    ]
+    bodies[1]["pin"] = [
+        {"region": {"box": [[-0.1, -0.1, -0.1], [1.1, 1.1, 0.3]], "relative": True}}
+    ]
     solid = {"law": "neo-hookean", "poisson_ratio": float(draw.choice([0.1, 0.25, 0.45]))}
     return {
         "body": bodies,
         "cages": {"cell_size": 0.075},
         "material": {"young_modulus": log_uniform(draw, 1e4, 1e7), "density": 1000.0} | solid,
         "time": {"step": step, "duration": 4 * step},
-        "self_contact": {"distance": log_uniform(draw, 2e-4, 1e-3), "friction": float(draw.uniform(0.1, 1))},
+        "self_contact": {
+            "distance": log_uniform(draw, 2e-4, 1e-3),
+            "friction": float(draw.uniform(0.1, 1)),
+        },
         "output": {"surface": False},
         "solver": {
             "preset": str(draw.choice(["newton", "newton-multigrid"])),
@@ -112,9 +128,17 @@ def start_far(draw: Draw, scene: dict) -> None:
 
 def touch(draw: Draw, scene: dict, bounds: np.ndarray) -> None:
     """The ground, which the lowest point of the body meets in one of the first two steps."""
-    speed, response = log_uniform(draw, 0.1, 10), str(draw.choice(["penalty", "penalty", "reflect"]))
+    speed, response = (
+        log_uniform(draw, 0.1, 10),
+        str(draw.choice(["penalty", "penalty", "reflect"])),
+    )
     gap = float(draw.uniform(0.1, 2)) * speed * scene["time"]["step"]
-    plane = {"shape": "plane", "point": [0.0, 0.0, bounds[0, 2] - gap], "normal": [0.0, 0.0, 1.0], "response": response}
+    plane = {
+        "shape": "plane",
+        "point": [0.0, 0.0, bounds[0, 2] - gap],
+        "normal": [0.0, 0.0, 1.0],
+        "response": response,
+    }
     friction = {"friction": float(draw.uniform(0.1, 1))} if response == "penalty" else {}
     scene["obstacle"] = [plane | friction]
     scene["start"] = {"velocity": [*draw.normal(0, 1, 2).tolist(), -speed]}
@@ -142,7 +166,9 @@ def material_of(draw: Draw) -> dict:
 
 
 def solver_of(draw: Draw) -> dict:
-    from msmpetsc.solve.presets import PRESETS  # with PETSc, which runs must not find started when they are forked
+    from msmpetsc.solve.presets import (
+        PRESETS,
+    )  # with PETSc, which runs must not find started when they are forked
 
     preset = str(draw.choice(list(PRESETS)))
     if draw.random() < 0.1:
@@ -190,7 +216,12 @@ def add_plates(draw: Draw, scene: dict, sides: np.ndarray) -> None:
     if response == "penalty" and draw.random() < 0.5:
         by = [0.0, 0.0, -float(draw.uniform(0.1, 1.5)) * half]
         path = [{"time": scene["time"]["duration"], "by": by}]
-        plate = {"shape": "plane", "point": [0.0, 0.0, half], "normal": [0.0, 0.0, -1.0], "path": path}
+        plate = {
+            "shape": "plane",
+            "point": [0.0, 0.0, half],
+            "normal": [0.0, 0.0, -1.0],
+            "path": path,
+        }
         scene["obstacle"].append(plate | {"response": "penalty"})
 
 
@@ -213,7 +244,9 @@ def measured(seed: int, changes: list[str], kinds: list[str], number: int) -> di
     scene = draw_scene(seed, number, FOLDER / str(seed), kinds[number % len(kinds)])
     result = scene.with_suffix(".h5")
     result.unlink(missing_ok=True)
-    run = lab.run(scene, result, ["--true-error", 1, "--quiet"], changes, timeout=SECONDS, warm=True)
+    run = lab.run(
+        scene, result, ["--true-error", 1, "--quiet"], changes, timeout=SECONDS, warm=True
+    )
     solver, steps = load_scene(scene).solver, []
     if result.exists():  # of a run that failed, the steps before
         frames = run.frames("step_error", "true_error")
@@ -232,11 +265,19 @@ def ratios_of(rows: list[dict]) -> np.ndarray:
 def row_of(name: str, rows: list[dict]) -> lab.Row:
     """Return the row of a preset: how its scenes ended, and said over true."""
     statuses, ratios = [row["status"] for row in rows], ratios_of(rows)
-    found: dict[str, object] = {"preset": name} | {word: statuses.count(status) for word, status in ENDS.items()}
+    found: dict[str, object] = {"preset": name} | {
+        word: statuses.count(status) for word, status in ENDS.items()
+    }
     found["faults"] = len(rows) - sum(statuses.count(status) for status in ENDS.values())
     within = ratios[np.isfinite(ratios)]
-    lowest = [f"{share:.2g}" for share in np.quantile(within, (0, 0.05, 0.5))] if len(within) else ["", "", ""]
-    found |= {"steps": len(ratios)} | dict(zip(("least ratio", "5%", "median"), lowest, strict=True))
+    lowest = (
+        [f"{share:.2g}" for share in np.quantile(within, (0, 0.05, 0.5))]
+        if len(within)
+        else ["", "", ""]
+    )
+    found |= {"steps": len(ratios)} | dict(
+        zip(("least ratio", "5%", "median"), lowest, strict=True)
+    )
     return found | {"below 1/3": int((ratios < LEAST).sum())}
 
 
@@ -257,10 +298,15 @@ def main() -> int:
         print(json.dumps(row, indent=1))
         return int(bad(row))
     with ThreadPoolExecutor(2) as pool:
-        rows = list(pool.map(partial(measured, args.seed, args.set, args.kinds), range(args.scenes)))
+        rows = list(
+            pool.map(partial(measured, args.seed, args.set, args.kinds), range(args.scenes))
+        )
     for row in filter(bad, rows):
         steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
-        print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)
+        print(
+            f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}",
+            file=sys.stderr,
+        )
     names = sorted({row["preset"] for row in rows})
     of_presets = [row_of(name, [row for row in rows if row["preset"] == name]) for name in names]
     lab.heading()

@@ -28,7 +28,8 @@ class Tree:
     def __init__(self, folder: Path):
         self.folder, package = folder, folder / "msmpetsc"
         self.paths = {
-            ".".join(path.relative_to(package).with_suffix("").parts): path for path in sorted(package.rglob("*.py"))
+            ".".join(path.relative_to(package).with_suffix("").parts): path
+            for path in sorted(package.rglob("*.py"))
         }
         self.modules = {name: ast.parse(path.read_text()) for name, path in self.paths.items()}
         self.lines = {name: path.read_text().splitlines() for name, path in self.paths.items()}
@@ -47,8 +48,12 @@ class Tree:
             if isinstance(node, ast.ImportFrom):
                 words = {f"{node.module}.{alias.name}" for alias in node.names} | {str(node.module)}
             else:
-                words = {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
-            found[name] |= {word.removeprefix("msmpetsc.") for word in words} & set(self.modules) - {name}
+                words = (
+                    {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
+                )
+            found[name] |= {word.removeprefix("msmpetsc.") for word in words} & set(
+                self.modules
+            ) - {name}
         return found
 
     def nodes(self) -> Iterator[tuple[str, ast.AST]]:
@@ -75,7 +80,10 @@ def rooms(tree: Tree) -> Facts:
         of_rooms[name.partition(".")[0]] += len(tree.lines[name])
     files = Counter(name.partition(".")[0] for name in own)
     yield "lines, files", f"{of_rooms.total():,}, {len(own)}"
-    yield "lines/files by room", ", ".join(f"{room} {lines:,}/{files[room]}" for room, lines in of_rooms.items())
+    yield (
+        "lines/files by room",
+        ", ".join(f"{room} {lines:,}/{files[room]}" for room, lines in of_rooms.items()),
+    )
     for folder in ("scripts", "tests"):
         paths = [path for path in (tree.folder / folder).rglob("*.py") if path.is_file()]
         yield f"lines of {folder}", f"{sum(len(path.read_text().splitlines()) for path in paths):,}"
@@ -91,7 +99,9 @@ def rooms(tree: Tree) -> Facts:
 def arguments(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.arg]:
     """Return the arguments but self and cls."""
     of = function.args
-    return [arg for arg in (*of.posonlyargs, *of.args, *of.kwonlyargs) if arg.arg not in ("self", "cls")]
+    return [
+        arg for arg in (*of.posonlyargs, *of.args, *of.kwonlyargs) if arg.arg not in ("self", "cls")
+    ]
 
 
 def height_of(node: ast.stmt) -> int:
@@ -109,13 +119,23 @@ def shape(tree: Tree) -> Facts:
     many = [name for name, function in tree.functions if len(arguments(function)) > MOST_ARGUMENTS]
     yield f"functions over {MOST_ARGUMENTS} arguments", len(many)
     for walk, pattern in WALKS.items():
-        taking = [name for name, function in tree.functions if re.search(pattern, ast.unparse(function.args))]
+        taking = [
+            name
+            for name, function in tree.functions
+            if re.search(pattern, ast.unparse(function.args))
+        ]
         yield f"functions, modules on the walk of {walk}", f"{len(taking)}, {len(set(taking))}"
     kinds = Counter(node.name for _, node in tree.nodes() if isinstance(node, ast.ClassDef))
     yield "class names that stand twice", listed(name for name, count in kinds.items() if count > 1)
     inside = {node for _, function in tree.functions for node in ast.walk(function)}
-    yield "imports inside functions", sum(isinstance(node, ast.Import | ast.ImportFrom) for node in inside)
-    yield "tuned module constants", sum(is_number(node) for module in tree.modules.values() for node in module.body)
+    yield (
+        "imports inside functions",
+        sum(isinstance(node, ast.Import | ast.ImportFrom) for node in inside),
+    )
+    yield (
+        "tuned module constants",
+        sum(is_number(node) for module in tree.modules.values() for node in module.body),
+    )
 
 
 def is_number(node: ast.stmt) -> bool:
@@ -139,17 +159,27 @@ def density(tree: Tree) -> Facts:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
             tuples += any(isinstance(target, ast.Tuple) for target in node.targets)
     wide = sum(len(line) > WIDE for line in lines)
-    counts = {f"lines over {WIDE}": wide, "conditional expressions": choices, "tuple assignments": tuples}
+    counts = {
+        f"lines over {WIDE}": wide,
+        "conditional expressions": choices,
+        "tuple assignments": tuples,
+    }
     for name, count in counts.items():
         yield f"{name}: all, in 1,000 lines", f"{count:,}, {1000 * count / len(lines):.1f}"
 
 
 def main() -> None:
     options = lab.parser(__doc__)
-    options.add_argument("folder", nargs="?", type=Path, default=ROOT, metavar="FOLDER", help="a clone (this one)")
+    options.add_argument(
+        "folder", nargs="?", type=Path, default=ROOT, metavar="FOLDER", help="a clone (this one)"
+    )
     args = options.parse_args()
     tree = Tree(args.folder.resolve())
-    lab.table({"measure": name, "now": value} for facts in (rooms, shape, density) for name, value in facts(tree))
+    lab.table(
+        {"measure": name, "now": value}
+        for facts in (rooms, shape, density)
+        for name, value in facts(tree)
+    )
 
 
 if __name__ == "__main__":

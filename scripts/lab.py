@@ -74,7 +74,11 @@ def run(
     """
     file = file_of(scene)
     command: list[object] = ["-m", "msmpetsc", "run", file, "-o", path, "--overwrite", *words]
-    command += ["--measure", path.with_suffix(".json"), *(word for change in changes for word in ("--set", change))]
+    command += [
+        "--measure",
+        path.with_suffix(".json"),
+        *(word for change in changes for word in ("--set", change)),
+    ]
     path.parent.mkdir(parents=True, exist_ok=True)
     print(file.stem, *words, *changes, f"({ranks} ranks)", file=sys.stderr, flush=True)
     ended = python(command, path.with_suffix(".log"), ranks, timeout, warm)
@@ -88,9 +92,13 @@ def file_of(scene: str | Path) -> Path:
     return Path(scene) if Path(scene).suffix == ".toml" else SCENES / f"{scene}.toml"
 
 
-def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:
+def python(
+    words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False
+) -> Ended:
     """Run Python with these words to its end, what it says into ``log``."""
-    launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []  # study.cases' starts PETSc where it is imported
+    launcher = (
+        ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
+    )  # study.cases' starts PETSc where it is imported
     return PROCESSES.run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
 
 
@@ -163,7 +171,9 @@ def parser(documentation: str | None) -> ArgumentParser:
 def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) -> None:
     """Print the tables of a study that the command line names, or all."""
     options = parser(documentation)
-    options.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(tables)}; all if none is named")
+    options.add_argument(
+        "tables", nargs="*", metavar="TABLE", help=f"of {', '.join(tables)}; all if none is named"
+    )
     args = options.parse_args()
     if unknown := set(args.tables) - set(tables):
         options.error(f"no table {', '.join(sorted(unknown))}: {', '.join(tables)}")
@@ -176,6 +186,11 @@ def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) 
 def heading() -> None:
     """Print the command of a script, the day and the machine, below which its tables stand."""
     name, *words = sys.argv
-    print(f"# {Path(name).name}\n\n```sh\n{shlex.join([f'scripts/{Path(name).name}', *words])}\n```\n")
+    print(
+        f"# {Path(name).name}\n\n```sh\n{shlex.join([f'scripts/{Path(name).name}', *words])}\n```\n"
+    )
     host = machine()
-    print(f"{datetime.date.today()}, msmpetsc {__version__}, {host['cpu']}, {host['cores']} cores.", flush=True)
+    print(
+        f"{datetime.date.today()}, msmpetsc {__version__}, {host['cpu']}, {host['cores']} cores.",
+        flush=True,
+    )

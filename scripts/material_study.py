@@ -35,14 +35,21 @@ from msmpetsc.solve.presets import find_preset
 
 E, NU, DENSITY, GRAVITY = 1e6, 1 / 4, 1000.0, 9.81  # [Pa], [-], [kg/m^3], [m/s^2]
 SHEAR = E / (2 * (1 + NU))  # [Pa]
-KAPPA_SQUARE, KAPPA_ROUND = 10 * (1 + NU) / (12 + 11 * NU), 6 * (1 + NU) / (7 + 6 * NU)  # Cowper (1966)
+KAPPA_SQUARE, KAPPA_ROUND = (
+    10 * (1 + NU) / (12 + 11 * NU),
+    6 * (1 + NU) / (7 + 6 * NU),
+)  # Cowper (1966)
 WIDTH, BEAM = 0.1, 10  # of the beam [m], and its length in widths
 ACROSS = (2, 4, 6, 8)  # cells across the beam
 LENGTH, RADIUS = 0.5, 0.05  # of bars that do not lie along the grid, and of the ball [m]
 OFFSETS = ((0.0, 0.0), (0.3, 0.7), (0.5, 0.5))  # of the grid across the bar [cells]
 SPRINGS = None  # in place of Poisson's ratio of a neo-Hookean solid
 LAWS = {"springs": SPRINGS, "neo-Hookean": NU}
-KINDS = {"whole": ("whole", SPRINGS), "fill": ("fill", SPRINGS), "neo-Hookean": ("fill", NU)}  # of boundary cells
+KINDS = {
+    "whole": ("whole", SPRINGS),
+    "fill": ("fill", SPRINGS),
+    "neo-Hookean": ("fill", NU),
+}  # of boundary cells
 
 
 # ---- lattices, and the Hessian at rest
@@ -57,10 +64,20 @@ def lattice_of(
 ) -> Lattice:
     """The lattice of a mesh in a grid that begins ``offset`` (3,) cells before it."""
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
-    bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
-    cages = fill([BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)], h, boundary=boundary)
-    law = {"law": "linear"} if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
-    return build_lattice(cages, Material.model_validate({"density": DENSITY, "young_modulus": E} | law))
+    bounds = np.array(
+        [surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)]
+    )
+    cages = fill(
+        [BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)], h, boundary=boundary
+    )
+    law = (
+        {"law": "linear"}
+        if poisson is SPRINGS
+        else {"law": "neo-hookean", "poisson_ratio": poisson}
+    )
+    return build_lattice(
+        cages, Material.model_validate({"density": DENSITY, "young_modulus": E} | law)
+    )
 
 
 def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS) -> Lattice:
@@ -71,10 +88,21 @@ def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS)
 
 def hessian(lattice: Lattice) -> csc_array:
     """Hessian of E at rest (3n, 3n) [N/m], from its products: nodes three cells apart share no cell."""
-    n, ijk = len(lattice.nodes), np.rint((lattice.nodes - lattice.nodes.min(axis=0)) / lattice.cell_size).astype(int)
-    colour, product, triplets = ijk % 3 @ [9, 3, 1], Elasticity(lattice).hessian_at(lattice.nodes), []
+    n, ijk = (
+        len(lattice.nodes),
+        np.rint((lattice.nodes - lattice.nodes.min(axis=0)) / lattice.cell_size).astype(int),
+    )
+    colour, product, triplets = (
+        ijk % 3 @ [9, 3, 1],
+        Elasticity(lattice).hessian_at(lattice.nodes),
+        [],
+    )
     neighbours = csc_array(
-        (np.ones(8 * len(lattice.cells)), lattice.cells.ravel(), 8 * np.arange(len(lattice.cells) + 1))
+        (
+            np.ones(8 * len(lattice.cells)),
+            lattice.cells.ravel(),
+            8 * np.arange(len(lattice.cells) + 1),
+        )
     )
     pairs = (neighbours @ neighbours.T).tocoo()
     for c in range(27):
@@ -84,14 +112,23 @@ def hessian(lattice: Lattice) -> csc_array:
             v[colour == c, axis] = 1
             product.add_product(v, column)
             for k in range(3):
-                triplets.append((column[pairs.row[of], k], 3 * pairs.row[of] + k, 3 * pairs.col[of] + axis))
+                triplets.append(
+                    (column[pairs.row[of], k], 3 * pairs.row[of] + k, 3 * pairs.col[of] + axis)
+                )
     values, rows, columns = np.concatenate(triplets, axis=1)
-    return coo_array((values, (rows.astype(int), columns.astype(int))), shape=(3 * n, 3 * n)).tocsc()
+    return coo_array(
+        (values, (rows.astype(int), columns.astype(int))), shape=(3 * n, 3 * n)
+    ).tocsc()
 
 
 def factorise(K: csc_array) -> Callable[[np.ndarray], np.ndarray]:
     """f -> K^(-1) f, K symmetric positive definite."""
-    return splu(csc_array(K), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve
+    return splu(
+        csc_array(K),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    ).solve
 
 
 # ---- Timoshenko's beams
@@ -119,7 +156,9 @@ def beam_section(across: float = np.inf) -> Section:
              And its masses sit at corners: rho I grows by 1 + 2 (h/b)^2.
     """
     solid, ratio = section(WIDTH**2, WIDTH**4 / 12, KAPPA_SQUARE), 1 / across**2
-    return solid._replace(EI=solid.EI * (1 + 169 / 140 * ratio), line_inertia=solid.line_inertia * (1 + 2 * ratio))
+    return solid._replace(
+        EI=solid.EI * (1 + 169 / 140 * ratio), line_inertia=solid.line_inertia * (1 + 2 * ratio)
+    )
 
 
 def tip_sag(of: Section, length: float) -> float:
@@ -147,7 +186,9 @@ def timoshenko_frequency(across: float = np.inf) -> float:
         B[2, 1], B[2, 3], B[3, 0] = -of.line_inertia * omega**2, -1, -of.line_mass * omega**2
         return np.linalg.det(expm(B * length)[2:, 2:])
 
-    slender = 1.8751**2 * np.sqrt(of.EI / of.line_mass) / length**2  # Euler-Bernoulli's [rad/s], a little higher
+    slender = (
+        1.8751**2 * np.sqrt(of.EI / of.line_mass) / length**2
+    )  # Euler-Bernoulli's [rad/s], a little higher
     return brentq(end, 0.5 * slender, 1.1 * slender, xtol=1e-12 * slender) / (2 * np.pi)
 
 
@@ -176,7 +217,10 @@ class Clamped:
     def frequency(self) -> float:
         """First bending frequency [Hz]."""
         # bending along y and along z are one double eigenvalue; a start that is given keeps the figures the same
-        modes = {"OPinv": LinearOperator(self.K.shape, self.inverse), "v0": np.ones(self.K.shape[0])}
+        modes = {
+            "OPinv": LinearOperator(self.K.shape, self.inverse),
+            "v0": np.ones(self.K.shape[0]),
+        }
         M = diags(np.repeat(self.lattice.mass, 3)[self.free])
         squares = eigsh(self.K, k=2, M=M, sigma=0, return_eigenvectors=False, **modes)
         return np.sqrt(squares.min()) / (2 * np.pi)
@@ -192,7 +236,12 @@ def lattice_beam(across: int, poisson: float | None = SPRINGS) -> tuple[float, f
 
 
 def steps(
-    lattice: Lattice, t: float, q: np.ndarray, before: np.ndarray, loads: Iterable[np.ndarray], error: float
+    lattice: Lattice,
+    t: float,
+    q: np.ndarray,
+    before: np.ndarray,
+    loads: Iterable[np.ndarray],
+    error: float,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """q_(n+1) and q_n, one pair for each of the loads (n, 3) [N]; from q_n and q_(n-1)."""
     stepper = Stepper(MPI.COMM_SELF, lattice, t, find_preset("newton"), error=error)
@@ -225,7 +274,9 @@ def struck_bar(courant: float, poisson: float | None = SPRINGS) -> tuple[np.ndar
     times = t * np.arange(1, round((STATIONS[1] + 60) / courant))
     blows = (np.exp(-0.5 * (time / PULSE - 5) ** 2) * force for time in times)
     motion = steps(lattice, t, lattice.nodes, lattice.nodes, blows, error=1e-5)
-    return times, np.array([[(q - p)[section == s, 0].mean() / t for s in STATIONS] for q, p in motion])
+    return times, np.array(
+        [[(q - p)[section == s, 0].mean() / t for s in STATIONS] for q, p in motion]
+    )
 
 
 def wave_speeds(times: np.ndarray, v: np.ndarray) -> tuple[float, float, float]:
@@ -249,7 +300,9 @@ def mass_error(lattice: Lattice, mesh: trimesh.Trimesh) -> float:
 def along_x(mesh: trimesh.Trimesh, degrees: float = 0.0) -> trimesh.Trimesh:
     """A bar of LENGTH along z, laid along x and turned about it."""
     mesh.vertices = mesh.vertices[:, [2, 0, 1]] + [LENGTH / 2, 0, 0]
-    return mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(degrees), (1, 0, 0)))
+    return mesh.apply_transform(
+        trimesh.transformations.rotation_matrix(np.radians(degrees), (1, 0, 0))
+    )
 
 
 def round_bar() -> trimesh.Trimesh:
@@ -262,10 +315,15 @@ def turned_bar() -> trimesh.Trimesh:
     return along_x(trimesh.creation.box((WIDTH, WIDTH, LENGTH)), degrees=30)
 
 
-def bar_errors(mesh: trimesh.Trimesh, exact: float, h: float, kind: str) -> tuple[int, np.ndarray, np.ndarray]:
+def bar_errors(
+    mesh: trimesh.Trimesh, exact: float, h: float, kind: str
+) -> tuple[int, np.ndarray, np.ndarray]:
     """Cells, and errors of sag and mass in the places of the grid."""
     lattices = [lattice_of(mesh, h, *KINDS[kind], offset=(0, *offset)) for offset in OFFSETS]
-    errors = [(Clamped(lattice).sag(LENGTH) / exact - 1, mass_error(lattice, mesh)) for lattice in lattices]
+    errors = [
+        (Clamped(lattice).sag(LENGTH) / exact - 1, mass_error(lattice, mesh))
+        for lattice in lattices
+    ]
     return len(lattices[0].cells), *np.transpose(errors)
 
 
@@ -275,7 +333,9 @@ def frequencies(lattice: Lattice, count: int) -> np.ndarray:
     K = hessian(lattice)
     shift = -1e-4 * E / (DENSITY * LENGTH**2)  # so that it can be factorised
     inverse = LinearOperator(K.shape, factorise((K - shift * diags(mass)).tocsc()))
-    squares = eigsh(K, k=6 + count, M=diags(mass), sigma=shift, OPinv=inverse, v0=np.ones(len(mass)))[0]
+    squares = eigsh(
+        K, k=6 + count, M=diags(mass), sigma=shift, OPinv=inverse, v0=np.ones(len(mass))
+    )[0]
     return np.sqrt(np.sort(squares)[6:])
 
 

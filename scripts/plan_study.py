@@ -30,7 +30,9 @@ SHORTER = 4  # times, of implicit steps
 NOT_MET = 3  # exit status of a plan that is there all the same
 FOLDER = lab.OUT / "plan_study"
 Setting = tuple[tuple[int | None, ...], tuple[int, ...]]
-STUDIES: dict[str, Setting] = {  # for each of ERRORS: first frames, that are tried, and cells of the finest trial
+STUDIES: dict[
+    str, Setting
+] = {  # for each of ERRORS: first frames, that are tried, and cells of the finest trial
     "armadillo_forehead": ((2, 2, 2), (1000, 4000, 8000)),
     "armadillo_leg": ((4, 2, 2), (1000, 4000, 8000)),
     "armadillo_palm": ((4, 2, 2), (1000, 4000, 8000)),
@@ -63,7 +65,9 @@ class Planned(NamedTuple):
     def run(self, method: Candidate, cells: int, limit: float) -> lab.Run:
         """Run so many cells by a method, with the surface at the scene's own frames."""
         step = load_scene(self.file).time.step
-        changes = overrides(self.file, {**tables(method), "cages": {"count": cells, "cell_size": None}})
+        changes = overrides(
+            self.file, {**tables(method), "cages": {"count": cells, "cell_size": None}}
+        )
         changes += ["output.surface=true", f"output.every={max(1, round(step / method.time_step))}"]
         if self.frames:
             changes += [f"time.duration={self.frames * step}"]
@@ -76,14 +80,23 @@ class Planned(NamedTuple):
         if method.integrator == STATIC:
             method = replace(method, step_error=1e-3)
         elif method.integrator != "verlet":  # whose substeps are as short as the cells ask
-            method = Candidate("bdf2", method.time_step / SHORTER, "newton", min(1e-3, method.step_error or 1e-3))
+            method = Candidate(
+                "bdf2", method.time_step / SHORTER, "newton", min(1e-3, method.step_error or 1e-3)
+            )
         for times in FINER:
             yield round(max(times * self.cells, MORE * finest)), method
 
 
 def planned(file: Path, target: float, frames: int | None, cells: int) -> Planned | str:
     """Return what `msmpetsc plan` chooses; or why there is nothing."""
-    words = ["--surface-error", target, *(("--frames", frames) if frames else ()), "--cells", cells, "--json"]
+    words = [
+        "--surface-error",
+        target,
+        *(("--frames", frames) if frames else ()),
+        "--cells",
+        cells,
+        "--json",
+    ]
     log = FOLDER / f"{file.stem}_{target:g}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     begin = perf_counter()
@@ -92,7 +105,9 @@ def planned(file: Path, target: float, frames: int | None, cells: int) -> Planne
         return ended.reason
     answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])  # behind what was tried
     choice = answer["choice"]
-    return Planned(file, frames, Candidate(**choice["method"]), choice["cells"], answer, perf_counter() - begin)
+    return Planned(
+        file, frames, Candidate(**choice["method"]), choice["cells"], answer, perf_counter() - begin
+    )
 
 
 def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
@@ -116,11 +131,17 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
         return found | {"chosen, cells": plan}
     error, why = true_error(plan, limit)
     method, choice = plan.method, plan.answer["choice"]
-    step = "" if method.step_error is None else f", {1000 * method.time_step:.3g} ms to {method.step_error:g}"
+    step = (
+        ""
+        if method.step_error is None
+        else f", {1000 * method.time_step:.3g} ms to {method.step_error:g}"
+    )
     bounds = [*([] if plan.answer["met"] else ["**not met**"]), why, *plan.answer["bounds"]]
     return found | {
         "chosen, cells": f"{method.integrator}{step}, {plan.cells}",
-        "expected: cells + time + step": " + ".join(f"{100 * value:.2g}%" for value in choice["budget"].values()),
+        "expected: cells + time + step": " + ".join(
+            f"{100 * value:.2g}%" for value in choice["budget"].values()
+        ),
         "true error": None if error is None else f"{100 * error:.2g}%",
         "over asked": None if error is None else f"{error / target:.2g}",
         "s a simulated s": float(choice["cost"]),
@@ -132,10 +153,17 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
 def rows(args: Namespace) -> lab.Rows:
     """Yield the rows, as they are run."""
     for target in args.errors:
-        number = next((number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1)
+        number = next(
+            (number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1
+        )
         for scene in args.scenes or STUDIES:
             tried, finest = STUDIES.get(scene, ANOTHER)
-            plan = planned(lab.file_of(scene), target, args.frames or tried[number], args.cells or finest[number])
+            plan = planned(
+                lab.file_of(scene),
+                target,
+                args.frames or tried[number],
+                args.cells or finest[number],
+            )
             yield row(scene, target, plan, args.limit)
 
 
@@ -147,8 +175,12 @@ def main() -> None:
     options.add_argument("--frames", type=int, help="the first ones, that are tried")
     options.add_argument("--limit", type=float, default=LIMIT, help="seconds of a finer run")
     args = options.parse_args()
-    if unknown := {name for name in args.scenes if name not in STUDIES and not Path(name).is_file()}:
-        options.error(f"no such scene: {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}")
+    if unknown := {
+        name for name in args.scenes if name not in STUDIES and not Path(name).is_file()
+    }:
+        options.error(
+            f"no such scene: {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}"
+        )
     lab.heading()
     lab.table(rows(args))
 

@@ -106,7 +106,9 @@ def volumes(result: Result) -> np.ndarray:
     """Return the volume (frames,) within the surface, over that at rest, less 1."""
     triangles = result["surface/triangles"][:]
     shapes = (result["surface/points"][:], *result.frames.surface)
-    found = np.array([trimesh.Trimesh(points, triangles, process=False).volume for points in shapes])
+    found = np.array(
+        [trimesh.Trimesh(points, triangles, process=False).volume for points in shapes]
+    )
     return found[1:] / found[0] - 1
 
 
@@ -122,7 +124,9 @@ def tissue(scene: str, args: Namespace) -> lab.Row:
             "frames a second": 1 / of.pop("wall_time"),
             **of,
             "inside out": int(result.frames.inverted[:].max()),
-            "volume": ", ".join(lab.percent(value, 2) for value in (change.min(), change.max(), change[-1])),
+            "volume": ", ".join(
+                lab.percent(value, 2) for value in (change.min(), change.max(), change[-1])
+            ),
         }
 
 
@@ -138,7 +142,9 @@ def cost(name: str, scene: str | Path, args: Namespace) -> tuple[Path, float]:
     time, cpu = lab.Run(path).cost["time"], sum(getrusage(RUSAGE_CHILDREN)[:2]) - began
     with Result(path) as result:
         frames = len(result.frames.time) - 1
-    return path, 1e3 * cpu * time["stepping"] / (time["setup"] + time["stepping"] + time["output"]) / frames
+    return path, 1e3 * cpu * time["stepping"] / (
+        time["setup"] + time["stepping"] + time["output"]
+    ) / frames
 
 
 def without_contact(file: Path) -> Path:
@@ -154,10 +160,15 @@ def without_contact(file: Path) -> Path:
 def touching(scene: str, args: Namespace) -> lab.Row:
     """Return the row of a scene that touches itself."""
     path, cpu = cost("touching", scene, args)
-    file, others = lab.file_of(scene), [change for change in args.set if not change.startswith("self_contact")]
+    file, others = (
+        lab.file_of(scene),
+        [change for change in args.set if not change.startswith("self_contact")],
+    )
     _, without = cost("without", without_contact(file), Namespace(**vars(args) | {"set": others}))
     model = build_model(MPI.COMM_SELF, load_scene(file, args.set))
-    assert isinstance(model.collision, CollisionSurface) and model.collision.surface and model.surface
+    assert (
+        isinstance(model.collision, CollisionSurface) and model.collision.surface and model.surface
+    )
     with Result(path) as result:
         whole = [*map(model.collision.points, result.frames.position, result.frames.time[:])]
         counted = np.unique(np.linspace(0, len(whole) - 1, COUNTED).round().astype(int))
@@ -170,7 +181,9 @@ def touching(scene: str, args: Namespace) -> lab.Row:
             "steps": len(whole) - 1,
             "contacts at most": int(result.frames.self_contacts[:].max()),
             "least distance [µm]": f"{1e6 * least:.2g} of {1e6 * model.collision.law.distance:.0f}",
-            "crossed": sum(int(count_crossings(each, model.collision.surface.triangles)) for each in whole),
+            "crossed": sum(
+                int(count_crossings(each, model.collision.surface.triangles)) for each in whole
+            ),
             "drawn": sum(int(count_crossings(each, model.surface.triangles)) for each in drawn),
             **mean(result, "iterations", "products"),
             "median, most products": f"{np.median(products):,.0f}, {products.max():,}",
@@ -191,9 +204,18 @@ TABLES = {
 def main() -> None:
     options = lab.parser(__doc__)
     options.add_argument("table", choices=TABLES)
-    options.add_argument("scenes", nargs="*", metavar="SCENE", help="of scenes/; those that the table is of, if absent")
-    options.add_argument("--frames", type=int, metavar="N", help="steps of each scene; all of them if absent")
-    options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes of every scene")
+    options.add_argument(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help="of scenes/; those that the table is of, if absent",
+    )
+    options.add_argument(
+        "--frames", type=int, metavar="N", help="steps of each scene; all of them if absent"
+    )
+    options.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="changes of every scene"
+    )
     options.add_argument("--shorter", type=int, default=1, metavar="N", help="times, the steps")
     args = options.parse_args()
     row, scenes = TABLES[args.table]

@@ -51,7 +51,9 @@ class Run(NamedTuple):
     def moved(self, x: float, axis: int = 0) -> np.ndarray:
         """Return the mean displacement (3,) [m] of the nodes with this coordinate, by their mass."""
         rest, at = self.lattice.nodes, np.isclose(self.lattice.nodes[:, axis], x)
-        return np.average((self.frames[-1].position - rest)[at], axis=0, weights=self.lattice.mass[at])
+        return np.average(
+            (self.frames[-1].position - rest)[at], axis=0, weights=self.lattice.mass[at]
+        )
 
 
 def run(mesh: trimesh.Trimesh | Path, poisson: float | None, **tables: Any) -> Run:
@@ -59,14 +61,24 @@ def run(mesh: trimesh.Trimesh | Path, poisson: float | None, **tables: Any) -> R
 
     poisson : Poisson's ratio of a neo-Hookean solid, or SPRINGS
     """
-    law = {"law": "linear"} if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
+    law = (
+        {"law": "linear"}
+        if poisson is SPRINGS
+        else {"law": "neo-hookean", "poisson_ratio": poisson}
+    )
     with tempfile.TemporaryDirectory() as folder:
         source = mesh
         if isinstance(mesh, trimesh.Trimesh):
             source = Path(folder) / "body.obj"
             mesh.export(source, digits=17)
-        scene: dict[str, Any] = {"mesh": {"source": str(source)}, "time": {"integrator": "static"}, **tables}
-        scene["material"] = {"young_modulus": E, "density": DENSITY} | law | scene.get("material", {})
+        scene: dict[str, Any] = {
+            "mesh": {"source": str(source)},
+            "time": {"integrator": "static"},
+            **tables,
+        }
+        scene["material"] = (
+            {"young_modulus": E, "density": DENSITY} | law | scene.get("material", {})
+        )
         scene = {"solver": {"error": 1e-6}, "output": {"surface": False}} | scene
         simulation = msmpetsc.Simulation(msmpetsc.Scene.of(scene))
         frames = list(simulation.frames())
@@ -83,7 +95,11 @@ def box(*sides: float) -> trimesh.Trimesh:
 def held(axis: int, at: float, side: int) -> Tables:
     """Return the region below (-1) or above (1) a plane across an axis."""
     normal = side * np.eye(3)[axis]
-    return {"region": {"half_space": {"point": [*(at * np.eye(3)[axis] - 1e-6 * normal)], "normal": [*normal]}}}
+    return {
+        "region": {
+            "half_space": {"point": [*(at * np.eye(3)[axis] - 1e-6 * normal)], "normal": [*normal]}
+        }
+    }
 
 
 # ---- beams
@@ -92,7 +108,13 @@ def held(axis: int, at: float, side: int) -> Tables:
 def bent(length: int, across: int, poisson: float | None, load: float) -> Run:
     """Return a cantilever of thickness 1 m with a load [N] across its end."""
     force = held(0, length, 1) | {"total": [0, 0, -load]}
-    return run(box(length, 1, 1), poisson, cages={"cell_size": 1 / across}, pin=[held(0, 0, -1)], force=[force])
+    return run(
+        box(length, 1, 1),
+        poisson,
+        cages={"cell_size": 1 / across},
+        pin=[held(0, 0, -1)],
+        force=[force],
+    )
 
 
 def sag_error(across: int, poisson: float | None, length: int = 10) -> float:
@@ -145,12 +167,18 @@ def tetrahedra(surface: trimesh.Trimesh) -> skfem.MeshTet:
     return skfem.MeshTet(points.T.copy(), cells.T.copy())
 
 
-def fem_surface(surface: trimesh.Trimesh, young: float, poisson: float, load: np.ndarray) -> np.ndarray:
+def fem_surface(
+    surface: trimesh.Trimesh, young: float, poisson: float, load: np.ndarray
+) -> np.ndarray:
     """Return the linear displacement (v, 3) [m] by quadratic tetrahedra, z = 0 clamped, ``load`` (3,) [N/m^3]."""
     basis = skfem.Basis(tetrahedra(surface), skfem.ElementVector(skfem.ElementTetP2()))
     K = linear_elasticity(*lame_parameters(young, poisson)).assemble(basis)
-    f = skfem.LinearForm(lambda v, _: load[0] * v[0] + load[1] * v[1] + load[2] * v[2]).assemble(basis)
-    fixed = basis.get_dofs(basis.mesh.facets_satisfying(lambda x: x[2] < 1e-9, boundaries_only=True))
+    f = skfem.LinearForm(lambda v, _: load[0] * v[0] + load[1] * v[1] + load[2] * v[2]).assemble(
+        basis
+    )
+    fixed = basis.get_dofs(
+        basis.mesh.facets_satisfying(lambda x: x[2] < 1e-9, boundaries_only=True)
+    )
     u = skfem.solve(*skfem.condense(K, f, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-10))
     return u[basis.nodal_dofs[:, : len(surface.vertices)]].T
 
@@ -166,12 +194,18 @@ def scan_rows(surface: Any, exact: np.ndarray) -> lab.Rows:
     for count in (1000, 10_000):
         row: dict[str, object] = {"cells asked": count}
         for name, poisson in (("springs", SPRINGS), ("neo-Hookean", 0.25)):
-            tables = {"material": {"young_modulus": SCAN_E}, "gravity": {"acceleration": PUSH}, "output": {}}
+            tables = {
+                "material": {"young_modulus": SCAN_E},
+                "gravity": {"acceleration": PUSH},
+                "output": {},
+            }
             of = run(surface, poisson, cages={"count": count}, pin=[held(2, 0, -1)], **tables)
             assert of.surface is not None
             u = of.frames[-1].surface - of.surface
             error = np.sqrt(area @ ((u - exact) ** 2).sum(axis=1) / size)
-            factor = area @ (u * exact).sum(axis=1) / size  # of the least difference, factor * exact - u
+            factor = (
+                area @ (u * exact).sum(axis=1) / size
+            )  # of the least difference, factor * exact - u
             row |= {
                 "cells": len(of.lattice.cells),
                 name: percent(error),
@@ -183,7 +217,9 @@ def scan_rows(surface: Any, exact: np.ndarray) -> lab.Rows:
 def rod_rows() -> lab.Rows:
     """Rows of the rod and its finite elements in $MSMPETSC_SOLID."""
     folder = Path(os.environ.get("MSMPETSC_SOLID", ""))
-    yield from scan_rows(trimesh.load(folder / "rod_cut.ply", process=False), np.load(folder / "rod_fem.npz")["U"])
+    yield from scan_rows(
+        trimesh.load(folder / "rod_cut.ply", process=False), np.load(folder / "rod_fem.npz")["U"]
+    )
 
 
 def bunny() -> trimesh.Trimesh:
@@ -191,9 +227,13 @@ def bunny() -> trimesh.Trimesh:
     whole = prepare(load("bunny", lab.SCENES), [{"simplify": 4000}])
     low, high = whole.points[:, 2].min(), whole.points[:, 2].max()
     base = low + CUT * (high - low)
-    solid = manifold3d.Manifold(manifold3d.Mesh(whole.points.astype("f4"), whole.triangles.astype("u4")))
+    solid = manifold3d.Manifold(
+        manifold3d.Mesh(whole.points.astype("f4"), whole.triangles.astype("u4"))
+    )
     cut = solid.trim_by_plane((0, 0, 1), base).simplify(1e-4).to_mesh()
-    surface = trimesh.Trimesh(cut.vert_properties[:, :3] - np.array([0, 0, base]), cut.tri_verts, process=False)
+    surface = trimesh.Trimesh(
+        cut.vert_properties[:, :3] - np.array([0, 0, base]), cut.tri_verts, process=False
+    )
     surface.vertices[np.abs(surface.vertices[:, 2]) < 1e-6, 2] = 0
     return surface
 
@@ -236,7 +276,9 @@ def limit(coarse: int, fine: int, poisson: float | None = SPRINGS) -> float:
     return b + (b - a) / ((fine / coarse) ** 2 - 1)
 
 
-def clamp_errors(sizes: tuple[int, ...], exact: float, held: float, poisson: float | None = SPRINGS) -> np.ndarray:
+def clamp_errors(
+    sizes: tuple[int, ...], exact: float, held: float, poisson: float | None = SPRINGS
+) -> np.ndarray:
     """Return relative errors of the stiffness, one a size."""
     return exact / np.array([compliance(cells, TILT, held, poisson) for cells in sizes]) - 1
 
@@ -248,9 +290,12 @@ def clamp_rows() -> lab.Rows:
         exact = limit(*sizes[1:], poisson)
         found = {name: clamp_errors(sizes, exact, held, poisson) for name, held in CLAMPS.items()}
         for k, cells in enumerate(sizes):
-            yield {"law": law, "cells": f"R/{cells}"} | {name: percent(of[k], 2) for name, of in found.items()}
+            yield {"law": law, "cells": f"R/{cells}"} | {
+                name: percent(of[k], 2) for name, of in found.items()
+            }
         yield {"law": law, "cells": "order"} | {
-            name: f"{lab.slope([1 / cells for cells in sizes], of):.2f}" for name, of in found.items()
+            name: f"{lab.slope([1 / cells for cells in sizes], of):.2f}"
+            for name, of in found.items()
         }
 
 
@@ -267,28 +312,42 @@ def graded(start: float, stop: float, count: int) -> np.ndarray:
 
 def fem_force(poisson: float, half: float) -> float:
     """Return the force [N] on a bonded plate so wide by half, by quadratic hexahedra of a quarter of the block."""
-    x = np.unique(np.concatenate([graded(0, half, 4), graded(WIDE / 2, half, 4 if half < WIDE / 2 else 0)]))
+    x = np.unique(
+        np.concatenate([graded(0, half, 4), graded(WIDE / 2, half, 4 if half < WIDE / 2 else 0)])
+    )
     z = np.unique(np.concatenate([graded(0.5, 0, 3), graded(0.5, 1, 4)]))
     mesh = skfem.MeshHex.init_tensor(x, x, z)
     basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=5)
     K = linear_elasticity(*lame_parameters(E, poisson)).assemble(basis)
     bottom = basis.get_dofs(mesh.facets_satisfying(lambda x: np.isclose(x[2], 0)))
     middles = [
-        basis.get_dofs(mesh.facets_satisfying(lambda x, k=k: np.isclose(x[k], 0))).all(f"u^{k + 1}") for k in (0, 1)
+        basis.get_dofs(mesh.facets_satisfying(lambda x, k=k: np.isclose(x[k], 0))).all(f"u^{k + 1}")
+        for k in (0, 1)
     ]
-    plate = basis.get_dofs(mesh.facets_satisfying(lambda x: np.isclose(x[2], 1) & (x[0] < half) & (x[1] < half)))
+    plate = basis.get_dofs(
+        mesh.facets_satisfying(lambda x: np.isclose(x[2], 1) & (x[0] < half) & (x[1] < half))
+    )
     u = basis.zeros()
     u[plate.all("u^3")] = -PRESSED
     fixed = np.unique(np.concatenate([bottom.all(), plate.all(), *middles]))
-    u = skfem.solve(*skfem.condense(K, basis.zeros(), x=u, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-10))
+    u = skfem.solve(
+        *skfem.condense(K, basis.zeros(), x=u, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-10)
+    )
     return -4 * (K @ u)[plate.all("u^3")].sum()
 
 
 def force(poisson: float | None, half: float, high: int) -> float:
     """Return the force [N] on the plate by a lattice ``high`` cells high."""
-    corners = [[WIDE / 2 - half, WIDE / 2 - half, 1 - 1e-6], [WIDE / 2 + half, WIDE / 2 + half, 1 + 1e-6]]
+    corners = [
+        [WIDE / 2 - half, WIDE / 2 - half, 1 - 1e-6],
+        [WIDE / 2 + half, WIDE / 2 + half, 1 + 1e-6],
+    ]
     anchor = {"region": {"box": corners}, "path": [{"time": 1, "by": [0, 0, -PRESSED]}]}
-    tables = {"pin": [held(2, 0, -1)], "anchor": [anchor], "time": {"integrator": "static", "step": 1, "duration": 1}}
+    tables = {
+        "pin": [held(2, 0, -1)],
+        "anchor": [anchor],
+        "time": {"integrator": "static", "step": 1, "duration": 1},
+    }
     of = run(box(WIDE, WIDE, 1), poisson, cages={"cell_size": 1 / high}, **tables)
     gradient = np.zeros_like(of.lattice.nodes)
     Elasticity(of.lattice).add_gradient(of.frames[-1].position, gradient)
@@ -303,7 +362,9 @@ def pressed_rows(half: float) -> lab.Rows:
             "quadratic FEM [N]": exact,
             "springs, 8 cells": percent(force(SPRINGS, half, 8) / exact - 1),
         }
-        yield row | {f"{high} cells": percent(force(poisson, half, high) / exact - 1) for high in (4, 8, 16)}
+        yield row | {
+            f"{high} cells": percent(force(poisson, half, high) / exact - 1) for high in (4, 8, 16)
+        }
 
 
 STARTS: dict[str, Tables] = {
@@ -319,7 +380,10 @@ FALL = {"time": {"step": 1 / 20, "duration": 60}, "solver": {"error": 1e-3}}
 def start_rows(tables: Tables) -> lab.Rows:
     """A clamped bar of 4 x 1 x 1 m without a load: what becomes of it, by cells across and Poisson's ratio."""
     for across, name in product((2, 3, 4, 6), STARTS):
-        ends = {f"nu {nu}": came_back(nu, across, tables | {"start": STARTS[name]}) for nu in (0.25, 0.45, 0.49)}
+        ends = {
+            f"nu {nu}": came_back(nu, across, tables | {"start": STARTS[name]})
+            for nu in (0.25, 0.45, 0.49)
+        }
         yield {"cells across": across, "start": name} | ends
 
 
@@ -335,7 +399,11 @@ BEAM = lab.SCENES / "studies" / "beam.obj"
 
 
 def beam(poisson: float | None, h: float, time: Tables, g: float = G, error: float = 1e-6) -> Run:
-    tables = {"gravity": {"acceleration": [0, 0, -g]}, "pin": [held(0, 0, -1)], "material": {"young_modulus": 5e5}}
+    tables = {
+        "gravity": {"acceleration": [0, 0, -g]},
+        "pin": [held(0, 0, -1)],
+        "material": {"young_modulus": 5e5},
+    }
     return run(BEAM, poisson, cages={"cell_size": h}, time=time, solver={"error": error}, **tables)
 
 
@@ -358,7 +426,11 @@ def rest_rows() -> lab.Rows:
 
 def swing_rows() -> lab.Rows:
     time = {"step": 1 / 60, "duration": 0.5}  # as in scenes/studies/beam_soft.toml
-    for poisson, sizes in ((SPRINGS, (1 / 32,)), (0.25, (1 / 32, 1.25 / 87)), (0.45, (1 / 32, 1.25 / 87))):
+    for poisson, sizes in (
+        (SPRINGS, (1 / 32,)),
+        (0.25, (1 / 32, 1.25 / 87)),
+        (0.45, (1 / 32, 1.25 / 87)),
+    ):
         for h in sizes:
             of = beam(poisson, h, time, error=1e-3)
             its = [frame.iterations for frame in of.frames[1:]]

@@ -25,7 +25,14 @@ ONE_MACHINE = {"OMPI_MCA_btl_tcp_if_include": "lo"}
 PATHS = os.pathsep.join(
     filter(None, (str(ROOT), str(ROOT / "tests" / "helpers"), os.environ.get("PYTHONPATH")))
 )  # petsc4py may be found by it
-ENVIRONMENT = {**os.environ, **AS_ROOT, "PYTHONPATH": PATHS, "OMP_NUM_THREADS": "1", **SHARED_CORES, **ONE_MACHINE}
+ENVIRONMENT = {
+    **os.environ,
+    **AS_ROOT,
+    "PYTHONPATH": PATHS,
+    "OMP_NUM_THREADS": "1",
+    **SHARED_CORES,
+    **ONE_MACHINE,
+}
 
 # three minutes: a file of each room, what any change may break
 SMOKE = {
@@ -50,7 +57,11 @@ Run = Callable[..., subprocess.CompletedProcess]
 def pytest_configure(config: pytest.Config) -> None:
     """All tests are all but the slow ones, unless tests are chosen: by their file, by -m or by -k."""
     options = config.option
-    if config.args_source is not config.ArgsSource.ARGS and not options.markexpr and not options.keyword:
+    if (
+        config.args_source is not config.ArgsSource.ARGS
+        and not options.markexpr
+        and not options.keyword
+    ):
         options.markexpr = "not slow"
 
 
@@ -77,7 +88,9 @@ def run(ranks: int, *arguments: object, status: int | None = None) -> subprocess
     return done
 
 
-def python(*words: object, env: Mapping[str, str] = ENVIRONMENT, **options: Any) -> subprocess.CompletedProcess:
+def python(
+    *words: object, env: Mapping[str, str] = ENVIRONMENT, **options: Any
+) -> subprocess.CompletedProcess:
     """A Python that really starts, finished; a hang ends with the time of its test."""
     command = [sys.executable, *map(str, words)]
     return subprocess.run(command, env=env, capture_output=True, text=True, **options)
@@ -93,7 +106,9 @@ def result_on(ranks: int, scene: Path, *words: object) -> h5py.File:
 @pytest.fixture
 def msmpetsc() -> Run:
     """msmpetsc(2, "run", "scene.toml") -> the finished command on that many ranks."""
-    return lambda ranks, *arguments, **options: run(ranks, "-m", "msmpetsc.cli.main", *arguments, **options)
+    return lambda ranks, *arguments, **options: run(
+        ranks, "-m", "msmpetsc.cli.main", *arguments, **options
+    )
 
 
 @pytest.fixture(scope="session")

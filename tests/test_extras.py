@@ -46,10 +46,14 @@ def test_the_table_of_extras_is_that_of_the_project(extra: str):
     installed = packages_distributions()
     for package in EXTRAS[extra]:
         known = {name.lower().replace("_", "-") for name in installed.get(package, [])}
-        assert known & wanted or not known, f"{package} is of {known}, the extra {extra} has {wanted}"
+        assert known & wanted or not known, (
+            f"{package} is of {known}, the extra {extra} has {wanted}"
+        )
 
 
-OF_RUNS = tuple(name for name in EXTRAS["run"] if name not in (*EXTRAS["render"], "pooch"))  # which pyvista needs
+OF_RUNS = tuple(
+    name for name in EXTRAS["run"] if name not in (*EXTRAS["render"], "pooch")
+)  # which pyvista needs
 DRAWN = [
     "render {} -o x.png",
     "render {} -o x.gif --frames 0:4:2",
@@ -73,20 +77,30 @@ def test_drawing_exporting_and_comparing_need_neither_mpi_nor_petsc_nor_a_compil
 def test_exporting_and_comparing_need_the_core_alone(command: str, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small_result.write(tmp_path / "x.h5")
-    done = without(tuple(package for packages in EXTRAS.values() for package in packages), *command.split())
+    done = without(
+        tuple(package for packages in EXTRAS.values() for package in packages), *command.split()
+    )
     assert done.returncode == 0, done.stderr
 
 
 def in_the_clean(python: Path, *words: object, folder: Path) -> subprocess.CompletedProcess:
     """Return the finished command of a Python that sees nothing of this one's packages."""
-    clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "OMPI_", "PMIX_"))}
-    return subprocess.run([python, *map(str, words)], cwd=folder, env=clean, capture_output=True, text=True)
+    clean = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "OMPI_", "PMIX_"))
+    }
+    return subprocess.run(
+        [python, *map(str, words)], cwd=folder, env=clean, capture_output=True, text=True
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball: Path):
-    hidden = shutil.ignore_patterns(".*", "out", "tests", "build", "__pycache__", "*.egg-info", "*.png")
+    hidden = shutil.ignore_patterns(
+        ".*", "out", "tests", "build", "__pycache__", "*.egg-info", "*.png"
+    )
     shutil.copytree(ROOT, tmp_path / "clone", symlinks=True, ignore=hidden)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "clean"], check=True)
     python = tmp_path / "clean" / "bin" / "python"
@@ -102,14 +116,21 @@ def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball:
     read = "import msmpetsc; print(msmpetsc.open('ball.h5').frames.position[-1].shape[1])"
     assert in_the_clean(python, "-c", read, folder=tmp_path).stdout == "3\n"
     doctor = in_the_clean(python, "-m", "msmpetsc", "doctor", folder=tmp_path)
-    assert doctor.returncode == 1 and "BROKEN" not in doctor.stdout and "ok       extra render" in doctor.stdout
+    assert (
+        doctor.returncode == 1
+        and "BROKEN" not in doctor.stdout
+        and "ok       extra render" in doctor.stdout
+    )
     refused = in_the_clean(python, "-m", "msmpetsc", "run", ball, folder=tmp_path)
     assert refused.returncode == 2 and "msmpetsc[run]" in refused.stderr
 
 
 BEAM = ROOT / "scenes" / "studies" / "atlas" / "beam.toml"
 NEEDED = {  # a package that is missing -> the extra that brings it, and a command that needs it
-    **{name: ("run", ["run", BEAM, "-o", "y.h5"]) for name in ("mpi4py", "petsc4py", "numba", "trimesh")},
+    **{
+        name: ("run", ["run", BEAM, "-o", "y.h5"])
+        for name in ("mpi4py", "petsc4py", "numba", "trimesh")
+    },
     "pydantic": ("render", ["render", "x.h5"]),
     "scipy": ("render", ["series", "x.h5"]),
     "pyvista": ("render", ["render", "x.h5", "-o", "x.png"]),
@@ -119,10 +140,14 @@ NEEDED = {  # a package that is missing -> the extra that brings it, and a comma
 
 
 @pytest.mark.parametrize("package", NEEDED)
-def test_what_needs_a_package_names_the_extra_that_brings_it(package: str, tmp_path: Path, monkeypatch):
+def test_what_needs_a_package_names_the_extra_that_brings_it(
+    package: str, tmp_path: Path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     small_result.write(tmp_path / "x.h5")
     extra, command = NEEDED[package]
     done = without((package,), *command)
     assert done.returncode == 2 and done.stderr.count("error") == 1, done.stderr
-    assert done.stderr.endswith(f"{package} is not installed: pip install 'msmpetsc[{extra}]' brings it\n"), done.stderr
+    assert done.stderr.endswith(
+        f"{package} is not installed: pip install 'msmpetsc[{extra}]' brings it\n"
+    ), done.stderr

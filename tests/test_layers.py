@@ -60,7 +60,9 @@ def violations(layer: str, source: str) -> list[str]:
 
 def prints_to_stdout(node: ast.AST) -> bool:
     """Writing to a stream that was handed in is allowed: print(..., file=stream)."""
-    is_print = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    is_print = (
+        isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    )
     return is_print and "file" not in [keyword.arg for keyword in node.keywords]
 
 
@@ -69,5 +71,7 @@ def test_every_file_keeps_to_its_layer():
     assert len(files) > 30
     layers = {path: path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in files}
     assert set(layers.values()) <= set(HEIGHT), "a file or folder that LAYERS does not know"
-    found = {str(path.relative_to(PACKAGE)): violations(layers[path], path.read_text()) for path in files}
+    found = {
+        str(path.relative_to(PACKAGE)): violations(layers[path], path.read_text()) for path in files
+    }
     assert {path: wrong for path, wrong in found.items() if wrong} == {}

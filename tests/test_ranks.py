@@ -13,15 +13,29 @@ LEFT = {"box": [[-1, -1, -1], [0.01, 1, 1]]}
 RIGHT = {"box": [[0.99, -1, -1], [2, 1, 1]]}
 FAR = {"half_space": {"point": [0.25, 0, 0], "normal": [1, 0, 0]}}
 TILTED = {"half_space": {"point": [0.1, 0, 0], "normal": [-1, 0.3, 0.2]}}
-FLOOR = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0.1, 1], "response": "penalty", "friction": 0.4}
-WALL = {"shape": "plane", "point": [0.55, 0, 0], "normal": [-1, 0, 0], "path": [{"time": 0.1, "by": [-0.06, 0, 0]}]}
+FLOOR = {
+    "shape": "plane",
+    "point": [0, 0, -0.01],
+    "normal": [0, 0.1, 1],
+    "response": "penalty",
+    "friction": 0.4,
+}
+WALL = {
+    "shape": "plane",
+    "point": [0.55, 0, 0],
+    "normal": [-1, 0, 0],
+    "path": [{"time": 0.1, "by": [-0.06, 0, 0]}],
+}
 PLATE = {"shape": "box", "box": [[-1, -1, 0.25], [2, 2, 0.6]], "response": "penalty"}
 PLATE |= {"path": [{"time": 0.1, "by": [0, 0, -0.15]}]}
 SOFT = {"young_modulus": 1e5, "density": 1000.0}
 SOLID = SOFT | {"law": "neo-hookean", "poisson_ratio": 0.3}
 LED = [{"region": LEFT, "path": [{"time": 0.1, "by": [0, 0, 0.05]}], "stop": 0.12}]
 TURNED = [{"region": RIGHT, "path": [{"time": 1.0, "turn": [30, 0, 0]}]}]
-SWITCHED = [{"region": RIGHT, "total": [0, 0, sign], "start": start} for sign, start in ((0.2, 0.0), (-0.4, 3.0))]
+SWITCHED = [
+    {"region": RIGHT, "total": [0, 0, sign], "start": start}
+    for sign, start in ((0.2, 0.0), (-0.4, 3.0))
+]
 
 
 class Case(NamedTuple):
@@ -33,7 +47,9 @@ class Case(NamedTuple):
     equal: tuple[str, ...] = ()
 
 
-def steps(count: int, step: float, integrator: str = "implicit-euler", **more: Any) -> dict[str, Any]:
+def steps(
+    count: int, step: float, integrator: str = "implicit-euler", **more: Any
+) -> dict[str, Any]:
     return {"step": step, "duration": count * step, "integrator": integrator} | more
 
 
@@ -95,7 +111,10 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[h5py.Fil
         files = [folder / f"{name} {ranks}.h5" for name in CASES]
         scenes = [block_scene(folder, name=name, **case.tables) for name, case in CASES.items()]
         words = [case.words for case in CASES.values()]
-        commands = [["run", scene, "-o", file, *more] for scene, file, more in zip(scenes, files, words, strict=True)]
+        commands = [
+            ["run", scene, "-o", file, *more]
+            for scene, file, more in zip(scenes, files, words, strict=True)
+        ]
         for name, file, answers in zip(CASES, files, answers_on(ranks, commands), strict=True):
             assert [status for status, _ in answers] == [0] * ranks, answers
             found[name].append(h5py.File(file))
@@ -108,19 +127,29 @@ def test_two_ranks_are_as_one(results: dict[str, list[h5py.File]], name: str):
     for array in ("nodes", "cells", "pinned"):
         np.testing.assert_array_equal(two["lattice"][array], one["lattice"][array])
     np.testing.assert_allclose(two["lattice/mass"], one["lattice/mass"], rtol=1e-15)
-    ends, stiffness = ([file["lattice"][part][:] for file in (one, two)] for part in ("springs", "stiffness"))
+    ends, stiffness = (
+        [file["lattice"][part][:] for file in (one, two)] for part in ("springs", "stiffness")
+    )
     order = [np.lexsort(np.sort(of, axis=1).T) for of in ends]
-    np.testing.assert_array_equal(*(np.sort(of[by], axis=1) for of, by in zip(ends, order, strict=True)))
-    np.testing.assert_allclose(*(of[by] for of, by in zip(stiffness, order, strict=True)), rtol=1e-12)
+    np.testing.assert_array_equal(
+        *(np.sort(of[by], axis=1) for of, by in zip(ends, order, strict=True))
+    )
+    np.testing.assert_allclose(
+        *(of[by] for of, by in zip(stiffness, order, strict=True)), rtol=1e-12
+    )
     frames, expected = two["frames"], one["frames"]
     np.testing.assert_array_equal(frames["position"][0], expected["position"][0])
     size = np.ptp(one["lattice/nodes"], axis=0).max()
-    np.testing.assert_allclose(frames["position"], expected["position"], rtol=0, atol=CASES[name].accuracy * size)
+    np.testing.assert_allclose(
+        frames["position"], expected["position"], rtol=0, atol=CASES[name].accuracy * size
+    )
     for number in CASES[name].equal:
         assert expected[number][:].any() and np.array_equal(frames[number], expected[number])
     for field in {"kinetic", "elastic", "contact", "torque"} & set(expected):
         most = np.abs(expected[field]).max()
-        np.testing.assert_allclose(frames[field], expected[field], rtol=0, atol=10 * CASES[name].accuracy * most)
+        np.testing.assert_allclose(
+            frames[field], expected[field], rtol=0, atol=10 * CASES[name].accuracy * most
+        )
     if "embedding" in one:
         np.testing.assert_allclose(two["embedding/weights"], one["embedding/weights"], rtol=1e-13)
         np.testing.assert_allclose(frames["surface"], expected["surface"], rtol=0, atol=1e-6 * size)

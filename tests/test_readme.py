@@ -27,7 +27,9 @@ from msmpetsc.scene.schema import BodyTable, SceneFile
 from msmpetsc.study.study_file import load_study
 
 OUTSIDE = {".venv", "out", "build", ".petsc-cuda", ".pytest_cache", ".hypothesis"}
-READMES = sorted(path for path in ROOT.rglob("README.md") if not OUTSIDE & set(path.relative_to(ROOT).parts))
+READMES = sorted(
+    path for path in ROOT.rglob("README.md") if not OUTSIDE & set(path.relative_to(ROOT).parts)
+)
 ELSEWHERE = {"asv", "pip", "python", "module", "export", "./configure", "eval"}
 SMALLER = {  # a command's words -> those of the test
     "cages.count=3000": "cages.count=400 --frames 4",
@@ -165,7 +167,15 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_commands_of_the_front_door_run(clone: Path):
     names = {path.name for path in (clone / "out").iterdir()}
-    assert {"coarse.h5", "coarse.xdmf", "coarse.png", "loose.h5", "my.h5", "my.png", "bunny_fall.h5"} <= names
+    assert {
+        "coarse.h5",
+        "coarse.xdmf",
+        "coarse.png",
+        "loose.h5",
+        "my.h5",
+        "my.png",
+        "bunny_fall.h5",
+    } <= names
 
 
 @pytest.mark.slow
@@ -218,7 +228,9 @@ def test_the_table_of_options_is_that_of_the_request():
 
 def test_the_tests_of_cases_are_there():
     """Those that its table names, of which it gives how they begin or all but `test_`."""
-    named = re.findall(r"\| `([\w/]+\.py)`: (.*) \|$", (ROOT / "tests" / "cases" / "README.md").read_text(), re.M)
+    named = re.findall(
+        r"\| `([\w/]+\.py)`: (.*) \|$", (ROOT / "tests" / "cases" / "README.md").read_text(), re.M
+    )
     assert len(named) > 30
     for file, names in named:
         text = (ROOT / file).read_text()

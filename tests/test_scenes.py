@@ -25,9 +25,20 @@ from msmpetsc.scene.schema import SceneFile
 from msmpetsc.study.metrics import distance_of_shapes
 
 SCENES = Path(__file__).parents[1] / "scenes"
-PAPER_CELLS = {"armadillo": 8338, "dragon": 11536, "lung": 6499, "heart": 3126, "bunny": 9946, "brain": 13661}
+PAPER_CELLS = {
+    "armadillo": 8338,
+    "dragon": 11536,
+    "lung": 6499,
+    "heart": 3126,
+    "bunny": 9946,
+    "brain": 13661,
+}
 TISSUE_CELLS = {"heart_tissue": 1500}  # of neo-Hookean scenes, which are not the paper's either
-TOUCHING_CELLS = {"two_bunnies": 1500, "pile": 1000, "armadillo_fold": 3000}  # of scenes that are not the paper's
+TOUCHING_CELLS = {
+    "two_bunnies": 1500,
+    "pile": 1000,
+    "armadillo_fold": 3000,
+}  # of scenes that are not the paper's
 ALL = sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
@@ -37,15 +48,22 @@ class Result:
     def __init__(self, path: Path):
         with h5py.File(path) as file:
             self.scene = SceneFile.model_validate(tomllib.loads(file.attrs["scene"]))
-            self.time, self.q, self.kinetic = (file[f"frames/{name}"][:] for name in ("time", "position", "kinetic"))
+            self.time, self.q, self.kinetic = (
+                file[f"frames/{name}"][:] for name in ("time", "position", "kinetic")
+            )
             self.nodes, self.mass = file["lattice/nodes"][:], file["lattice/mass"][:]
             self.cells, self.turned = file["lattice/cells"][:], file["frames/inverted"][:]
             self.gained = file["frames/energy_gained"][:]
-            self.total = self.kinetic + sum(file[f"frames/{name}"][:] for name in ("elastic", "potential", "contact"))
+            self.total = self.kinetic + sum(
+                file[f"frames/{name}"][:] for name in ("elastic", "potential", "contact")
+            )
             self.most = (self.kinetic + file["frames/elastic"][:]).max()
             points, self.surface = file["surface/points"][:], file["frames/surface"][:]
             self.body = points, file["surface/triangles"][:].astype(np.int64)
-            self.contacts, self.nearest = file["frames/self_contacts"][:], file["frames/self_distance"][:]
+            self.contacts, self.nearest = (
+                file["frames/self_contacts"][:],
+                file["frames/self_distance"][:],
+            )
         self.h = np.ptp(self.nodes[self.cells[0]], axis=0).max()
         self.bounds = np.array([points.min(axis=0), points.max(axis=0)])
         self.height = np.ptp(self.bounds, axis=0)[2]
@@ -63,7 +81,9 @@ class Result:
 
     def mean(self, x: np.ndarray, where: np.ndarray) -> np.ndarray:
         """Mean by mass over some nodes of (..., n, 3)."""
-        return np.einsum("...nc,n->...c", x[..., where, :], self.mass[where]) / self.mass[where].sum()
+        return (
+            np.einsum("...nc,n->...c", x[..., where, :], self.mass[where]) / self.mass[where].sum()
+        )
 
     def moved(self, frame: int, where: np.ndarray) -> np.ndarray:
         """Mean displacement of some nodes from rest (3,), in heights of the body."""
@@ -122,7 +142,9 @@ def test_every_scene_has_the_papers_cells_or_its_own_and_four_moments():
     for name in ALL:
         scene = SceneFile.model_validate(tomllib.loads((SCENES / f"{name}.toml").read_text()))
         assert scene.cages.count == (own.get(name) or PAPER_CELLS[name.split("_")[0]])
-        assert scene.self_contact is None or scene.self_contact.surface is None  # what is drawn is what touches
+        assert (
+            scene.self_contact is None or scene.self_contact.surface is None
+        )  # what is drawn is what touches
         assert len(scene.picture.times) == 4 and scene.picture.times[-1] <= scene.time.duration
 
 
@@ -130,7 +152,9 @@ def test_every_scene_has_the_papers_cells_or_its_own_and_four_moments():
 
 
 @pytest.mark.parametrize(("name", "least"), [("leg", 0.1), ("palm", 0.07), ("forehead", 0.07)])
-def test_the_dragged_armadillo_comes_to_rest_and_its_dragged_part_has_followed(result, name: str, least: float):
+def test_the_dragged_armadillo_comes_to_rest_and_its_dragged_part_has_followed(
+    result, name: str, least: float
+):
     run = result(f"armadillo_{name}")
     (force,) = run.scene.force
     direction = np.array(force.total) / np.linalg.norm(force.total)
@@ -151,7 +175,11 @@ def test_the_armadillos_other_leg_goes_along(result):
 
 def knee_angle(run: Result, q: np.ndarray) -> float:
     """Between thigh and shank of the hind legs, as seen from the side [degrees]."""
-    zones = ([0, 0.3, 0.45], [1, 0.5, 0.55]), ([0, 0.3, 0.3], [1, 0.5, 0.4]), ([0, 0.1, 0.2], [1, 0.3, 0.3])
+    zones = (
+        ([0, 0.3, 0.45], [1, 0.5, 0.55]),
+        ([0, 0.3, 0.3], [1, 0.5, 0.4]),
+        ([0, 0.1, 0.2], [1, 0.3, 0.3]),
+    )
     thigh, knee, hock = (run.mean(q, run.zone(*zone))[1:] for zone in zones)
     up, down = thigh - knee, hock - knee
     return np.degrees(np.arccos(up @ down / np.linalg.norm(up) / np.linalg.norm(down)))
@@ -159,7 +187,9 @@ def knee_angle(run: Result, q: np.ndarray) -> float:
 
 def test_the_dragon_is_raised_to_rest_and_pushed_to_rest_and_bends_its_knees(result):
     run = result("dragon_raise_push")
-    turn = np.searchsorted(run.time, run.scene.force[1].start - 1e-9)  # the first frame under the force reversed
+    turn = np.searchsorted(
+        run.time, run.scene.force[1].start - 1e-9
+    )  # the first frame under the force reversed
     assert run.kinetic[turn - 1] < 1e-6 * run.kinetic[:turn].max()
     assert run.kinetic[-1] < 1e-6 * run.kinetic[turn:].max()
     for zone in (([0, 0.5, 0.8], [1, 0.9, 1]), ([0, 0.15, 0.8], [1, 0.5, 1])):  # head, wings
@@ -177,13 +207,17 @@ def error_of_lobes(run: Result) -> float:
     """The greater of the two lobes' shape errors at the end [m]: thin bronchi join them, and they lean over."""
     lobes = (run.zone([x, 0, 0], [x + 0.45, 1, 0.5]) for x in (0, 0.55))
     parts = ((run.q[-1][lobe], run.nodes[lobe], run.mass[lobe]) for lobe in lobes)
-    return max(distance_of_shapes(q, rest, mass) * np.ptp(rest, axis=0).max() for q, rest, mass in parts)
+    return max(
+        distance_of_shapes(q, rest, mass) * np.ptp(rest, axis=0).max() for q, rest, mass in parts
+    )
 
 
 def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trachea(result):
     run = result("lung_press")
     plate = run.scene.obstacle[1]
-    low = plate.box[0][2] + np.array([Motion.through(plate.path).value_at(time)[2] for time in run.time])
+    low = plate.box[0][2] + np.array(
+        [Motion.through(plate.path).value_at(time)[2] for time in run.time]
+    )
     there = run.time < plate.stop - 1e-9
     assert low.min() < 0.82 * 0.21  # the lobes are 0.21 m high
     assert run.surface[:, :, 2].min() > -0.4 * run.h  # the tips it lands on
@@ -191,7 +225,9 @@ def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trac
     body, tip = run.zone([0, 0, 0], [1, 1, 0.5]), run.zone([0, 0, 0.95], [1, 1, 1])
     assert error_of_lobes(run) < 0.02 * run.height
     assert run.moved(-1, body)[2] > -0.07  # it leans over and sags under its own weight
-    assert run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]  # folded, and up again
+    assert (
+        run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]
+    )  # folded, and up again
     assert (
         0 < run.inverted(-1) < 0.06 * len(run.cells)
     )  # 29 of 999, in the tips of the lobes: springs do not undo a fold
@@ -223,7 +259,10 @@ def test_the_heart_follows_the_pull_and_returns(result):
     pull = np.linalg.norm(anchor.path[-1].by)
     away = run.q[held - 1][prescribed] - run.nodes[prescribed]
     np.testing.assert_allclose(away, np.broadcast_to(anchor.path[-1].by, away.shape), atol=1e-12)
-    assert np.linalg.norm(run.q[held][prescribed] - run.q[held - 1][prescribed], axis=1).min() > 0.1 * pull  # let go
+    assert (
+        np.linalg.norm(run.q[held][prescribed] - run.q[held - 1][prescribed], axis=1).min()
+        > 0.1 * pull
+    )  # let go
     assert np.linalg.norm(run.q[-1] - run.nodes, axis=1).max() < 0.01 * pull
     assert run.inverted(held - 1) == 0
 
@@ -232,10 +271,15 @@ def test_a_heart_of_tissue_keeps_its_volume_while_it_is_pulled_and_when_it_is_le
     """That of springs, whose Poisson's ratio is 1/4, gains 8% in the pull."""
     run = result("heart_tissue")
     triangles = run.body[1]
-    volumes = [trimesh.Trimesh(points, triangles, process=False).volume for points in (run.body[0], *run.surface)]
+    volumes = [
+        trimesh.Trimesh(points, triangles, process=False).volume
+        for points in (run.body[0], *run.surface)
+    ]
     np.testing.assert_allclose(volumes / volumes[0], 1, atol=0.01)
     (anchor,) = run.scene.anchor
-    assert np.linalg.norm(run.q[-1] - run.nodes, axis=1).max() < 0.02 * np.linalg.norm(anchor.path[-1].by)
+    assert np.linalg.norm(run.q[-1] - run.nodes, axis=1).max() < 0.02 * np.linalg.norm(
+        anchor.path[-1].by
+    )
 
 
 # ---- Figure 11
@@ -249,7 +293,9 @@ def test_it_falls_freely_hits_the_ground_and_leaps_and_gains_nothing(result, nam
     gravity, t = np.array(run.scene.gravity.acceleration), run.scene.time.step
     contact = int(np.argmax(run.q[:, :, 2].min(axis=1) <= 0))
     n = np.arange(contact)[:, None, None]
-    np.testing.assert_allclose(run.q[:contact], run.nodes + gravity * t**2 * n * (n + 1) / 2, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        run.q[:contact], run.nodes + gravity * t**2 * n * (n + 1) / 2, rtol=0, atol=1e-10
+    )
     v = run.middle_velocity()[:, 2]
     assert v[contact - 2] == pytest.approx(gravity[2] * t * (contact - 1), rel=1e-9)
     assert v[contact:].max() > -0.5 * v[contact - 2]  # reversed
@@ -273,9 +319,13 @@ def test_a_bunny_that_falls_on_another_comes_to_rest_on_it(result):
     """So do the eight of the pile, which take three minutes."""
     run = result("two_bunnies")
     assert run.contacts[-1] > 0 and run.nearest[-1] > 0
-    assert not any(count_crossings(drawn, run.body[1]) for drawn in run.surface[10::20])  # what is drawn touches
+    assert not any(
+        count_crossings(drawn, run.body[1]) for drawn in run.surface[10::20]
+    )  # what is drawn touches
     assert run.kinetic[-1] < 1e-2 * run.kinetic.max()
-    assert run.surface[-1, :, 2].min() > -0.6 * run.h  # the nodes of an ear meet the ground, not its surface
+    assert (
+        run.surface[-1, :, 2].min() > -0.6 * run.h
+    )  # the nodes of an ear meet the ground, not its surface
     assert run.inverted(-1) == 0
 
 

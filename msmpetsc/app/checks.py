@@ -10,7 +10,12 @@ from msmpetsc.results.disk import refuse_no_file
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
 MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
 SCENE_NAMES = (".toml",)
-NO_PART_OF_A_LINE = ("Cc", "Cs", "Zl", "Zp")  # categories: controls, bytes that are no UTF-8, ends of lines
+NO_PART_OF_A_LINE = (
+    "Cc",
+    "Cs",
+    "Zl",
+    "Zp",
+)  # categories: controls, bytes that are no UTF-8, ends of lines
 
 
 def checked_path(given: str | os.PathLike[str]) -> Path:
@@ -38,7 +43,11 @@ def checked_file(given: str | os.PathLike[str]) -> Path:
     return path
 
 
-def refuse_other_format(option: str, path: str | os.PathLike[str] | None, endings: tuple[str, ...]) -> None:
+def refuse_other_format(
+    option: str, path: str | os.PathLike[str] | None, endings: tuple[str, ...]
+) -> None:
     """Raise InputError for the name of a file of another format than is written."""
     if path is not None and Path(path).suffix.lower() not in endings:
-        raise InputError(f"{option} {path}: what is written there is named {' or '.join(f'*{end}' for end in endings)}")
+        raise InputError(
+            f"{option} {path}: what is written there is named {' or '.join(f'*{end}' for end in endings)}"
+        )

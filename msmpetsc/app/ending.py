@@ -20,7 +20,9 @@ TIMED = "msmpetsc: %(levelname)s [%(relativeCreated).0f ms]: %(message)s"
 
 
 @contextmanager
-def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False) -> Iterator[None]:
+def logged_on_root(
+    comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False
+) -> Iterator[None]:
     """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with milliseconds."""
     log = logging.getLogger("msmpetsc")
     before = log.handlers, log.level

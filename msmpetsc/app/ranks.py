@@ -22,7 +22,10 @@ VARIABLES_OF_MPI = (  # of a launcher around us: not for our children
     "OMPI_MCA_orte_hnp_uri", "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
 )  # fmt: skip
 # more ranks than cores are the user's to ask for: as Open MPI 4 calls it, and as 5 does
-OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
+OVERSUBSCRIBED = {
+    "OMPI_MCA_rmaps_base_oversubscribe": "1",
+    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
+}
 
 
 class OneProcess:
@@ -43,7 +46,10 @@ def world(started: bool = False) -> "MPI.Comm":
     try:
         with _variables({} if launched else ALONE):
             from mpi4py import MPI
-    except (ImportError, RuntimeError):  # missing or broken, in a shell of a batch system, say: `run` says so
+    except (
+        ImportError,
+        RuntimeError,
+    ):  # missing or broken, in a shell of a batch system, say: `run` says so
         if started:
             raise
         return cast("MPI.Comm", OneProcess())
@@ -64,7 +70,9 @@ def _variables(values: dict[str, str]) -> Iterator[None]:
 
 def last_error(output: str) -> str:
     """Return why a child failed: the last line of its output that is an error, or else the last line."""
-    lines = [line.strip() for line in output.splitlines() if line.strip(" -")]  # without mpiexec's frames
+    lines = [
+        line.strip() for line in output.splitlines() if line.strip(" -")
+    ]  # without mpiexec's frames
     if any("attempt to run as root" in line for line in lines):
         return "mpiexec starts no ranks as root: set OMPI_ALLOW_RUN_AS_ROOT=1 and OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"
     errors = [line for line in lines if "msmpetsc: error:" in line]
@@ -73,6 +81,8 @@ def last_error(output: str) -> str:
 
 def environment(alone: bool = False) -> dict[str, str]:
     """Return the environment for a child, without the variables of the MPI of this process."""
-    ours = {name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)}
+    ours = {
+        name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)
+    }
     # one thread a rank, or ranks and threads would fight for the cores
     return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | ours

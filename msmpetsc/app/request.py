@@ -14,7 +14,13 @@ from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from msmpetsc.app.checks import MEASURE_NAMES, RESULT_NAMES, checked_file, checked_path, refuse_other_format
+from msmpetsc.app.checks import (
+    MEASURE_NAMES,
+    RESULT_NAMES,
+    checked_file,
+    checked_path,
+    refuse_other_format,
+)
 from msmpetsc.errors import InputError
 from msmpetsc.scene.toml import overrides_of
 from msmpetsc.solve.petsc.words import words_of
@@ -55,16 +61,26 @@ class RunRequest:
     """A run that is asked for."""
 
     scene: "File | Mapping[str, Any] | Scene | None" = given(
-        None, Option("scene file (TOML); in Python a Scene, too, or its tables", "SCENE", checked_path)
+        None,
+        Option("scene file (TOML); in Python a Scene, too, or its tables", "SCENE", checked_path),
     )
     output: File | None = given(
-        None, Option("result file, .h5 or .hdf5; out/SCENE.h5 if not given", "OUT.h5", checked_file, short="-o")
+        None,
+        Option(
+            "result file, .h5 or .hdf5; out/SCENE.h5 if not given",
+            "OUT.h5",
+            checked_file,
+            short="-o",
+        ),
     )
     _: KW_ONLY
     preset: str | None = given(None, Option("solver preset (see --list-presets)", "NAME"))
     error: float | None = given(None, Option("relative error at which a step is done", "E", float))
     device: Literal["cpu", "cuda"] | None = given(
-        None, Option("where to compute: cuda is -mat_type aijcusparse, a CUDA GPU", choices=("cpu", "cuda"))
+        None,
+        Option(
+            "where to compute: cuda is -mat_type aijcusparse, a CUDA GPU", choices=("cpu", "cuda")
+        ),
     )
     frames: int | None = given(None, Option("stop after N steps", "N", int))
     set: Mapping[str, Any] | Sequence[str] = given(
@@ -82,19 +98,36 @@ class RunRequest:
     )
     force: bool = given(False, Option("resume with another scene or other options than before"))
     checkpoint_every: int | None = given(
-        None, Option("frames from one checkpoint to the next; default: as take 1% of the time at most", "N", int)
+        None,
+        Option(
+            "frames from one checkpoint to the next; default: as take 1% of the time at most",
+            "N",
+            int,
+        ),
     )
-    gather: bool = given(False, Option("let rank 0 write for all: where nodes of a cluster do not see one file alike"))
+    gather: bool = given(
+        False,
+        Option("let rank 0 write for all: where nodes of a cluster do not see one file alike"),
+    )
     true_error: int | None = given(
         None, Option("also solve every N-th step to rounding, and store its true error", "N", int)
     )
     measure: File | None = given(
-        None, Option("write what the run cost: times, products, memory, machine", "OUT.json", checked_file)
+        None,
+        Option(
+            "write what the run cost: times, products, memory, machine", "OUT.json", checked_file
+        ),
     )
     petsc_options: str | Mapping[str, Any] = given(
-        "", Option('PETSc\'s options, for this run alone: "-ksp_rtol 1e-3 -ksp_view", {"ksp_rtol": 1e-3}', python=True)
+        "",
+        Option(
+            'PETSc\'s options, for this run alone: "-ksp_rtol 1e-3 -ksp_view", {"ksp_rtol": 1e-3}',
+            python=True,
+        ),
     )
-    quiet: bool = given(False, Option("no notes and no progress; warnings and errors stay", python=True))
+    quiet: bool = given(
+        False, Option("no notes and no progress; warnings and errors stay", python=True)
+    )
     on_frame: "Callable[[Frame], object] | None" = given(
         None, Option("called on all ranks with each frame, once that is written", python=True)
     )
@@ -105,7 +138,9 @@ class RunRequest:
             value = getattr(self, name)
             if isinstance(value, str | os.PathLike) and option.kind in (checked_path, checked_file):
                 option.kind(os.fspath(value))
-            if option.kind is int and not isinstance(value, Integral | None):  # Python alone can give it
+            if option.kind is int and not isinstance(
+                value, Integral | None
+            ):  # Python alone can give it
                 raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}")
             if option.kind is int and value is not None and value < 1:
                 raise InputError(f"{flag_of(name)} must be at least 1, not {value}")
@@ -113,9 +148,15 @@ class RunRequest:
                 raise InputError(f"{flag_of(name)} is {' or '.join(option.choices)}, not {value!r}")
         refuse_other_format("-o", self.output, RESULT_NAMES)
         refuse_other_format("--measure", self.measure, MEASURE_NAMES)
-        other = self.output is not None and self.resume is not None and Path(self.output) != Path(self.resume)
+        other = (
+            self.output is not None
+            and self.resume is not None
+            and Path(self.output) != Path(self.resume)
+        )
         if self.resume and (self.overwrite or other):
-            raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
+            raise InputError(
+                "--resume goes on in its own file: -o and --overwrite have no place beside it"
+            )
         if self.scene is not None and not (self.file or self.output or self.resume):
             raise InputError("a scene that is no file gives its result no name: say output")
 
@@ -152,7 +193,11 @@ class RunRequest:
                 continue
             values = overrides_of(value) if isinstance(value, Mapping) else value
             several = values if isinstance(values, list | tuple) else [values]
-            words += [flag_of(name)] if value is True else [f"{flag_of(name)}={each}" for each in several]
+            words += (
+                [flag_of(name)]
+                if value is True
+                else [f"{flag_of(name)}={each}" for each in several]
+            )
         return shlex.join([*words, *self.petsc_words])
 
     @property

@@ -16,7 +16,12 @@ from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.geometry.registry import MODELS
 from msmpetsc.results.reader import refuse_deadly
-from msmpetsc.results.restart import Earlier, read_checkpoint, refuse_changed_lattice, refuse_unlike_frame
+from msmpetsc.results.restart import (
+    Earlier,
+    read_checkpoint,
+    refuse_changed_lattice,
+    refuse_unlike_frame,
+)
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.scene.problems import as_given
 from msmpetsc.scene.reading import Scene, load_scene, scene_of
@@ -30,11 +35,25 @@ OF_NO_EFFECT = re.compile(  # on results
     r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc|^use_gpu_aware_mpi$|^device_"
 )
 # a file has one of each
-FIXED = ("time.step", "time.integrator", "output.every", "output.surface", "output.stress", "output.probe")
-OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that may differ without a word
+FIXED = (
+    "time.step",
+    "time.integrator",
+    "output.every",
+    "output.surface",
+    "output.stress",
+    "output.probe",
+)
+OF_NO_MATTER = {
+    "text",
+    "folder",
+    "title",
+    "picture",
+}  # keys of a scene that may differ without a word
 
 
-def earlier_run(comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool) -> Earlier | None:
+def earlier_run(
+    comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool
+) -> Earlier | None:
     """Return the run to go on from, None to run from the start (collective). Raises InputError.
 
     may_start : whether there is a scene to start from, where there is no such file yet
@@ -72,7 +91,9 @@ def _stored(earlier: Earlier) -> dict[str, str]:
     try:
         return options_of(shlex.split(earlier.texts.get("petsc_options", "")))
     except ValueError:
-        raise InputError(f"{earlier.path} is damaged: its PETSc options cannot be taken apart") from None
+        raise InputError(
+            f"{earlier.path} is damaged: its PETSc options cannot be taken apart"
+        ) from None
 
 
 def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
@@ -116,7 +137,10 @@ class Resumed:
             raise InputError("\n".join([*fixed, "that cannot change within a file"]))
         if (version := earlier.texts.get("msmpetsc_version")) != __version__:
             log.warning(
-                "%s was begun by msmpetsc %s, this is %s", earlier.path, printable(str(version), 20), __version__
+                "%s was begun by msmpetsc %s, this is %s",
+                earlier.path,
+                printable(str(version), 20),
+                __version__,
             )
 
     @property

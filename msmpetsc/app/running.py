@@ -17,7 +17,15 @@ from msmpetsc.app.checkpointing import Checkpoints, Signals
 from msmpetsc.app.ending import ending_together
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
-from msmpetsc.app.summary import Cost, log_end, log_model, refuse_unwritable, tell_stop, versions, warn_of_long_steps
+from msmpetsc.app.summary import (
+    Cost,
+    log_end,
+    log_model,
+    refuse_unwritable,
+    tell_stop,
+    versions,
+    warn_of_long_steps,
+)
 from msmpetsc.backend import kernel_cache
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
@@ -51,7 +59,9 @@ class RunPlan:
     logged: dict[str, float]
 
 
-def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, started: float) -> int:
+def run_steps(
+    comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, started: float
+) -> int:
     """Run from the start, or go on from an earlier run; return the exit status (collective).
 
     started : count of perf_counter at the start of the command [s]
@@ -59,7 +69,9 @@ def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None,
     plan = prepare(comm, request, earlier)
     if (resumed := plan.resumed) and resumed.is_done:
         write_companions(comm, request, whole=True)
-        log.info("%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished)
+        log.info(
+            "%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished
+        )
         return 0
     return finish(comm, plan, *take_steps(comm, plan), started)
 
@@ -92,7 +104,9 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
         Signals(comm) as signals,
         begun(SETUP) as set_up,
         open_output(comm, plan) as file,
-        TimeLoop(comm, plan.scene, model := described_model(comm, plan), plan.request.true_error) as simulation,
+        TimeLoop(
+            comm, plan.scene, model := described_model(comm, plan), plan.request.true_error
+        ) as simulation,
     ):
         try:
             with ending_together(comm, abandon=file.abandon):
@@ -104,11 +118,17 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                 is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:
-                    observers = [cost.count, progress.update, *filter(None, [plan.request.on_frame])]
+                    observers = [
+                        cost.count,
+                        progress.update,
+                        *filter(None, [plan.request.on_frame]),
+                    ]
                     signals.begin(file.abandon)
                     for frame in checkpoints.steps():
                         with cost.of_output():
-                            if frame is not None and next(numbers) >= file.finished:  # a run that goes on has some
+                            if (
+                                frame is not None and next(numbers) >= file.finished
+                            ):  # a run that goes on has some
                                 file.append(frame)
                                 on_root(comm, xdmf.update)
                             stops = checkpoints.after_step(frame is not None)
@@ -124,7 +144,12 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
 
 
 def finish(
-    comm: MPI.Intracomm, plan: RunPlan, ended: Checkpoints, cost: Cost, failure: StepFailed | None, started: float
+    comm: MPI.Intracomm,
+    plan: RunPlan,
+    ended: Checkpoints,
+    cost: Cost,
+    failure: StepFailed | None,
+    started: float,
 ) -> int:
     """Write what stands beside the result, tell the end, and return the exit status (collective).
 
@@ -144,7 +169,9 @@ def finish(
     return 0
 
 
-def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> list[str]:
+def lines_of_options(
+    comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None
+) -> list[str]:
     """Return the options in PETSc's database of a run, or of a preset alone (collective)."""
     refuse_early(comm)
     choose(comm, request.device)
@@ -152,7 +179,9 @@ def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier 
         scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
         solvers = solvers_of(scene, request.true_error)
     elif request.set or request.frames:
-        raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
+        raise InputError(
+            "--set and --frames change a scene: name the SCENE; --preset alone needs none"
+        )
     else:
         solvers = {"": (find_preset(request.preset or Solver.model_fields["preset"].default), 0)}
     lines = shown_options(solvers)
@@ -173,7 +202,9 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
         scene = stored_scene(earlier, changes)
     else:
         raise InputError("a SCENE is needed, or --resume OUT.h5")
-    return scene.changed({"time.duration": request.frames * scene.time.step} if request.frames else {})
+    return scene.changed(
+        {"time.duration": request.frames * scene.time.step} if request.frames else {}
+    )
 
 
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
@@ -183,7 +214,9 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
     return {
         "msmpetsc_version": __version__,
         "petsc_version": versions()["petsc"],
-        "petsc_options": " ".join(f"-{name} {shlex.quote(value)}" if value else f"-{name}" for name, value in options),
+        "petsc_options": " ".join(
+            f"-{name} {shlex.quote(value)}" if value else f"-{name}" for name, value in options
+        ),
         "ranks": comm.size,
         "command": request.command,
         "scene": scene.text,
@@ -212,7 +245,9 @@ def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
     return model
 
 
-def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: TimeLoop) -> int:
+def start_output(
+    comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: TimeLoop
+) -> int:
     """Write the model, go on where an earlier run stopped, and make room for frames (collective).
 
     model : as it was built; the simulation's own may be on a GPU
@@ -235,7 +270,9 @@ def write_companions(comm: MPI.Intracomm, request: RunRequest, whole: bool) -> l
     left = [path, path.with_suffix(".xdmf")]
     on_root(comm, lambda: write_xdmf(path))
     if whole and request.picture:
-        from msmpetsc.view.sheet import contact_sheet  # loads VTK: a second that other runs need not wait
+        from msmpetsc.view.sheet import (
+            contact_sheet,
+        )  # loads VTK: a second that other runs need not wait
 
         left.append(path.with_suffix(".png"))
         on_root(comm, lambda: contact_sheet(path, left[-1]))

@@ -34,7 +34,9 @@ def asked_by(request: Callable[P, object]) -> Callable[[Callable[..., T]], Calla
     """Return a decorator that gives a function the arguments of a request, and their help."""
 
     def decorate(function: Callable[..., T]) -> Callable[P, T]:
-        signature = inspect.signature(request).replace(return_annotation=function.__annotations__["return"])
+        signature = inspect.signature(request).replace(
+            return_annotation=function.__annotations__["return"]
+        )
         function.__signature__ = signature  # type: ignore[attr-defined]  # which help() shows
         lines = (f"    {name:16} : {option.help}" for name, option in OPTIONS.items())
         function.__doc__ = "\n".join([function.__doc__ or "", *lines, ""])
@@ -81,14 +83,19 @@ def options_shown(comm: MPI.Intracomm, request: RunRequest) -> list[str]:
 
 
 @contextmanager
-def options_given(comm: MPI.Intracomm, request: RunRequest) -> Iterator[tuple[RunRequest, Earlier | None]]:
+def options_given(
+    comm: MPI.Intracomm, request: RunRequest
+) -> Iterator[tuple[RunRequest, Earlier | None]]:
     """Give PETSc the options of a request, and of the run that it goes on from (collective)."""
     earlier = earlier_run(comm, request.resume, request.scene is not None)
     if earlier is not None:
         words = [*kept_options(earlier, request.petsc_words), *request.petsc_words]
         true_error = request.true_error or earlier.true_error or None
         request = replace(request, petsc_options=shlex.join(words), true_error=true_error)
-    with lent_options(comm, request.petsc_words), np.errstate(all="ignore"):  # a step tells of what overflows
+    with (
+        lent_options(comm, request.petsc_words),
+        np.errstate(all="ignore"),
+    ):  # a step tells of what overflows
         yield request, earlier
 
 
@@ -122,7 +129,13 @@ class Simulation:
     model : of the run begun last: lattice, embedding, on rank 0 the surface; None before the first
     """
 
-    def __init__(self, scene: Source, *, device: str | None = None, petsc_options: str | Mapping[str, Any] = ""):
+    def __init__(
+        self,
+        scene: Source,
+        *,
+        device: str | None = None,
+        petsc_options: str | Mapping[str, Any] = "",
+    ):
         """Read and check the scene; the mesh is read when the first run begins.
 
         scene         : a file's path, tables as in a file, or a Scene
@@ -146,7 +159,9 @@ class Simulation:
         ranks = f"{self.comm.size} rank{'s' * (self.comm.size > 1)}"
         return f"Simulation({self.scene!r}, {self.device or 'cpu'}, {ranks})"
 
-    def frames(self, frames: int | None = None, *, set: Mapping[str, Any] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, frames: int | None = None, *, set: Mapping[str, Any] | None = None
+    ) -> Iterator[Frame]:
         """Yield the frames of a run from the start, frame 0 first (collective).
 
         frames : stop after so many steps
@@ -182,7 +197,9 @@ class Simulation:
         words = [*self._words, f"-{OPTION}", AIJCUSPARSE] if self.device == "cuda" else self._words
         alone = not +presets.in_use  # no other simulation is begun
         if words and not alone:
-            raise InputError("another simulation is under way: end it before one that has PETSc options or a device")
+            raise InputError(
+                "another simulation is under way: end it before one that has PETSc options or a device"
+            )
         if words:
             until_the_end.enter_context(lent_options(self.comm, words))
         if alone:

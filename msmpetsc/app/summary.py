@@ -37,7 +37,9 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
     """Log size, volume and mass of each body, counts, and the nodes that anchors and forces take (collective)."""
     lattice = model.lattice
     masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(model.bodies))
-    shares = np.bincount(lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(model.bodies))
+    shares = np.bincount(
+        lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(model.bodies)
+    )
     sums = comm.allreduce(np.array([masses, shares * lattice.cell_size**3]))
     for number, (body, (mass, volume)) in enumerate(zip(model.bodies, sums.T, strict=True)):
         mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
@@ -48,7 +50,9 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
         size = " x ".join(f"{length:.4g}" for length in body.bounds[1] - body.bounds[0])
         log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
     held = int(lattice.pinned[: lattice.owned].sum())
-    cells, springs, pinned = (comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, held))
+    cells, springs, pinned = (
+        comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, held)
+    )
     log.info(
         "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
         cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
@@ -68,7 +72,10 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
     moduli = [body.material and body.material.young_modulus for body in scene.body] or [None]
     softest = min((modulus or scene.material.young_modulus or np.inf) for modulus in moduli)
     lengths = [body.bounds[1] - body.bounds[0] for body in model.bodies]
-    period = max(bending_period(sides.max(), sides.min(), softest, scene.material.density) for sides in lengths)
+    period = max(
+        bending_period(sides.max(), sides.min(), softest, scene.material.density)
+        for sides in lengths
+    )
     if time.step > period > 0:
         log.warning(
             "time.step is %.2g periods of the slowest vibration, about %.1g s, which it damps away: time.step = %.1g "
@@ -109,9 +116,17 @@ class Cost:
         self.output = self.stepping = 0.0
         self.products: dict[int, int] = {}
         model = simulation.model
-        free = int((~simulation.environment.anchors.fixed_at(simulation.time_step)[: model.lattice.owned]).sum())
+        free = int(
+            (
+                ~simulation.environment.anchors.fixed_at(simulation.time_step)[
+                    : model.lattice.owned
+                ]
+            ).sum()
+        )
         own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, free
-        self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
+        self.counts = dict(
+            zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True)
+        )
 
     @contextmanager
     def of_output(self) -> Iterator[None]:
@@ -137,7 +152,9 @@ class Cost:
                 hardest, max(working), ratio,
             )  # fmt: skip
 
-    def write(self, path: Path, command: str, before: dict[str, float], failure: StepFailed | None = None) -> None:
+    def write(
+        self, path: Path, command: str, before: dict[str, float], failure: StepFailed | None = None
+    ) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written.
 
         before : seconds in events of the process when the run began
@@ -145,7 +162,9 @@ class Cost:
         comm, simulation = self.comm, self.simulation
         device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
-        time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm, before)
+        time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(
+            comm, before
+        )
         record = {
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
             **self.counts,

@@ -9,7 +9,9 @@ Array: TypeAlias = npt.NDArray[Any]  # of any numbers
 Floats: TypeAlias = npt.NDArray[np.float64]  # (n,) one number a node, spring, cell or point
 Positions: TypeAlias = npt.NDArray[np.float64]  # (n, 3) [m]
 Rows: TypeAlias = npt.NDArray[np.float64]  # (n, k) other rows: forces, velocities, normals, blocks
-Indices: TypeAlias = npt.NDArray[np.signedinteger[Any]]  # numbers of nodes, springs, cells, points, triangles
+Indices: TypeAlias = npt.NDArray[
+    np.signedinteger[Any]
+]  # numbers of nodes, springs, cells, points, triangles
 Mask: TypeAlias = npt.NDArray[np.bool_]  # (n,) which of them
 
 

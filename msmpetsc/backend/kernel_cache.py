@@ -28,7 +28,9 @@ from numba.core.serialize import dumps
 import msmpetsc
 
 PACKAGE = Path(msmpetsc.__file__).parent
-PROBE = 1 << 16  # [byte] that a folder must take to be written to; a full disk may still take some bytes
+PROBE = (
+    1 << 16
+)  # [byte] that a folder must take to be written to; a full disk may still take some bytes
 CHECK = hashlib.sha256().digest_size  # [byte] at the start of a file, a digest of the rest
 
 
@@ -60,7 +62,11 @@ def _is_safe(folder: Path) -> bool:
     """Return whether this user, root or the owner of the package alone may write to a folder."""
     status = folder.lstat()
     is_ours = status.st_uid in (os.getuid(), 0, PACKAGE.stat().st_uid)
-    return stat.S_ISDIR(status.st_mode) and is_ours and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return (
+        stat.S_ISDIR(status.st_mode)
+        and is_ours
+        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    )
 
 
 @cache
@@ -141,12 +147,18 @@ class KernelCache(NullCache):
 def key(function: Callable[..., Any], types: Iterable[Any], target: object) -> str:
     """Return the key of a function, compiled for arguments of these types and for a processor."""
     constants = sorted(_constants(function).items())
-    return repr((function.__module__, function.__qualname__, target, [*map(_described, types)], constants))
+    return repr(
+        (function.__module__, function.__qualname__, target, [*map(_described, types)], constants)
+    )
 
 
 def _described(kind: Any) -> tuple[Any, ...]:
     """Return the name of a type with the fields of named tuples, which numba's name of it lacks."""
-    return str(kind), getattr(kind, "fields", ()), [_described(one) for one in getattr(kind, "types", ())]
+    return (
+        str(kind),
+        getattr(kind, "fields", ()),
+        [_described(one) for one in getattr(kind, "types", ())],
+    )
 
 
 @cache

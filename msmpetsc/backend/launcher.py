@@ -25,7 +25,11 @@ from msmpetsc.errors import MsmpetscError
 cuda: Any = untyped
 THREADS = 128  # of a block: registers, not their number, bound the kernels that look at all neighbours of a node
 KEPT = 4096  # descriptions of arrays
-SCALARS = {bool: "?7x", int: "q", float: "d"}  # as the driver takes them (struct): each in eight bytes of its own
+SCALARS = {
+    bool: "?7x",
+    int: "q",
+    float: "d",
+}  # as the driver takes them (struct): each in eight bytes of its own
 TYPES = {"?7x": numba.types.boolean, "q": numba.types.int64, "d": numba.types.float64}
 
 Words = tuple[float, ...]  # of an argument, as the kernel takes them
@@ -59,7 +63,9 @@ def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
 
 
 @lru_cache(maxsize=KEPT)
-def described(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: str) -> tuple[str, Words]:
+def described(
+    pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: str
+) -> tuple[str, Words]:
     """Return the kind of an array, "f8 2 C", and the words that numba's kernels take for it.
 
     These are no owner, no parent, its size, and where it lies.
@@ -68,7 +74,15 @@ def described(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dt
     by_row = tuple(np.cumprod((size, *shape[:0:-1]))[::-1])
     by_column = tuple(np.cumprod((size, *shape[:-1])))
     layout = "C" if strides == by_row or 0 in shape else "F" if strides == by_column else "A"
-    return f"{dtype} {len(shape)} {layout}", (0, 0, int(np.prod(shape)), size, pointer, *shape, *strides)
+    return f"{dtype} {len(shape)} {layout}", (
+        0,
+        0,
+        int(np.prod(shape)),
+        size,
+        pointer,
+        *shape,
+        *strides,
+    )
 
 
 def type_of(kind: Kind) -> object:
@@ -108,7 +122,9 @@ class Launch:
         self.pack(self.memory, 0, count, *words)  # the driver copies them before it returns
         stream = cupy.cuda.get_current_stream().ptr
         blocks = -(-count // THREADS)
-        status = driver()(self.function.ptr, blocks, 1, 1, THREADS, 1, 1, 0, stream, self.pointers, None)
+        status = driver()(
+            self.function.ptr, blocks, 1, 1, THREADS, 1, 1, 0, stream, self.pointers, None
+        )
         if status:
             raise MsmpetscError(f"the GPU refused a kernel: CUDA error {status}")
 

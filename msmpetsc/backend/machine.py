@@ -9,12 +9,19 @@ import psutil
 
 def machine() -> dict[str, Any]:
     """Return processor, cores, memory [byte] and system."""
-    path = Path("/proc/cpuinfo")  # where Linux has the model's name: Python's platform does not look there
+    path = Path(
+        "/proc/cpuinfo"
+    )  # where Linux has the model's name: Python's platform does not look there
     lines = path.read_text().splitlines() if path.exists() else []
     models = (line.partition(": ")[2] for line in lines if line.startswith("model name"))
     cpu = next(models, "") or platform.processor() or platform.machine()
     memory = psutil.virtual_memory().total
-    return {"cpu": cpu, "cores": psutil.cpu_count(), "memory": memory, "system": platform.platform(terse=True)}
+    return {
+        "cpu": cpu,
+        "cores": psutil.cpu_count(),
+        "memory": memory,
+        "system": platform.platform(terse=True),
+    }
 
 
 def peak_memory() -> int:

@@ -9,7 +9,9 @@ from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.app.request import OPTIONS, RunRequest, flag_of
 from msmpetsc.results.frame_choice import frames_in
 
-Argument = tuple[tuple[str, ...], dict[str, Any]]  # names and keywords, as argparse's ``add_argument`` takes them
+Argument = tuple[
+    tuple[str, ...], dict[str, Any]
+]  # names and keywords, as argparse's ``add_argument`` takes them
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,11 @@ def arguments_of_run() -> tuple[Argument, ...]:
     for field in fields(RunRequest):
         name, option = field.name, OPTIONS[field.name]
         about = option.help.replace("%", "%%")
-        valued: dict[str, Any] = {"type": option.kind, "metavar": option.value or None, "help": about}
+        valued: dict[str, Any] = {
+            "type": option.kind,
+            "metavar": option.value or None,
+            "help": about,
+        }
         if option.python:
             continue
         if name == "scene":
@@ -74,9 +80,17 @@ def arguments_of_run() -> tuple[Argument, ...]:
         elif field.default is False:
             taken.append(switch(flag_of(name), about))
         elif field.default == ():
-            taken.append(argument(flag_of(name), action="append", default=[], metavar=option.value, help=about))
+            taken.append(
+                argument(
+                    flag_of(name), action="append", default=[], metavar=option.value, help=about
+                )
+            )
         else:
-            taken.append(argument(*filter(None, [option.short, flag_of(name)]), choices=option.choices, **valued))
+            taken.append(
+                argument(
+                    *filter(None, [option.short, flag_of(name)]), choices=option.choices, **valued
+                )
+            )
     return tuple(taken)
 
 
@@ -93,7 +107,13 @@ def whole(name: str, value: str, about: str, **keywords: Any) -> Argument:
 
 
 SCENE = argument("scene", type=checked_path, metavar="SCENE", help="scene file (TOML)")
-SET = argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000")
+SET = argument(
+    "--set",
+    action="append",
+    default=[],
+    metavar="KEY=VALUE",
+    help="override a scene key: cages.count=3000",
+)
 JSON = switch("--json", "print one JSON object and nothing else")
 SAID = (  # of every command
     switch("--quiet", "no notes and no progress; warnings and errors stay"),

@@ -82,10 +82,15 @@ def entry_point() -> None:
             sys.stdout.flush()
     except BrokenPipeError:
         nowhere = os.open(os.devnull, os.O_WRONLY)
-        for stream in (sys.stdout, sys.stderr):  # what is left to be written, at the exit too, has no reader
+        for stream in (
+            sys.stdout,
+            sys.stderr,
+        ):  # what is left to be written, at the exit too, has no reader
             os.dup2(nowhere, stream.fileno())
         status = 128 + signal.SIGPIPE
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: one more could only spoil the status
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # all is done: one more could only spoil the status
     sys.exit(status)
 
 
@@ -98,10 +103,16 @@ def parsed(words: list[str]) -> argparse.Namespace:
     if ours and ours[0] not in COMMANDS and not ours[0].startswith("-"):
         word = printable(ours[0], 60)
         if word.endswith(SCENE_NAMES):
-            raise InputError(f"{word} is no command, did you mean 'msmpetsc run {shlex.quote(word)}'?")
-        raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
+            raise InputError(
+                f"{word} is no command, did you mean 'msmpetsc run {shlex.quote(word)}'?"
+            )
+        raise InputError(
+            f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}"
+        )
     _refuse_one_dash(ours, petsc)
-    args, unknown = command_parser().parse_known_args(ours, argparse.Namespace(petsc_options=shlex.join(petsc)))
+    args, unknown = command_parser().parse_known_args(
+        ours, argparse.Namespace(petsc_options=shlex.join(petsc))
+    )
     if unknown:
         near = did_you_mean(unknown[0], option_names(args.command))
         raise InputError(f"{args.command}: unknown argument {unknown[0]}{near}")
@@ -131,10 +142,14 @@ def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
     valid = option_names(name)
     for word in petsc:
         doubled = f"-{word.partition('=')[0]}"
-        if doubled in valid and not (name == "run" and doubled == "--help"):  # PETSc has a -help, too
+        if doubled in valid and not (
+            name == "run" and doubled == "--help"
+        ):  # PETSc has a -help, too
             raise InputError(f"{word}: options of one dash are PETSc's, did you mean {doubled!r}?")
     if petsc and name != "run":
-        raise InputError(f"{petsc[0]}: {name} takes no PETSc options{did_you_mean(f'-{petsc[0]}', valid)}")
+        raise InputError(
+            f"{petsc[0]}: {name} takes no PETSc options{did_you_mean(f'-{petsc[0]}', valid)}"
+        )
 
 
 class Parser(argparse.ArgumentParser):
@@ -143,7 +158,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(re.sub(r"^argument (\S+): (?=must )", r"\1 ", message))
 
-    def _print_message(self, message: str, file: Any = None) -> None:  # where argparse prints help and version
+    def _print_message(
+        self, message: str, file: Any = None
+    ) -> None:  # where argparse prints help and version
         if world().rank == 0:
             super()._print_message(message, file)
 
@@ -173,7 +190,11 @@ def command_parser() -> Parser:
         examples = "\n  ".join(("examples:", *command.examples))
         about = textwrap.fill(command.description or "")
         add = commands.add_parser(
-            name, help=command.help, description=about, epilog=examples, formatter_class=RawDescriptionHelpFormatter
+            name,
+            help=command.help,
+            description=about,
+            epilog=examples,
+            formatter_class=RawDescriptionHelpFormatter,
         )
         for names, keywords in command.arguments:
             add.add_argument(*names, **keywords)

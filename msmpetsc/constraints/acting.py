@@ -28,7 +28,9 @@ class ActingForces:
         """
         owned = self.lattice.owned
         for number, force in enumerate(self.own_forces):
-            self._own[number] = like(q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time))
+            self._own[number] = like(
+                q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time)
+            )
 
     def at(self, time: float) -> Rows:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""
@@ -74,9 +76,13 @@ class Anchors:
 
     def fixed_at(self, time: float) -> Mask:
         """Return the nodes (l,) bool that are no unknowns, pinned or held by an anchor."""
-        return reduce(np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.pinned)
+        return reduce(
+            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.pinned
+        )
 
-    def prescribed(self, q: Positions, time: float, begin: float = 0.0, share: float = 1.0) -> Positions | None:
+    def prescribed(
+        self, q: Positions, time: float, begin: float = 0.0, share: float = 1.0
+    ) -> Positions | None:
         """Return q with the anchored nodes where they will be; None if there are none.
 
         begin, share : they have made but this share of their path from begin [s] to ``time`` [s]

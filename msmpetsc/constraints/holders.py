@@ -58,7 +58,9 @@ class Holders:
         mass = lattice.mass[:, None]
         sums = sums_by(number, np.hstack([mass * lattice.nodes[: lattice.owned], mass]), len(masks))
         whole = lattice.table.comm.allreduce(sums)
-        return cls(tuple(masks), number, whole[:, :3] / np.maximum(whole[:, 3:], np.finfo(float).tiny))
+        return cls(
+            tuple(masks), number, whole[:, :3] / np.maximum(whole[:, 3:], np.finfo(float).tiny)
+        )
 
     def totals(self, forces: Rows) -> Rows:
         """Return the sum (a, 3) over the nodes of each of what holds nodes (owned, 3), of this rank's."""
@@ -81,7 +83,9 @@ def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
     return sums
 
 
-def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions) -> Lattice:
+def clamped(
+    scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions
+) -> Lattice:
     """Return the lattice with the springs, or cells, cut by pins and by anchors that never let go.
 
     points : (l, 3) of the bodies that nodes are nearest to [m]
@@ -95,7 +99,9 @@ def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, poin
         body = lattice.body[free]
 
         def within(x: Positions) -> Mask:
-            where: Mask = np.any([np.zeros(len(x), bool), *(finder.inside(t, x, body) for t in tables)], axis=0)
+            where: Mask = np.any(
+                [np.zeros(len(x), bool), *(finder.inside(t, x, body) for t in tables)], axis=0
+            )
             return where
 
         start = lattice.nodes[free]
@@ -113,7 +119,9 @@ def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, poin
     return replace(lattice, stiffness=stiffness)
 
 
-def _with_cut_cells(lattice: Lattice, held: Mask, stiffer: Callable[[Indices, Indices], Floats]) -> Lattice:
+def _with_cut_cells(
+    lattice: Lattice, held: Mask, stiffer: Callable[[Indices, Indices], Floats]
+) -> Lattice:
     """Return a solid whose cells with free and held corners are stiffer by the mean free part of their pairs."""
     assert lattice.solid is not None
     fast, corners = held[lattice.local_cells], lattice.local_cells
@@ -140,7 +148,9 @@ def _free_part(within: Within, start: Positions, end: Positions) -> Floats:
     return np.where(leads_in, np.maximum(high, LEAST), 1.0)
 
 
-def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions) -> tuple[str, ...]:
+def taken(
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions
+) -> tuple[str, ...]:
     """Return what anchors and forces take, in words; warn of what is overruled (collective).
 
     lattice : with its pins
@@ -165,7 +175,9 @@ def taken(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor],
     for table in scene.tables("force"):
         where, force = masks[table.key], table.table
         until = math.inf if force.stop is None else force.stop
-        lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]  # hold all the while
+        lasting = [
+            a.where for a in anchors if a.stop is None or a.stop >= until
+        ]  # hold all the while
         nodes = count(where)
         held = count(where & reduce(np.logical_or, lasting, lattice.pinned))
         if held == nodes and force.pulls:

@@ -49,9 +49,14 @@ class Motion(Lines):
     @classmethod
     def through(cls, poses: Iterable[Pose], center: ArrayLike | None = None) -> "Motion":
         """Return the motion along a scene's path; one without a center does not turn."""
-        stops = [(0.0, np.zeros(6)), *((p.time, np.hstack([p.by, np.radians(p.turn)])) for p in poses)]
+        stops = [
+            (0.0, np.zeros(6)),
+            *((p.time, np.hstack([p.by, np.radians(p.turn)])) for p in poses),
+        ]
         about = np.zeros(3) if center is None else np.array(center)
-        return cls(np.array([time for time, _ in stops]), np.array([pose for _, pose in stops]), about)
+        return cls(
+            np.array([time for time, _ in stops]), np.array([pose for _, pose in stops]), about
+        )
 
     @property
     def leads_away(self) -> bool:
@@ -68,7 +73,9 @@ class Motion(Lines):
 
     def unmoved(self, q: Positions, pose: Floats) -> Positions:
         """Return where points q (n, 3) [m] of a pose (6,) are at time 0: what ``moved`` takes."""
-        at_rest: Positions = (q - self.center - pose[:3]) @ Rotation.from_rotvec(pose[3:]).as_matrix() + self.center
+        at_rest: Positions = (q - self.center - pose[:3]) @ Rotation.from_rotvec(
+            pose[3:]
+        ).as_matrix() + self.center
         return at_rest
 
     def moved(self, x: Positions, pose: Floats) -> Positions:
@@ -172,7 +179,9 @@ class OwnForce(Timed):
             words = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
             raise InputError(f"{self.key}.function: {words}") from None
         if not np.isfinite(force).all():
-            raise InputError(f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)")
+            raise InputError(
+                f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)"
+            )
         return force
 
 

@@ -14,7 +14,9 @@ from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
-ROWS = FORM + 2  # of a cell's constants: its form, modes times m = mu V / (16 h^2); m; lambda V / (16 h^2)
+ROWS = (
+    FORM + 2
+)  # of a cell's constants: its form, modes times m = mu V / (16 h^2); m; lambda V / (16 h^2)
 STATE = 11  # F by rows, V U' / (16 h^2), V U'' / (16 h^2)
 BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of VTK's order, x fastest, then y
 
@@ -67,7 +69,9 @@ def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
     """Return the lattice's cells with their constants (c, ROWS), in the memory that its nodes are in."""
     cells, kinds, number = to_host(lattice.local_cells)[:, BY_AXIS], [], np.arange(len(constants))
     _, alike, count = np.unique(_whole_rows(constants), return_inverse=True, return_counts=True)
-    rank = np.where(count[alike] < LANES, len(count), alike)  # those that fill no block stay where they are
+    rank = np.where(
+        count[alike] < LANES, len(count), alike
+    )  # those that fill no block stay where they are
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
         own = np.flatnonzero(kind)
         order = own[np.argsort(rank[own], kind="stable")]
@@ -94,7 +98,9 @@ def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
 
 def _whole_rows(rows: Rows) -> Array:
     """Return rows as one thing each, (n,), which are sorted and compared bit by bit."""
-    return np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    return (
+        np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    )
 
 
 def add_corners(write: Callable[[Rows], None], around: Indices, corners: int, rows: Rows) -> None:

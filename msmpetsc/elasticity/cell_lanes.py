@@ -31,7 +31,16 @@ FAST = {"contract", "nsz", "reassoc", "arcp"}  # numba: sums may be reordered, f
 
 @njit(inline="always")
 def _component_in(w: Floats, at: int) -> Eight:
-    return w[at], w[at + 24], w[at + 48], w[at + 72], w[at + 96], w[at + 120], w[at + 144], w[at + 168]
+    return (
+        w[at],
+        w[at + 24],
+        w[at + 48],
+        w[at + 72],
+        w[at + 96],
+        w[at + 120],
+        w[at + 144],
+        w[at + 168],
+    )
 
 
 @njit(inline="always")
@@ -127,5 +136,7 @@ def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
             s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
             before, more = w[s], w[s + 8]
             if m > 0.0:
-                change += w[s + 16] + blocks.h4**2 * volume_change(before + more, before, more, m, lame)
+                change += w[s + 16] + blocks.h4**2 * volume_change(
+                    before + more, before, more, m, lame
+                )
     return change

@@ -42,9 +42,45 @@ def strains_at(q: Positions, cells: CellRows, i: int) -> Strains:
     """Return the strains of cell i."""
     c, form = cells.nodes[i], form_of(cells.constants, constants_at(cells, i))
     return (
-        strain((q[c[0], 0], q[c[1], 0], q[c[2], 0], q[c[3], 0], q[c[4], 0], q[c[5], 0], q[c[6], 0], q[c[7], 0]), form),
-        strain((q[c[0], 1], q[c[1], 1], q[c[2], 1], q[c[3], 1], q[c[4], 1], q[c[5], 1], q[c[6], 1], q[c[7], 1]), form),
-        strain((q[c[0], 2], q[c[1], 2], q[c[2], 2], q[c[3], 2], q[c[4], 2], q[c[5], 2], q[c[6], 2], q[c[7], 2]), form),
+        strain(
+            (
+                q[c[0], 0],
+                q[c[1], 0],
+                q[c[2], 0],
+                q[c[3], 0],
+                q[c[4], 0],
+                q[c[5], 0],
+                q[c[6], 0],
+                q[c[7], 0],
+            ),
+            form,
+        ),
+        strain(
+            (
+                q[c[0], 1],
+                q[c[1], 1],
+                q[c[2], 1],
+                q[c[3], 1],
+                q[c[4], 1],
+                q[c[5], 1],
+                q[c[6], 1],
+                q[c[7], 1],
+            ),
+            form,
+        ),
+        strain(
+            (
+                q[c[0], 2],
+                q[c[1], 2],
+                q[c[2], 2],
+                q[c[3], 2],
+                q[c[4], 2],
+                q[c[5], 2],
+                q[c[6], 2],
+                q[c[7], 2],
+            ),
+            form,
+        ),
     )
 
 
@@ -55,7 +91,9 @@ def gradient_at(q: Positions, cells: CellRows, i: int) -> Nine:
 
 
 @kernel
-def _write_products(first: int, count: int, step: int, v: Rows, cells: CellRows, store: Floats) -> None:
+def _write_products(
+    first: int, count: int, step: int, v: Rows, cells: CellRows, store: Floats
+) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(v, cells, i)
         slopes = turned_pull(e, cells.constants[k + 104], cells.state, state_at(i))
@@ -63,7 +101,9 @@ def _write_products(first: int, count: int, step: int, v: Rows, cells: CellRows,
 
 
 @kernel
-def _write_gradients(first: int, count: int, step: int, q: Positions, cells: CellRows, store: Floats) -> None:
+def _write_gradients(
+    first: int, count: int, step: int, q: Positions, cells: CellRows, store: Floats
+) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
         slopes = pull(e, cells.constants[k + 104], cells.constants[k + 112], cells.h4)
@@ -71,7 +111,9 @@ def _write_gradients(first: int, count: int, step: int, q: Positions, cells: Cel
 
 
 @kernel
-def _add_around(first: int, count: int, step: int, store: Floats, around: Indices, rows: Rows) -> None:
+def _add_around(
+    first: int, count: int, step: int, store: Floats, around: Indices, rows: Rows
+) -> None:
     for i in range(first, count, step):
         x, y, z = 0.0, 0.0, 0.0
         for a in range(8):
@@ -84,15 +126,21 @@ def _add_around(first: int, count: int, step: int, store: Floats, around: Indice
 
 
 @kernel
-def _write_states(first: int, count: int, step: int, q: Positions, cells: CellRows, projected: bool) -> None:
+def _write_states(
+    first: int, count: int, step: int, q: Positions, cells: CellRows, projected: bool
+) -> None:
     for i in range(first, count, step):
         k, f = constants_at(cells, i), gradient_at(q, cells, i)
-        slope, curvature = slopes_at(f, cells.constants[k + 104], cells.constants[k + 112], projected)
+        slope, curvature = slopes_at(
+            f, cells.constants[k + 104], cells.constants[k + 112], projected
+        )
         write_state(cells.state, state_at(i), f, slope, curvature)
 
 
 @kernel
-def _write_changes(first: int, count: int, step: int, parts: Floats, cells: CellRows, way: Way) -> None:
+def _write_changes(
+    first: int, count: int, step: int, parts: Floats, cells: CellRows, way: Way
+) -> None:
     base, _, moved = way
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
@@ -103,7 +151,9 @@ def _write_changes(first: int, count: int, step: int, parts: Floats, cells: Cell
             parts[i] = quadratic_change(cells.constants, k, d, e) + cells.h4**2 * volume
 
 
-def _add(kernel: Callable[..., None], array: Array, cells: CellRows, around: Indices, rows: Rows) -> None:
+def _add(
+    kernel: Callable[..., None], array: Array, cells: CellRows, around: Indices, rows: Rows
+) -> None:
     """Let cells write 3 numbers a corner, and add them to the owned rows (l, 3)."""
     store = np.empty(24 * len(cells.nodes), like=rows)
     kernel(len(cells.nodes), array, cells, store)

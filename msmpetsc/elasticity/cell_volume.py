@@ -34,11 +34,34 @@ def _volume(a: Vector, b: Vector, c: Vector) -> float:
 @njit()
 def least_volume(q: Positions, c: Indices) -> float:
     """Return the least of the eight corner volumes of a cell [m^3]; each edge is read once."""
-    x0, x1, x2, x3 = between(q, c[0], c[1]), between(q, c[3], c[2]), between(q, c[4], c[5]), between(q, c[7], c[6])
-    y0, y1, y2, y3 = between(q, c[0], c[3]), between(q, c[1], c[2]), between(q, c[4], c[7]), between(q, c[5], c[6])
-    z0, z1, z2, z3 = between(q, c[0], c[4]), between(q, c[1], c[5]), between(q, c[2], c[6]), between(q, c[3], c[7])
+    x0, x1, x2, x3 = (
+        between(q, c[0], c[1]),
+        between(q, c[3], c[2]),
+        between(q, c[4], c[5]),
+        between(q, c[7], c[6]),
+    )
+    y0, y1, y2, y3 = (
+        between(q, c[0], c[3]),
+        between(q, c[1], c[2]),
+        between(q, c[4], c[7]),
+        between(q, c[5], c[6]),
+    )
+    z0, z1, z2, z3 = (
+        between(q, c[0], c[4]),
+        between(q, c[1], c[5]),
+        between(q, c[2], c[6]),
+        between(q, c[3], c[7]),
+    )
     volume = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
-    return float(min(volume, _volume(x2, y2, z0), _volume(x2, y3, z1), _volume(x3, y3, z2), _volume(x3, y2, z3)))
+    return float(
+        min(
+            volume,
+            _volume(x2, y2, z0),
+            _volume(x2, y3, z1),
+            _volume(x3, y3, z2),
+            _volume(x3, y2, z3),
+        )
+    )
 
 
 @kernel
@@ -58,18 +81,31 @@ def least_volumes(q: Positions, cells: Indices) -> Floats:
 
 @njit(inline="always")
 def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
-    corners = q[c[0], k], q[c[1], k], q[c[3], k], q[c[2], k], q[c[4], k], q[c[5], k], q[c[7], k], q[c[6], k]
+    corners = (
+        q[c[0], k],
+        q[c[1], k],
+        q[c[3], k],
+        q[c[2], k],
+        q[c[4], k],
+        q[c[5], k],
+        q[c[7], k],
+        q[c[6], k],
+    )
     x, y, z, _, _, _, _ = strain(corners, form)
     return x, y, z
 
 
 @kernel
-def _mean_volume_of(first: int, count: int, step: int, volumes: Floats, q: Positions, shapes: Shapes) -> None:
+def _mean_volume_of(
+    first: int, count: int, step: int, volumes: Floats, q: Positions, shapes: Shapes
+) -> None:
     cells, forms = shapes
     for i in range(first, count, step):
         f, c = forms[i], cells[i]
         form = f[0], f[1], f[2], f[3], f[4], f[5]
-        volumes[i] = _volume(_mean_slope(q, c, 0, form), _mean_slope(q, c, 1, form), _mean_slope(q, c, 2, form))
+        volumes[i] = _volume(
+            _mean_slope(q, c, 0, form), _mean_slope(q, c, 1, form), _mean_slope(q, c, 2, form)
+        )
 
 
 def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -> Floats:

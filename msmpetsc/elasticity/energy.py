@@ -29,7 +29,9 @@ class Elasticity:
         if self.solid and lattice.viscous:
             self.viscosity = Viscosity(self.solid, lattice.viscous, lattice.owned, lattice.nodes)
         if self.solid is None:
-            self.springs = (SpringScatter if on_host(lattice.nodes) else SpringGather).of_lattice(lattice)
+            self.springs = (SpringScatter if on_host(lattice.nodes) else SpringGather).of_lattice(
+                lattice
+            )
         self.parts = [part for part in (self.solid, self.springs, self.viscosity) if part]
 
     def energy(self, q: Positions) -> float:
@@ -67,7 +69,9 @@ class Elasticity:
         law.add_concavity(q, concavity)
         return concavity[: self.owned]
 
-    def hessian_at(self, q: Positions, projected: bool = False, dtype: type = np.float64) -> "Hessian":
+    def hessian_at(
+        self, q: Positions, projected: bool = False, dtype: type = np.float64
+    ) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].
 
         projected : without its negative parts, as of compressed springs

@@ -13,7 +13,9 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 
     rows, measure : (k,) local nodes, and what is measured of each
     """
-    number, where = _least(comm, lattice, rows[:, None], -np.nan_to_num(to_host(measure), nan=np.inf))
+    number, where = _least(
+        comm, lattice, rows[:, None], -np.nan_to_num(to_host(measure), nan=np.inf)
+    )
     return f"node {number}, {where}"
 
 
@@ -29,10 +31,15 @@ def _least(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) 
         point = to_host(lattice.nodes[like(lattice.nodes, nodes)].mean(axis=0))
         candidate = float(measure[least]), int(lattice.global_numbers[nodes[0]]), point
     _, number, point = min(comm.allgather(candidate), key=lambda candidate: candidate[0])
-    return number, f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
+    return (
+        number,
+        f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m",
+    )
 
 
-def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool = False) -> tuple[int, str]:
+def worst_inverted(
+    comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool = False
+) -> tuple[int, str]:
     """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective).
 
     A solid's cell is where what is inside the surface is, in the mean: corners of a sliver may fold far outside.

@@ -92,7 +92,11 @@ def volume_energy(j: float, mu: float, lame: float) -> float:
     """Return U at J = j."""
     above = max(j, ONSET)
     below, (slope, curvature) = j - above, _slopes(above, mu, lame)
-    return 0.5 * lame * (above - 1.0) ** 2 - mu * math.log(above) + below * (slope + 0.5 * curvature * below)
+    return (
+        0.5 * lame * (above - 1.0) ** 2
+        - mu * math.log(above)
+        + below * (slope + 0.5 * curvature * below)
+    )
 
 
 @njit(inline="always")
@@ -112,11 +116,18 @@ def _borne(f: Nine, j: float, slope: float, least: float) -> float:
 
     There it is Gershgorin's bound of the greatest singular value of F, exact in a rotation, elsewhere R |F|.
     """
-    xx, yy, zz = f[0] ** 2 + f[3] ** 2 + f[6] ** 2, f[1] ** 2 + f[4] ** 2 + f[7] ** 2, f[2] ** 2 + f[5] ** 2 + f[8] ** 2
+    xx, yy, zz = (
+        f[0] ** 2 + f[3] ** 2 + f[6] ** 2,
+        f[1] ** 2 + f[4] ** 2 + f[7] ** 2,
+        f[2] ** 2 + f[5] ** 2 + f[8] ** 2,
+    )
     xy = abs(f[0] * f[1] + f[3] * f[4] + f[6] * f[7])
     xz = abs(f[0] * f[2] + f[3] * f[5] + f[6] * f[8])
     yz = abs(f[1] * f[2] + f[4] * f[5] + f[7] * f[8])
-    largest, norm = math.sqrt(max(xx + xy + xz, yy + xy + yz, zz + xz + yz)), math.sqrt(xx + yy + zz)
+    largest, norm = (
+        math.sqrt(max(xx + xy + xz, yy + xy + yz, zz + xz + yz)),
+        math.sqrt(xx + yy + zz),
+    )
     return largest if slope < 0.0 and j >= least else NORM * norm
 
 
@@ -152,7 +163,17 @@ def gradient_of(e: Strains, over: float) -> Nine:
 def kept_gradient(state: Floats, s: int) -> Nine:
     """Return F as a Hessian keeps it."""
     rows = state[s], state[s + 8], state[s + 16], state[s + 24], state[s + 32], state[s + 40]
-    return rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], state[s + 48], state[s + 56], state[s + 64]
+    return (
+        rows[0],
+        rows[1],
+        rows[2],
+        rows[3],
+        rows[4],
+        rows[5],
+        state[s + 48],
+        state[s + 56],
+        state[s + 64],
+    )
 
 
 @njit(inline="always")
@@ -192,7 +213,13 @@ def quadratic_change(w: Floats, k: int, moved: Strains, base: Strains) -> float:
 @njit(inline="always")
 def write_state(store: Floats, s: int, f: Nine, slope: float, curvature: float) -> None:
     """Write what a Hessian keeps of a cell: F, V U' and V U''."""
-    store[s], store[s + 8], store[s + 16], store[s + 24], store[s + 32] = f[0], f[1], f[2], f[3], f[4]
+    store[s], store[s + 8], store[s + 16], store[s + 24], store[s + 32] = (
+        f[0],
+        f[1],
+        f[2],
+        f[3],
+        f[4],
+    )
     store[s + 40], store[s + 48], store[s + 56], store[s + 64] = f[5], f[6], f[7], f[8]
     store[s + 72], store[s + 80] = slope, curvature
 

@@ -8,10 +8,27 @@ from types import ModuleType
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, greatest, on_host, to_host
+from msmpetsc.backend.arrays import (
+    Array,
+    Floats,
+    Indices,
+    Positions,
+    Rows,
+    greatest,
+    on_host,
+    to_host,
+)
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity import cell_lanes, cell_threads
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, add_corners, blocks_of, one_by_one
+from msmpetsc.elasticity.cell_blocks import (
+    ROWS,
+    STATE,
+    Blocks,
+    CellRows,
+    add_corners,
+    blocks_of,
+    one_by_one,
+)
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, linearise, state_at
 from msmpetsc.elasticity.neo_hookean import along_cofactors, corner_stiffness, kept_cofactors, lost
@@ -32,13 +49,17 @@ def _size(a: int, constants: Floats, k: int) -> float:
 
 
 @kernel
-def _add_concavity(first: int, count: int, step: int, concavity: Rows, cells: CellRows, q: Positions) -> None:
+def _add_concavity(
+    first: int, count: int, step: int, concavity: Rows, cells: CellRows, q: Positions
+) -> None:
     """V |G|^2 is no more than sum_a |g_a| (sum_b |g_b|) V |v_a|^2, with g_a the mean slope of corner a."""
     for i in range(first, count, step):
         k, sizes = constants_at(cells, i), 0.0
         for a in range(8):
             sizes += _size(a, cells.constants, k)
-        taken = sizes * lost(gradient_at(q, cells, i), cells.constants[k + 104], cells.constants[k + 112])
+        taken = sizes * lost(
+            gradient_at(q, cells, i), cells.constants[k + 104], cells.constants[k + 112]
+        )
         for a in range(8):
             concavity[_row_of(cells, i, a), 0] += taken * _size(a, cells.constants, k)
 
@@ -81,7 +102,9 @@ class CellHessians:
         """Add the diagonal blocks to ``diagonal`` (l, 9) [N/m], but for what U' adds, which is none."""
         cells = one_by_one(self.blocks, self.state)
         count = len(cells.nodes)
-        add_corners(lambda rows: _add_diagonal(count, rows, cells), self.blocks.around, 8 * count, diagonal)
+        add_corners(
+            lambda rows: _add_diagonal(count, rows, cells), self.blocks.around, 8 * count, diagonal
+        )
 
 
 @dataclass(frozen=True)
@@ -97,7 +120,9 @@ class NeoHookean:
         h4 = 4 * lattice.cell_size
         forms, volume, shear, lame = map(to_host, lattice.solid)
         m = (shear * volume / h4**2)[:, None]
-        constants = np.concatenate([forms[:, :6], m * forms[:, 6:], m, (lame * volume / h4**2)[:, None]], axis=1)
+        constants = np.concatenate(
+            [forms[:, :6], m * forms[:, 6:], m, (lame * volume / h4**2)[:, None]], axis=1
+        )
         return cls(blocks_of(lattice, constants))
 
     @property
@@ -140,7 +165,12 @@ class NeoHookean:
         """Add to ``concavity`` (l,) [N/m] how much less than 0 the Hessian may be."""
         cells, of_nodes = one_by_one(self.blocks), concavity.reshape(-1, 1)
         count = len(cells.nodes)
-        add_corners(lambda rows: _add_concavity(count, rows, cells, q), self.blocks.around, 8 * count, of_nodes)
+        add_corners(
+            lambda rows: _add_concavity(count, rows, cells, q),
+            self.blocks.around,
+            8 * count,
+            of_nodes,
+        )
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
         """Return what adds (Hessian of E at q) v [N] to its second argument: of F, V U' and V U'' of all cells."""

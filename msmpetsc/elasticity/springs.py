@@ -28,7 +28,9 @@ Product = Callable[[Array, Array], None]  # adds (a Hessian) v [N] to the second
 Vector = tuple[float, float, float]
 Four = tuple[float, float, float, float]
 
-SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a symmetric block stand among 6
+SYMMETRIC = np.array(
+    [0, 1, 2, 1, 3, 4, 2, 4, 5]
+)  # where the 9 numbers of a symmetric block stand among 6
 
 # A spring of no length has no direction: it then pulls nothing and its energy stays 1/2 k r^2.
 TINY = 1e-300
@@ -46,7 +48,9 @@ def spring_change(before: Vector, d: Vector, r: float, k: float) -> float:
     e = before[0] + d[0], before[1] + d[1], before[2] + d[2]
     length, length_before = math.sqrt(dot(e, e)), math.sqrt(dot(before, before))
     total = length + length_before
-    longer = (d[0] * (e[0] + before[0]) + d[1] * (e[1] + before[1]) + d[2] * (e[2] + before[2])) / max(total, TINY)
+    longer = (
+        d[0] * (e[0] + before[0]) + d[1] * (e[1] + before[1]) + d[2] * (e[2] + before[2])
+    ) / max(total, TINY)
     return 0.5 * k * longer * (total - 2.0 * r)
 
 
@@ -89,7 +93,12 @@ class Springs(NamedTuple):
     @classmethod
     def of_lattice(cls, lattice: Lattice, first: int | None = None) -> "Springs":
         """Return the first springs of a lattice, or all, in the memory that its nodes are in."""
-        return cls(*(like(lattice.nodes, a[:first]) for a in (lattice.springs, lattice.rest_length, lattice.stiffness)))
+        return cls(
+            *(
+                like(lattice.nodes, a[:first])
+                for a in (lattice.springs, lattice.rest_length, lattice.stiffness)
+            )
+        )
 
 
 class Way(NamedTuple):
@@ -112,7 +121,9 @@ def between(q: Positions, a: int, b: int) -> Vector:
 
 
 @kernel
-def _elastic_change(first: int, count: int, step: int, sums: Floats, springs: Springs, way: Way) -> None:
+def _elastic_change(
+    first: int, count: int, step: int, sums: Floats, springs: Springs, way: Way
+) -> None:
     ends, rest_length, stiffness = springs
     base, _, moved = way
     change = 0.0
@@ -362,7 +373,9 @@ def _gradient_around(first: int, count: int, step: int, gradient: Rows, springs:
 
 
 @kernel
-def _concavity_around(first: int, count: int, step: int, concavity: Floats, springs: AroundAt) -> None:
+def _concavity_around(
+    first: int, count: int, step: int, concavity: Floats, springs: AroundAt
+) -> None:
     (neighbour, kind, stiffness, lengths), q, _ = springs
     for i in range(first, count, step):
         total = 0.0
@@ -370,12 +383,16 @@ def _concavity_around(first: int, count: int, step: int, concavity: Floats, spri
             j = neighbour[s, i]
             if j < 0:
                 break
-            total -= 2.0 * min(spring_pull(between(q, j, i), lengths[kind[s, i]], stiffness[s, i]), 0.0)
+            total -= 2.0 * min(
+                spring_pull(between(q, j, i), lengths[kind[s, i]], stiffness[s, i]), 0.0
+            )
         concavity[i] += total
 
 
 @kernel
-def _product_around(first: int, count: int, step: int, product: Rows, springs: AroundAt, v: Rows) -> None:
+def _product_around(
+    first: int, count: int, step: int, product: Rows, springs: AroundAt, v: Rows
+) -> None:
     (neighbour, kind, stiffness, lengths), q, projected = springs
     for i in range(first, count, step):
         px, py, pz = 0.0, 0.0, 0.0

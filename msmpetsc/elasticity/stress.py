@@ -37,10 +37,14 @@ class StressField:
         self.solid, self.cells, self.cells_owned = solid, lattice.solid, lattice.cells_owned
         self.rest = lattice.nodes
         corners, of_blocks = to_host(lattice.local_cells), to_host(solid.blocks.nodes)
-        first, lanes = np.unique(of_blocks[:, :, 0], return_index=True)  # before the lanes that fill up
+        first, lanes = np.unique(
+            of_blocks[:, :, 0], return_index=True
+        )  # before the lanes that fill up
         self.lanes = lanes[np.searchsorted(first, corners[:, 0])]
         weights, number = np.repeat(self.cells.volume, 8), np.repeat(np.arange(len(corners)), 8)
-        around = csr_array((weights, (corners.ravel(), number)), shape=(len(lattice.nodes), len(corners)))
+        around = csr_array(
+            (weights, (corners.ravel(), number)), shape=(len(lattice.nodes), len(corners))
+        )
         self.around = around[: lattice.owned]
         self.around.data /= np.repeat(self.around.sum(axis=1), np.diff(self.around.indptr))
 
@@ -52,20 +56,29 @@ class StressField:
         """
         rows = to_host(self.solid.hessian_at(q, False).state)
         state = rows.reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
-        f, slope = state[:, :9].reshape(-1, 3, 3), state[:, 9] * self.solid.blocks.h4**2 / self.cells.volume
+        f, slope = (
+            state[:, :9].reshape(-1, 3, 3),
+            state[:, 9] * self.solid.blocks.h4**2 / self.cells.volume,
+        )
         share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
         stress: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
         stress[:, :3] += slope[:, None]
-        energies = cell_changes(self.solid.blocks, LANES * len(self.solid.blocks.nodes), q, self.rest)
+        energies = cell_changes(
+            self.solid.blocks, LANES * len(self.solid.blocks.nodes), q, self.rest
+        )
         energies = to_host(energies)[self.lanes] / self.cells.volume
         own = slice(self.cells_owned)
         of_nodes = _fields(self.around @ stress, self.around @ energies)
-        return of_nodes | {f"cell_{name}": rows for name, rows in _fields(stress[own], energies[own]).items()}
+        return of_nodes | {
+            f"cell_{name}": rows for name, rows in _fields(stress[own], energies[own]).items()
+        }
 
 
 def _fields(stress: Rows, energy: Floats) -> dict[str, Any]:
     """Return what is known by stresses (k, 6) [Pa] and energies (k,) [J/m^3]."""
     pressure = -stress[:, :3].mean(axis=1)
-    deviator = np.concatenate([stress[:, :3] + pressure[:, None], np.sqrt(2) * stress[:, 3:]], axis=1)
+    deviator = np.concatenate(
+        [stress[:, :3] + pressure[:, None], np.sqrt(2) * stress[:, 3:]], axis=1
+    )
     von_mises = np.sqrt(1.5) * np.linalg.norm(deviator, axis=1)
     return {"stress": stress, "von_mises": von_mises, "pressure": pressure, "strain_energy": energy}

@@ -21,7 +21,9 @@ from msmpetsc.elasticity.solid import CellHessians, NeoHookean
 
 
 @kernel
-def _turned_states(first: int, count: int, step: int, q: Positions, cells: CellRows, state: Floats) -> None:
+def _turned_states(
+    first: int, count: int, step: int, q: Positions, cells: CellRows, state: Floats
+) -> None:
     """Write what a Hessian keeps of cells at rest, turned as those at q (l, 3) [m].
 
     Cells that are flat or inside out have no rotation: K is not turned then, nor does it forgive a turn.
@@ -62,7 +64,11 @@ class Viscosity:
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return this rank's part of D(q) - D(base) [J], that of its nodes' forces."""
-        both, product, owned = (q - self.before) + (base - self.before), np.zeros_like(q), self.owned
+        both, product, owned = (
+            (q - self.before) + (base - self.before),
+            np.zeros_like(q),
+            self.owned,
+        )
         self.hessian(both, product)
         return 0.5 * float(np.vdot(q[:owned] - base[:owned], product[:owned]))
 
@@ -73,7 +79,9 @@ class Viscosity:
     def hessian_at(self, _: Positions, __: bool, dtype: type = np.float64) -> CellHessians:
         """Return what adds (Hessian of D) v [N] to its second argument."""
         constants: Rows = self.blocks.constants.astype(dtype, copy=False)
-        return CellHessians(self.blocks._replace(constants=constants), self.hessian.state.astype(dtype, copy=False))
+        return CellHessians(
+            self.blocks._replace(constants=constants), self.hessian.state.astype(dtype, copy=False)
+        )
 
     def add_bound(self, _: Positions, blocks: Rows) -> None:
         """Add the diagonal blocks of the Hessian to ``blocks`` (l, 9) [N/m]."""

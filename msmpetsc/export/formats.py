@@ -23,16 +23,25 @@ FLOAT, UNSIGNED = 5126, 5125  # component types
 POINTS, TRIANGLES = 34962, 34963  # uses of a buffer view: vertex data, indices
 MOST_BYTES = 2**32 - 2**20  # less what is no vertex
 Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # a quarter turn about x
-CLAY = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0}, "doubleSided": True}
+CLAY = {
+    "pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0},
+    "doubleSided": True,
+}
 
 
 def normals(points: Array, triangles: Indices) -> Array:
     """Return area-weighted unit normals (v, 3) float32 at points (v, 3) of triangles (f, 3)."""
     corners = points[triangles].astype(float)
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sums = [np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T]
+    sums = [
+        np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T
+    ]
     vectors = np.stack(sums, axis=1)
-    vectors[~vectors.any(axis=1)] = (0, 0, 1)  # a point of no triangle, or of folded ones: any direction is as good
+    vectors[~vectors.any(axis=1)] = (
+        0,
+        0,
+        1,
+    )  # a point of no triangle, or of folded ones: any direction is as good
     return np.divide(vectors, np.linalg.norm(vectors, axis=1, keepdims=True), dtype=np.float32)
 
 
@@ -61,7 +70,11 @@ class Chunk:
         bounds : whether to say the least and greatest values, as points, targets and times must
         """
         component = UNSIGNED if use == TRIANGLES else FLOAT
-        accessor: dict[str, Any] = {"bufferView": len(self.views), "componentType": component, "count": len(rows)}
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views),
+            "componentType": component,
+            "count": len(rows),
+        }
         accessor["type"] = "VEC3" if rows.ndim == 2 else "SCALAR"
         if bounds:
             ends = np.reshape([rows.min(axis=0), rows.max(axis=0)], (2, -1)).tolist()
@@ -75,7 +88,10 @@ class Chunk:
 
     def add_shape(self, points: Array, normals: Array) -> dict[str, int]:
         """Add points and normals, (v, 3) float32 each; return their accessors."""
-        return {"POSITION": self.add(points, POINTS, bounds=True), "NORMAL": self.add(normals, POINTS)}
+        return {
+            "POSITION": self.add(points, POINTS, bounds=True),
+            "NORMAL": self.add(normals, POINTS),
+        }
 
 
 def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
@@ -95,15 +111,24 @@ def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
         points = (run.surface_at(frame) - middle).astype(np.float32)
         targets.append(chunk.add_shape(points - base, normals(points, triangles) - upright))
         if chunk.size > MOST_BYTES:
-            raise InputError(f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)")
+            raise InputError(
+                f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)"
+            )
     document = _document(shape, indices, targets, run.path.stem, middle)
     if others:
         document["animations"] = [_animation(chunk, run.frames.time[:][frames], len(others))]
-    document |= {"accessors": chunk.accessors, "bufferViews": chunk.views, "buffers": [{"byteLength": chunk.size}]}
+    document |= {
+        "accessors": chunk.accessors,
+        "bufferViews": chunk.views,
+        "buffers": [{"byteLength": chunk.size}],
+    }
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     with open(path, "wb") as file:
-        file.write(struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + chunk.size, len(text), b"JSON") + text)
+        file.write(
+            struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + chunk.size, len(text), b"JSON")
+            + text
+        )
         file.write(struct.pack("<I4s", chunk.size, b"BIN\0"))
         file.writelines(chunk.parts)
 
@@ -132,7 +157,11 @@ def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
     """Return the animation that blends linearly between morph targets at the frames' times (t,) [s]."""
     since = (times - times[0]).astype(np.float32)
     weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
-    sampler = {"input": chunk.add(since, bounds=True), "output": chunk.add(weights), "interpolation": "LINEAR"}
+    sampler = {
+        "input": chunk.add(since, bounds=True),
+        "output": chunk.add(weights),
+        "interpolation": "LINEAR",
+    }
     channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
     return {"samplers": [sampler], "channels": [channel]}
 
@@ -149,7 +178,9 @@ def write_one_frame(run: Result, frames: Sequence[int], path: Path) -> None:
     import meshio
 
     (frame,) = frames
-    meshio.write(path, meshio.Mesh(run.surface_at(frame), [("triangle", run.indices("surface/triangles"))]))
+    meshio.write(
+        path, meshio.Mesh(run.surface_at(frame), [("triangle", run.indices("surface/triangles"))])
+    )
 
 
 FORMATS: dict[str, Callable[[Result, Sequence[int], Path], None]] = {  # of the surface at frames
@@ -173,7 +204,9 @@ def export(result: str | Path, path: str | Path, frames: Frames | None = None) -
     path = Path(path)
     write = FORMATS.get(path.suffix.lower())
     if write is None:
-        raise InputError(f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}")
+        raise InputError(
+            f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}"
+        )
     with Result(result) as run:
         numbers = _frames(run, path, write is not write_one_frame, frames)
         if "surface/points" not in run:

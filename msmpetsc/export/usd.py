@@ -41,7 +41,10 @@ def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
         # USD's points are of single precision, which is exact about the body's middle: the root puts them there
         middle = middle_of(run.surface_at(frames[0]))
         root.AddTranslateOp().Set(Gf.Vec3d(*middle))
-        bodies = [UsdBody(stage, root.GetPath(), triangles, of_point, number) for number in np.unique(of_point)]
+        bodies = [
+            UsdBody(stage, root.GetPath(), triangles, of_point, number)
+            for number in np.unique(of_point)
+        ]
         for count, (frame, code) in enumerate(zip(frames, codes, strict=True), 1):
             points = run.surface_at(frame) - middle
             for body in bodies:
@@ -65,7 +68,9 @@ class UsdBody:
         self._mesh = UsdGeom.Mesh.Define(stage, root.AppendChild(name))
         self._mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)  # or it would be rounded off
         self._mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(own), 3))
-        self._mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(self._triangles.ravel().astype(np.int32)))
+        self._mesh.CreateFaceVertexIndicesAttr(
+            Vt.IntArray.FromNumpy(self._triangles.ravel().astype(np.int32))
+        )
         self._mesh.CreateDisplayColorAttr([Gf.Vec3f(*CLAY)])
         self._mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
 

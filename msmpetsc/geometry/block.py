@@ -33,7 +33,11 @@ _x, _y, _z = np.indices((2, 2, 2)).reshape(3, -1, 1)
 
 SQUARE = np.stack([_axis, _plane, _j, _k], 1)  # (108,4)
 NODES = np.stack(  # (108,4) corner nodes, as (a,b): 00, 10, 11, 01
-    [_entry(NODE_STRIDE, _axis, _plane, _j + a, _k + b) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))], 1
+    [
+        _entry(NODE_STRIDE, _axis, _plane, _j + a, _k + b)
+        for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
+    ],
+    1,
 )
 CELLS = np.stack(  # (108,2) cells below and above
     [
@@ -55,7 +59,9 @@ EDGE = np.indices((3, 3, 4, 4)).reshape(4, -1).T.copy()  # (144,4): axis, i, j, 
 AROUND = np.zeros((8, 28), bool)  # the 8 cells around each corner of the middle cell
 for _dx, _dy, _dz in np.ndindex(2, 2, 2):
     AROUND[np.arange(8)[:, None], 9 * (_x + _dx) + 3 * (_y + _dy) + _z + _dz] = True
-OF_CORNER = np.nonzero(AROUND[:, CELLS].any(2))[1].reshape(8, 36).copy()  # the squares of those cells
+OF_CORNER = (
+    np.nonzero(AROUND[:, CELLS].any(2))[1].reshape(8, 36).copy()
+)  # the squares of those cells
 
 
 @njit()

@@ -16,9 +16,23 @@ from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
-from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
+from msmpetsc.geometry.grid import (
+    CHUNK,
+    BodyGrids,
+    Grid,
+    decode_morton,
+    encode_morton,
+    packed,
+    unpacked,
+)
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
-from msmpetsc.geometry.valid_cells import Slab, cells_of_gaps, enclosed_gaps, slab_edges, touched_cells
+from msmpetsc.geometry.valid_cells import (
+    Slab,
+    cells_of_gaps,
+    enclosed_gaps,
+    slab_edges,
+    touched_cells,
+)
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
@@ -97,7 +111,12 @@ class SlabCells:
         return int(comm.allreduce(len(self.boundary) + self.interior))
 
 
-def fill(bodies: Sequence[BodySurface], cell_size: float, max_cells: int = 5_000_000, boundary: str = "fill") -> Cages:
+def fill(
+    bodies: Sequence[BodySurface],
+    cell_size: float,
+    max_cells: int = 5_000_000,
+    boundary: str = "fill",
+) -> Cages:
     """Return the valid cells of side ``cell_size`` [m] of all bodies (collective).
 
     boundary : "fill": a boundary cell counts for the share of it that is inside; "whole", as in the paper
@@ -107,7 +126,9 @@ def fill(bodies: Sequence[BodySurface], cell_size: float, max_cells: int = 5_000
     found = slabs_of_all(bodies, grids, max_cells, boundary)
     refuse_beyond_memory(comm, sum(cells.count(comm) for cells in found))
     parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, found, strict=True)]
-    keys = encode_morton(np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(parts)]))
+    keys = encode_morton(
+        np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(parts)])
+    )
     table = SortedKeys(comm, keys)
     route = Route(comm, table.owner(keys))
     order = np.argsort(route.send(keys))
@@ -116,7 +137,9 @@ def fill(bodies: Sequence[BodySurface], cell_size: float, max_cells: int = 5_000
     share = squares = None
     if any(fills):
         of_bodies = [_whole(len(kind)) if inside is None else inside for _, kind, inside in parts]
-        share, squares = (route.send(np.concatenate(rows))[order] for rows in zip(*of_bodies, strict=True))
+        share, squares = (
+            route.send(np.concatenate(rows))[order] for rows in zip(*of_bodies, strict=True)
+        )
     return Cages(grids, table, route.send(kind)[order], share, squares, fills)
 
 
@@ -127,7 +150,9 @@ def _whole(count: int) -> Inside:
     return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
 
 
-def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Inside | None]:
+def _cells_of(
+    body: BodySurface, grid: Grid, cells: SlabCells, boundary: str
+) -> tuple[Indices, Array, Inside | None]:
     """Return grid index (n, 3), kind (n,), shares and squares of a rank's cells (collective)."""
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
@@ -152,10 +177,14 @@ def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
         _warn_of_parts(abs(body.report.volume), body.comm.allreduce(held) * grid.cell_size**3)
         share, squares = share.transpose(0, *(1 + axes)), squares[:, axes]
     elif body.report.closed:
-        log.warning('triangles are wound against each other, so boundary cells count whole: prepare = ["orient"]')
+        log.warning(
+            'triangles are wound against each other, so boundary cells count whole: prepare = ["orient"]'
+        )
         return None
     else:
-        share, squares = sampled_inside(body.comm.bcast(body.surface), grid, cells.boundary[:, axes])
+        share, squares = sampled_inside(
+            body.comm.bcast(body.surface), grid, cells.boundary[:, axes]
+        )
     counted = np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
     return counted, squares + (counted - share).mean(axis=(1, 2, 3))[:, None] / 4
 
@@ -169,10 +198,14 @@ def _warn_of_parts(enclosed: float, held: float) -> None:
             else 'parts overlap or lie in each other; prepare = ["union"] joins them, ["orient"] makes cavities of '
             "inner parts"
         )
-        log.warning("the mesh encloses %.4g m^3, its cells hold %.4g m^3: %s", enclosed, held, remedy)
+        log.warning(
+            "the mesh encloses %.4g m^3, its cells hold %.4g m^3: %s", enclosed, held, remedy
+        )
 
 
-def slabs_of_all(bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str) -> list[SlabCells]:
+def slabs_of_all(
+    bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str
+) -> list[SlabCells]:
     """Return the valid cells of each body in this rank's slab (collective)."""
     found: list[SlabCells] = []
     comm, before = bodies[0].comm, 0
@@ -217,11 +250,16 @@ def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
 
 def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
     """Raise InputError for a lattice whose parts cannot fit into memory (collective)."""
-    memory, needed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), cells * LEAST_OF_A_CELL / comm.size
+    memory, needed = (
+        os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        cells * LEAST_OF_A_CELL / comm.size,
+    )
     with together(comm):
         if needed > memory:
             has = f"this machine has {memory / 1e9:.3g} GB"
-            raise InputError(f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, and {has}")
+            raise InputError(
+                f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, and {has}"
+            )
 
 
 def _axes(body: BodySurface) -> Indices:
@@ -245,7 +283,11 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     reached = [planes.min(axis=1), planes.max(axis=1)]
     first, last = np.searchsorted(edges[1:], reached, side="right")
     copies = last - first + 1
-    rank = np.repeat(first, copies) + np.arange(copies.sum()) - np.repeat(np.cumsum(copies) - copies, copies)
+    rank = (
+        np.repeat(first, copies)
+        + np.arange(copies.sum())
+        - np.repeat(np.cumsum(copies) - copies, copies)
+    )
     return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
 
 
@@ -258,7 +300,9 @@ def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:
     return unpacked(np.unique(np.concatenate(keys)))
 
 
-def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices) -> Indices:
+def _gaps_by_winding(
+    body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices
+) -> Indices:
     """Return the interior cells of an open surface, by the winding numbers of their centres.
 
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
@@ -270,7 +314,9 @@ def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, b
     first, last = slab.first * shape[1] * shape[2], slab.last * shape[1] * shape[2]
     gaps = [np.empty((0, 4), np.int64)]
     for start in range(first, last, CHUNK):
-        cells = np.stack(np.unravel_index(np.arange(start, min(start + CHUNK, last)), shape), axis=1)
+        cells = np.stack(
+            np.unravel_index(np.arange(start, min(start + CHUNK, last)), shape), axis=1
+        )
         cells = cells[~np.isin(packed(cells), marked)]
         centres = np.empty(cells.shape)
         centres[:, axes] = cells + 0.5
@@ -305,18 +351,28 @@ def choose_cell_size(
             return float(np.exp(nearest))
         guess = _next_guess(excess, nearest)
     taken = round(count * np.exp(excess[nearest]))
-    log.warning("cages.count: no cell size was found that gives %d cells within 1%%; taking %d", count, taken)
+    log.warning(
+        "cages.count: no cell size was found that gives %d cells within 1%%; taking %d",
+        count,
+        taken,
+    )
     return float(np.exp(nearest))
 
 
 def estimated_cells(bodies: Sequence[BodySurface], cell_size: float) -> float:
     """Return about how many cells of side h [m] fill bodies: V / h^3 + 3/4 A / h^2, as boundary cells stick out."""
-    return sum(abs(body.report.volume) / cell_size**3 + 0.75 * body.report.area / cell_size**2 for body in bodies)
+    return sum(
+        abs(body.report.volume) / cell_size**3 + 0.75 * body.report.area / cell_size**2
+        for body in bodies
+    )
 
 
 def estimated_size(bodies: Sequence[BodySurface], count: float) -> float:
     """Return about the cell size [m] that gives ``count`` cells."""
-    area, volume = sum(body.report.area for body in bodies), sum(abs(body.report.volume) for body in bodies)
+    area, volume = (
+        sum(body.report.area for body in bodies),
+        sum(abs(body.report.volume) for body in bodies),
+    )
     roots = np.roots([count, 0, -0.75 * area, -volume])
     return float(roots.real.max())
 
@@ -339,7 +395,9 @@ def _next_guess(excess: dict[float, float], nearest: float) -> float:
     """Return the zero of the secant through the two best tries, else the middle of the bracket."""
     slope = -2.5  # between that of a shell and that of a solid
     if len(excess) > 1:
-        second = min((size for size in excess if size != nearest), key=lambda size: abs(excess[size]))
+        second = min(
+            (size for size in excess if size != nearest), key=lambda size: abs(excess[size])
+        )
         secant = (excess[nearest] - excess[second]) / (nearest - second)
         slope = secant if -5 < secant < -1 else slope
     guess = nearest - excess[nearest] / slope

@@ -38,7 +38,9 @@ class Kind(NamedTuple):
         ring = [int(corner) for corner in face]
         if cells.shape[1] in self.quadratic:
             first, edges = 1 + int(max(map(max, self.faces))), [{*edge} for edge in self.edges]
-            middles = [first + edges.index({*pair}) for pair in zip(face, face[1:] + face[0], strict=True)]
+            middles = [
+                first + edges.index({*pair}) for pair in zip(face, face[1:] + face[0], strict=True)
+            ]
             ring = [node for pair in zip(ring, middles, strict=True) for node in pair]
         triangles: Indices = cells[:, np.array(ring)[CUTS[len(ring)]]]
         return triangles
@@ -79,7 +81,10 @@ def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
 
     if path.suffix.lower() == ".inp" and b"*INCLUDE" in data.upper():
         raise ValueError("it includes other files, which are not read")
-    texts, binary = {".inp": meshio.abaqus, ".bdf": meshio.nastran}, {".vtu": meshio.vtu, ".vtk": meshio.vtk}
+    texts, binary = (
+        {".inp": meshio.abaqus, ".bdf": meshio.nastran},
+        {".vtu": meshio.vtu, ".vtk": meshio.vtk},
+    )
     if reader := texts.get(path.suffix.lower()):
         mesh = reader.read(_Lines(data.decode(errors="replace")))
     else:
@@ -129,16 +134,31 @@ def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indic
     for name, rows in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
             yield name, [np.asarray(own, np.int64) for own in rows]
-    arrays = {key: np.concatenate(parts) for key, parts in mesh.cell_data.items() if key != "gmsh:geometrical"}
-    dimensions = np.repeat([kind.dimension if kind else 0 for kind, _ in blocks], [len(cells) for _, cells in blocks])
+    arrays = {
+        key: np.concatenate(parts)
+        for key, parts in mesh.cell_data.items()
+        if key != "gmsh:geometrical"
+    }
+    dimensions = np.repeat(
+        [kind.dimension if kind else 0 for kind, _ in blocks], [len(cells) for _, cells in blocks]
+    )
     ends = np.cumsum([len(cells) for _, cells in blocks])
-    for key, label, usual in labels_of({key: each for key, each in arrays.items() if each.shape == dimensions.shape}):
+    for key, label, usual in labels_of(
+        {key: each for key, each in arrays.items() if each.shape == dimensions.shape}
+    ):
         # in which a name is of a label and a dimension, and 0 is no group
         is_gmsh = key == "gmsh:physical"
-        names = {(int(tag), int(size)): name for name, (tag, size) in mesh.field_data.items()} if is_gmsh else {}
+        names = (
+            {(int(tag), int(size)): name for name, (tag, size) in mesh.field_data.items()}
+            if is_gmsh
+            else {}
+        )
         for dimension in (2, 3) if label or not is_gmsh else ():
             own = (arrays[key] == label) & (dimensions == dimension)
-            yield names.get((label, dimension), usual), [*map(np.flatnonzero, np.split(own, ends[:-1]))]
+            yield (
+                names.get((label, dimension), usual),
+                [*map(np.flatnonzero, np.split(own, ends[:-1]))],
+            )
 
 
 def labels_of(arrays: Mapping[str, Array]) -> Iterator[tuple[str, int, str]]:
@@ -165,17 +185,28 @@ def boundary(points: Positions, blocks: Blocks) -> Indices:
 
     The cell itself may be inverted.
     """
-    solid = [(kind, cells, _volumes(points, kind, cells) < 0) for kind, cells in blocks if kind and kind.dimension == 3]
+    solid = [
+        (kind, cells, _volumes(points, kind, cells) < 0)
+        for kind, cells in blocks
+        if kind and kind.dimension == 3
+    ]
     faces = [(face, *of_kind) for of_kind in solid for face in of_kind[0].faces]
-    keys = [np.zeros((0, 4), np.int64), *(_key(cells[:, [*map(int, face)]]) for face, _, cells, _ in faces)]
+    keys = [
+        np.zeros((0, 4), np.int64),
+        *(_key(cells[:, [*map(int, face)]]) for face, _, cells, _ in faces),
+    ]
     ordered = np.concatenate(keys)[order := np.lexsort(np.concatenate(keys).T)]
     same = (ordered[1:] == ordered[:-1]).all(axis=1)
     outer = np.ones(len(order), bool)
     outer[order[1:][same]] = outer[order[:-1][same]] = False
     parts, ends = [np.zeros((0, 3), np.int64)], np.cumsum([len(key) for key in keys])
-    for (face, kind, cells, inverted), own in zip(faces, np.split(outer, ends[:-1])[1:], strict=True):
+    for (face, kind, cells, inverted), own in zip(
+        faces, np.split(outer, ends[:-1])[1:], strict=True
+    ):
         triangles = kind.triangles(cells[own], face)
-        parts.append(np.where(inverted[own][:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3))
+        parts.append(
+            np.where(inverted[own][:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3)
+        )
     triangles = np.concatenate(parts)
     whole: Indices = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     return whole
@@ -193,6 +224,8 @@ def _volumes(points: Positions, kind: Kind, cells: Indices) -> Floats:
     """Return the signed volume (c,) of cells, negative if they are inverted [m^3]."""
     volumes = np.zeros(len(cells))
     for face in kind.faces:
-        a, b, c = np.moveaxis(points[kind.triangles(cells, face)] - points[cells[:, :1], None], 2, 0)
+        a, b, c = np.moveaxis(
+            points[kind.triangles(cells, face)] - points[cells[:, :1], None], 2, 0
+        )
         volumes += np.einsum("cti,cti->c", a, np.cross(b, c)) / 6
     return volumes

@@ -78,7 +78,9 @@ Weights = tuple[float, float, float, float]
 FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with its leading terms removed
 
 
-def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> csr_array:
+def embed(
+    points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0
+) -> csr_array:
     """Return W for the surface points of all bodies, one after the other (collective).
 
     Each rank has a contiguous range of its rows; columns are global node numbers.
@@ -102,7 +104,9 @@ def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: st
         return row[part][point], numbers[cell[part]][point, node], weights[point, node]
 
     parts = (slice(start, start + CHUNK) for start in range(0, max(len(u), 1), CHUNK))
-    rows, columns, weights = (np.concatenate(part) for part in zip(*map(entries, parts), strict=True))
+    rows, columns, weights = (
+        np.concatenate(part) for part in zip(*map(entries, parts), strict=True)
+    )
     first = total * np.arange(comm.size + 1) // comm.size  # of the rows that each rank keeps
     route = Route(comm, np.searchsorted(first[1:], rows, side="right"))
     start, stop = first[comm.rank : comm.rank + 2]
@@ -138,7 +142,9 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
     if not np.all(neighbours[:, ITSELF]):
         raise ValueError("a point lies in a cell that is not valid")
     u = np.ascontiguousarray(np.where(u < ON_FACE, 0.0, np.where(u > 1.0 - ON_FACE, 1.0, u)))
-    neighbours = np.ascontiguousarray(neighbours, bool)  # one memory layout: the kernels are compiled once
+    neighbours = np.ascontiguousarray(
+        neighbours, bool
+    )  # one memory layout: the kernels are compiled once
     weights = np.empty((len(u), 64))
     if kind == "mvc":  # *Cages coordinates of a cell without neighbours
         neighbours = neighbours & (np.arange(27) == ITSELF)
@@ -174,7 +180,9 @@ def edge_angle(edge: int, view: PointView) -> float:
         axis, i, j, k = EDGE[edge, 0], EDGE[edge, 1], EDGE[edge, 2], EDGE[edge, 3]
         distance2 = view.planes[(axis + 1) % 3, j] ** 2 + view.planes[(axis + 2) % 3, k] ** 2
         cross = sqrt(distance2)
-        view.angles[edge] = atan2(cross, view.planes[axis, i] * view.planes[axis, i + 1] + distance2) / cross
+        view.angles[edge] = (
+            atan2(cross, view.planes[axis, i] * view.planes[axis, i + 1] + distance2) / cross
+        )
     return float(view.angles[edge])
 
 
@@ -226,7 +234,12 @@ def square_weights(frame: Frame, g: Angles) -> Weights:
     first_b = 0.5 * d * (g[0] - g[4]) - b0 * first
     second_a = 0.5 * d * (g[3] - g[4]) - a0 * second
     second_b = 0.5 * d * (g[4] - g[2]) - b0 * second
-    return first - first_a + second - second_b, first_a - first_b, first_b + second_a, second_b - second_a
+    return (
+        first - first_a + second - second_b,
+        first_a - first_b,
+        first_b + second_a,
+        second_b - second_a,
+    )
 
 
 @njit()
@@ -287,7 +300,9 @@ def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> N
     for s in range(36):
         square = OF_CORNER[corner, s]
         below, above = CELLS[square, 0], CELLS[square, 1]
-        outwards = int(AROUND[corner, below] and valid[below]) - int(AROUND[corner, above] and valid[above])
+        outwards = int(AROUND[corner, below] and valid[below]) - int(
+            AROUND[corner, above] and valid[above]
+        )
         if outwards != 0:
             if set_limit(square, view, weights):
                 return
@@ -359,9 +374,13 @@ def gradient_table() -> Rows:
     """
     offsets = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), -1).reshape(27, 3)
     octants = (offsets != 0).all(1)  # a cell around v has its far corner at (+-1, +-1, +-1)
-    is_corner = ((offsets == 0) | (offsets == offsets[octants][:, None])).all(-1)  # (8 cells, 27 nodes)
+    is_corner = ((offsets == 0) | (offsets == offsets[octants][:, None])).all(
+        -1
+    )  # (8 cells, 27 nodes)
     bits = np.arange(256)[:, None] >> np.arange(8) & 1
-    spans = (bits @ is_corner > 0)[..., None] * offsets  # (256,27,3): X_j - X_v, 0 where there is no node
+    spans = (bits @ is_corner > 0)[
+        ..., None
+    ] * offsets  # (256,27,3): X_j - X_v, 0 where there is no node
     table = np.zeros((256, 3, 27))
     normal = spans[1:].swapaxes(1, 2)  # normal equations: exactly 0 where there is no node
     table[1:] = np.linalg.solve(normal @ spans[1:], normal)

@@ -35,7 +35,11 @@ SEEN, SUMS = 6, 17  # sums of a piece: those that count for the cells below it t
 
 # barycentric coordinates and weights that integrate polynomials of degree 4 over a triangle (Dunavant 1985)
 POINTS = np.array(
-    [np.roll([1 - 2 * a, a, a], turn) for a in (0.445948490915965, 0.091576213509771) for turn in range(3)]
+    [
+        np.roll([1 - 2 * a, a, a], turn)
+        for a in (0.445948490915965, 0.091576213509771)
+        for turn in range(3)
+    ]
 )
 WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
@@ -93,7 +97,9 @@ class Columns:
         uncut = np.where(is_above[:, None, None], self.below[place], 0.0)
         is_cut = found == keys
         share = np.where(is_cut[:, None, None, None], self.corners[place], uncut[..., None])
-        return share, np.where(is_cut[:, None], self.squares[place], uncut.mean(axis=(1, 2))[:, None] / 12)
+        return share, np.where(
+            is_cut[:, None], self.squares[place], uncut.mean(axis=(1, 2))[:, None] / 12
+        )
 
 
 def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
@@ -186,10 +192,18 @@ def sampled_inside(surface: Surface, grid: Grid, cells: Indices) -> tuple[Rows, 
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     along = np.stack([1 - at, at]) / SAMPLES  # the two linear functions of an axis
     middles = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
-    shares, squares, step = np.empty((len(cells), 2, 2, 2)), np.empty((len(cells), 3)), max(1, CHUNK // len(middles))
+    shares, squares, step = (
+        np.empty((len(cells), 2, 2, 2)),
+        np.empty((len(cells), 3)),
+        max(1, CHUNK // len(middles)),
+    )
     for start in range(0, len(cells), step):
         points = grid.node_positions(cells[start : start + step, None, :] + middles).reshape(-1, 3)
         inside = is_inside(surface, points).reshape(-1, SAMPLES, SAMPLES, SAMPLES)
-        shares[start : start + step] = 8 * np.einsum("cxyz,ax,by,dz->cabd", inside, along, along, along)
-        squares[start : start + step] = inside.reshape(len(inside), -1) @ (middles - 0.5) ** 2 / len(middles)
+        shares[start : start + step] = 8 * np.einsum(
+            "cxyz,ax,by,dz->cabd", inside, along, along, along
+        )
+        squares[start : start + step] = (
+            inside.reshape(len(inside), -1) @ (middles - 0.5) ** 2 / len(middles)
+        )
     return shares, squares

@@ -104,7 +104,11 @@ class BodyGrids:
 
     def body_of(self, ijk: Indices) -> Indices:
         """Return the number (...,) of the body that grid indices (..., 3) are of."""
-        return (ijk[..., 0] // self.room).astype(np.int64) if self.room else np.zeros(ijk.shape[:-1], np.int64)
+        return (
+            (ijk[..., 0] // self.room).astype(np.int64)
+            if self.room
+            else np.zeros(ijk.shape[:-1], np.int64)
+        )
 
     def node_positions(self, ijk: Array) -> Positions:
         """Return the positions [m] of grid nodes (..., 3), or of what lies between nodes."""
@@ -113,7 +117,9 @@ class BodyGrids:
 
     def nearest_nodes(self, points: Positions, body: Indices) -> Indices:
         """Return the grid index (..., 3) of the nodes of bodies (...,) nearest to points (..., 3) [m]."""
-        nodes: Indices = np.rint((points - self._origins[body]) / self.cell_size).astype(np.int64) + self.first(body)
+        nodes: Indices = np.rint((points - self._origins[body]) / self.cell_size).astype(
+            np.int64
+        ) + self.first(body)
         return nodes
 
 
@@ -150,7 +156,11 @@ def _encode(ijk: Indices, keys: Indices) -> None:
 @njit()
 def _decode(keys: Indices, ijk: Indices) -> None:
     for n in range(len(keys)):
-        ijk[n, 0], ijk[n, 1], ijk[n, 2] = _gather(keys[n]), _gather(keys[n] >> 1), _gather(keys[n] >> 2)
+        ijk[n, 0], ijk[n, 1], ijk[n, 2] = (
+            _gather(keys[n]),
+            _gather(keys[n] >> 1),
+            _gather(keys[n] >> 2),
+        )
 
 
 def packed(ijk: Indices) -> Indices:

@@ -30,16 +30,22 @@ def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
         in_box: Mask = ((points >= low - edge) & (points <= high + edge)).all(axis=1)
         return in_box
     if region.sphere is not None:
-        distance = np.linalg.norm(points - (origin + np.array(region.sphere.center) * scale), axis=1)
+        distance = np.linalg.norm(
+            points - (origin + np.array(region.sphere.center) * scale), axis=1
+        )
         in_sphere: Mask = distance <= region.sphere.radius * length + edge
         return in_sphere
-    assert region.half_space is not None  # the schema has one, and those of the mesh are not asked for
+    assert (
+        region.half_space is not None
+    )  # the schema has one, and those of the mesh are not asked for
     point = origin + np.array(region.half_space.point) * scale
     beyond: Mask = (points - point) @ np.asarray(region.half_space.normal) >= -edge
     return beyond
 
 
-def inside_bodies(region: Region, points: Positions, bounds: Rows, body: Indices, meant: int | None) -> Mask:
+def inside_bodies(
+    region: Region, points: Positions, bounds: Rows, body: Indices, meant: int | None
+) -> Mask:
     """Return which points (n, 3) [m] of bodies lie in a region, (n,) bool.
 
     bounds : (b, 2, 3) each body's bounding box at rest [m]

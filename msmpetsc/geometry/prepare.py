@@ -252,7 +252,9 @@ def _depths(surface: Surface, patch: Indices) -> Indices:
     """Return in how many other patches (p,) each patch of triangles (f,) lies."""
     order = np.argsort(patch, kind="stable")
     ends = np.flatnonzero(np.diff(patch[order])) + 1
-    parts = [compact(surface.points, triangles) for triangles in np.split(surface.triangles[order], ends)]
+    parts = [
+        compact(surface.points, triangles) for triangles in np.split(surface.triangles[order], ends)
+    ]
     low, high = np.array([bounds_of(part) for part in parts]).swapaxes(0, 1)
     middles = surface.points[surface.triangles].mean(axis=1)
     depths = np.zeros(len(parts), np.int64)
@@ -275,7 +277,8 @@ def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
 
 
 STEPS: dict[str, Step] = {
-    step.__name__: step for step in (merge, largest_part, union, repair, simplify, refine, orient, rotate)
+    step.__name__: step
+    for step in (merge, largest_part, union, repair, simplify, refine, orient, rotate)
 }
 
 
@@ -290,7 +293,9 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
         raise InputError(f"prepare: '{name}': {error}") from error
     except Exception as error:  # what the libraries below raise on odd meshes is not documented
         if isinstance(error, ModuleNotFoundError) and (expected := as_expected(error)):
-            raise InputError(f"prepare: '{name}': {expected}") from error  # one line says which extra it needs
+            raise InputError(
+                f"prepare: '{name}': {expected}"
+            ) from error  # one line says which extra it needs
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():
@@ -306,10 +311,15 @@ def cached(step: Step, surface: Surface, *values: object) -> Surface:
     if len(surface.triangles) < LARGE or step is rotate:  # which moves groups, too
         return step(surface, *values)
     versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
-    digest = hashlib.sha256(Path(__file__).read_bytes() + repr((step.__name__, values, versions)).encode())
+    digest = hashlib.sha256(
+        Path(__file__).read_bytes() + repr((step.__name__, values, versions)).encode()
+    )
     digest.update(surface.points.tobytes() + surface.triangles.tobytes())
     path = Path(pooch.os_cache("msmpetsc"), "prepared", f"{digest.hexdigest()}.npz")
-    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile), np.load(path) as arrays:  # there, and whole
+    with (
+        suppress(OSError, ValueError, KeyError, EOFError, BadZipFile),
+        np.load(path) as arrays,
+    ):  # there, and whole
         return Surface(arrays["points"], arrays["triangles"])
     result = step(surface, *values)
     with suppress(OSError):  # a full disk, a home that cannot be written

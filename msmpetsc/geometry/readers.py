@@ -49,7 +49,9 @@ def read_surface(path: str | Path) -> Surface:
     except ModuleNotFoundError:  # a reader's package: says which extra brings it
         raise
     except MemoryError:
-        raise InputError(f"{path}: reading it takes more memory than {kind.upper()} of its size can need") from None
+        raise InputError(
+            f"{path}: reading it takes more memory than {kind.upper()} of its size can need"
+        ) from None
     except Exception as error:  # on garbage the readers raise whatever comes
         reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
@@ -115,7 +117,10 @@ def _silence() -> Iterator[None]:
 def _bounded_memory(most: int) -> Iterator[None]:
     """Raise MemoryError where this process takes ``most`` [byte] more: files may claim or pack more than they hold."""
     limits = resource.getrlimit(resource.RLIMIT_DATA)
-    bounds = [psutil.Process().memory_info().data + most, *(x for x in limits if x != resource.RLIM_INFINITY)]
+    bounds = [
+        psutil.Process().memory_info().data + most,
+        *(x for x in limits if x != resource.RLIM_INFINITY),
+    ]
     resource.setrlimit(resource.RLIMIT_DATA, (min(bounds), limits[1]))
     try:
         yield
@@ -218,7 +223,10 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
             if not node.startswith("geometry_"):  # trimesh's name of a part without a name
                 groups[node].append(part.faces + start)
             node, left = parents.get(node), left - 1
-    points, faces = ([np.zeros((0, 3)), *(getattr(part, name) for part in parts)] for name in ("vertices", "faces"))
+    points, faces = (
+        [np.zeros((0, 3)), *(getattr(part, name) for part in parts)]
+        for name in ("vertices", "faces")
+    )
     triangles = [own + start for own, start in zip(faces[1:], first, strict=True)]
     return (
         np.concatenate(points),

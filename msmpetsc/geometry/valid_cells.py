@@ -56,7 +56,9 @@ def _clip(polygon: Rows, n: int, axis: int, plane: float, side: float, out: Rows
 
 
 @njit()
-def clip_between(polygon: Rows, n: int, axis: int, planes: tuple[float, float], work: Rows, out: Rows) -> int:
+def clip_between(
+    polygon: Rows, n: int, axis: int, planes: tuple[float, float], work: Rows, out: Rows
+) -> int:
     """Clip a polygon to the layer between two planes of an axis; return its size."""
     m = _clip(polygon, n, axis, planes[0], 1.0, work)
     return _clip(work, m, axis, planes[1], -1.0, out)
@@ -176,7 +178,9 @@ def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) 
     pairs = np.concatenate(comm.allgather(pairs))
     names, ends = np.unique(np.append(pairs, [EXTERIOR]), return_inverse=True)
     ends = ends[:-1].reshape(-1, 2)
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(names), len(names)))
+    graph = coo_array(
+        (np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(names), len(names))
+    )
     component = connected_components(graph, directed=False)[1]
     outside = names[component == component[0]]  # names[0] is EXTERIOR
     return np.where(np.isin(label, outside), EXTERIOR, label)
@@ -218,7 +222,9 @@ def _links(cells: Indices, gaps: Indices, asked: Indices, side: Indices) -> Indi
     count = np.searchsorted(begins, last, side="right") - low
     others = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - low, count)
     keys = packed(cells)
-    columns = np.append(keys // LIMIT, -2 * LIMIT)  # the last is no column: that of a cell before all, or after
+    columns = np.append(
+        keys // LIMIT, -2 * LIMIT
+    )  # the last is no column: that of a cell before all, or after
     below = columns[np.searchsorted(keys, first, side="right") - 1]
     above = columns[np.searchsorted(keys, last)]
     past = (below != first // LIMIT) | (above != first // LIMIT)

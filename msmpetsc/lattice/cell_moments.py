@@ -29,7 +29,9 @@ from msmpetsc.lattice.cut_cells import CORNERS
 FORM = 13  # numbers of a cell's form: 2 c (3), 4 <xy>, <xz>, <yz>, then the modes' form of ``forms_of``
 SIGNS = 2.0 * CORNERS - 1
 PAIRS = ((0, 1), (0, 2), (1, 2))
-SUMS = np.stack([*SIGNS.T, *(SIGNS[:, i] * SIGNS[:, j] for i, j in PAIRS), SIGNS.prod(axis=1)])  # (7, 8) of the corners
+SUMS = np.stack(
+    [*SIGNS.T, *(SIGNS[:, i] * SIGNS[:, j] for i, j in PAIRS), SIGNS.prod(axis=1)]
+)  # (7, 8) of the corners
 WHOLE = np.array([*[0.0] * 6, *[2 / 3] * 3, *[0.0] * 3, 1 / 3])  # form of a whole cell
 
 
@@ -41,18 +43,24 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
     16 (C_xx C_yy + C_xx C_zz + C_yy C_zz).
     """
     volume = share.mean(axis=1, keepdims=True)
-    middle, products = (share @ sums.T / (8 * size * volume) for sums, size in ((SUMS[:3], 2), (SUMS[3:6], 4)))
+    middle, products = (
+        share @ sums.T / (8 * size * volume) for sums, size in ((SUMS[:3], 2), (SUMS[3:6], 4))
+    )
     covariance = np.zeros((len(share), 3, 3))
     for k in range(3):
         covariance[:, k, k] = squares[:, k] / volume[:, 0] - middle[:, k] ** 2
     for k, (i, j) in enumerate(PAIRS):
         covariance[:, i, j] = covariance[:, j, i] = products[:, k] - middle[:, i] * middle[:, j]
-    values, vectors = np.linalg.eigh(covariance)  # of bodies that overlap the shares are cut at 1: then it may be none
+    values, vectors = np.linalg.eigh(
+        covariance
+    )  # of bodies that overlap the shares are cut at 1: then it may be none
     covariance = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     x, y, z = covariance[:, range(3), range(3)].T
     coupled = 4 * np.stack([covariance[:, 1, 2], covariance[:, 0, 2], covariance[:, 0, 1]], axis=1)
     own = 4 * np.stack([x + y, x + z, y + z], axis=1)
-    return np.concatenate([2 * middle, 4 * products, own, coupled, 16 * (x * y + x * z + y * z)[:, None]], axis=1)
+    return np.concatenate(
+        [2 * middle, 4 * products, own, coupled, 16 * (x * y + x * z + y * z)[:, None]], axis=1
+    )
 
 
 def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:

@@ -16,12 +16,20 @@ from msmpetsc.backend.arrays import Rows
 from msmpetsc.lattice.material import CELLS_AROUND, ISOTROPIC
 
 # corners of a cell in VTK's hexahedron order, which is also the order in the file
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-KIND = ((CORNERS[:, None] - CORNERS) ** 2).sum(axis=2)  # (8, 8) of the spring between two corners; 0 of none
+CORNERS = np.array(
+    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+)
+KIND = ((CORNERS[:, None] - CORNERS) ** 2).sum(
+    axis=2
+)  # (8, 8) of the spring between two corners; 0 of none
 # (8, 8, 8): corners whose shares a spring has the mean of are those that agree with both ends where these agree
-MEANT = ((CORNERS[:, None, None] == CORNERS) | (CORNERS[:, None, None] != CORNERS[None, :, None])).all(axis=3)
+MEANT = (
+    (CORNERS[:, None, None] == CORNERS) | (CORNERS[:, None, None] != CORNERS[None, :, None])
+).all(axis=3)
 MEAN = MEANT / MEANT.sum(axis=2, keepdims=True)
-STRENGTH = np.where(KIND > 0, ISOTROPIC[KIND] / np.maximum(CELLS_AROUND[KIND], 1), 0.0)  # (8, 8) of a cell's springs
+STRENGTH = np.where(
+    KIND > 0, ISOTROPIC[KIND] / np.maximum(CELLS_AROUND[KIND], 1), 0.0
+)  # (8, 8) of a cell's springs
 
 
 def shares_of_pairs(share: Rows) -> Rows:
@@ -32,5 +40,7 @@ def shares_of_pairs(share: Rows) -> Rows:
 
 def shares_of_mass(of_pairs: Rows) -> Rows:
     """Return the share (c, 8) of an eighth of a whole cell's mass that each corner has, from the springs' (c, 8, 8)."""
-    of_mass: Rows = np.einsum("cab,ab->ca", of_pairs, STRENGTH, optimize=True) / STRENGTH.sum(axis=1)
+    of_mass: Rows = np.einsum("cab,ab->ca", of_pairs, STRENGTH, optimize=True) / STRENGTH.sum(
+        axis=1
+    )
     return of_mass

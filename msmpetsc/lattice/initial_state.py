@@ -10,7 +10,9 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.motion import Start, Twist
 
-InitialState = tuple[Positions, Rows]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
+InitialState = tuple[
+    Positions, Rows
+]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 
 
 def initial_state(

@@ -121,7 +121,10 @@ class Lattice:
 
 
 def build_lattice(
-    cages: Cages, material: Material, of_cells: MaterialOfCells | None = None, topology: "Topology | None" = None
+    cages: Cages,
+    material: Material,
+    of_cells: MaterialOfCells | None = None,
+    topology: "Topology | None" = None,
 ) -> Lattice:
     """Build masses and springs of valid cells, of boundary cells what is inside (cut_cells; collective).
 
@@ -135,7 +138,9 @@ def build_lattice(
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])
     law = (_of_solid if is_solid else _of_springs)(net, h, material, of_cells)
     grids = cages.grids
-    nodes_of_bodies = np.bincount(grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids))
+    nodes_of_bodies = np.bincount(
+        grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids)
+    )
     return Lattice(
         table=net.table,
         cell_size=h,
@@ -144,7 +149,9 @@ def build_lattice(
         mass=law.mass,
         cells=net.corners,
         cell_kind=cages.kind,
-        cell_share=np.ones(len(cages.kind)) if cages.share is None else cages.share.mean(axis=(1, 2, 3)),
+        cell_share=np.ones(len(cages.kind))
+        if cages.share is None
+        else cages.share.mean(axis=(1, 2, 3)),
         springs=net.springs,
         springs_owned=net.springs_owned,
         rest_length=h * np.sqrt(KIND[net.direction]),
@@ -197,7 +204,17 @@ def topology_of(cages: Cages) -> Topology:
     share = None if share is None else share[:, *CORNERS.T]
     squares = cages.of_cells(ijk[cells[:, 0]], cages.squares)
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *_springs(cells, numbers, owned))
+    return Topology(
+        table,
+        corners,
+        ijk,
+        octants,
+        ghosts,
+        cells,
+        share,
+        squares,
+        *_springs(cells, numbers, owned),
+    )
 
 
 class LawConstants(NamedTuple):
@@ -215,7 +232,9 @@ class LawConstants(NamedTuple):
     solid: SolidCells | None = None
 
 
-def _of_springs(net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None) -> LawConstants:
+def _of_springs(
+    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
+) -> LawConstants:
     """Return the constants of springs: of each the mean over the cells that share it."""
     if of_cells is None and net.share is None:
         mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
@@ -242,7 +261,9 @@ def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None
     return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
 
 
-def _of_solid(net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None) -> LawConstants:
+def _of_solid(
+    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
+) -> LawConstants:
     """Return the constants of a solid: as with springs each corner's mass goes as the diagonal of L."""
     owned, count, made_of = len(net.octants), len(net.cells), _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)

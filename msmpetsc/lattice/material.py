@@ -35,7 +35,9 @@ class CellMaterial:
 MaterialOfCells = Callable[[Indices], CellMaterial]  # by the grid index (c, 3) of cells
 
 
-def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: Indices, cells: Indices) -> Floats:
+def calibrated_stiffness(
+    young_modulus: float | Floats, cell_size: float, kind: Indices, cells: Indices
+) -> Floats:
     """Return the spring stiffness [N/m] of an isotropic lattice with Young's modulus E [Pa] at small strain.
 
     Assembled cell by cell, so a spring on the body's boundary has the weight of the cells it bounds.
@@ -45,7 +47,9 @@ def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: 
     kind          : (s,) squared length in cells
     cells         : (s,) number of valid cells that share the spring
     """
-    stiffness: Floats = edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
+    stiffness: Floats = (
+        edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
+    )
     return stiffness
 
 

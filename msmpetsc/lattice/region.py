@@ -78,14 +78,20 @@ class Finder:
         region = table.table.region
         if region.is_of_mesh:
             nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
-            where = around = self._of_mesh(table, nodes, lattice.nodes, lattice.body, are_nodes=True)
+            where = around = self._of_mesh(
+                table, nodes, lattice.nodes, lattice.body, are_nodes=True
+            )
         else:
             where = self.inside(table, points, lattice.body)
             around = self.inside(table, lattice.nodes, lattice.body)
             where = where | self._at_edge(table, lattice, around & ~where)
-        found, near = self.comm.allreduce(np.array([mask[: lattice.owned].sum() for mask in (where, around & ~where)]))
+        found, near = self.comm.allreduce(
+            np.array([mask[: lattice.owned].sum() for mask in (where, around & ~where)])
+        )
         if found == 0:
-            raise InputError(f"{table.key}.region holds no node of the lattice{self._beside(table)}")
+            raise InputError(
+                f"{table.key}.region holds no node of the lattice{self._beside(table)}"
+            )
         if found < near:
             log.warning(
                 "%s.region only grazes the body: it means %d nodes, not %d that stick out into it from beside it%s",
@@ -131,9 +137,13 @@ class Finder:
         bounds = self.bounds if table.body is None else self.bounds[[table.body]]
         body = _in_words(bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))
         region = table.table.region
-        return f": the body is {body}" + ("" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}")
+        return f": the body is {body}" + (
+            "" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}"
+        )
 
-    def _of_mesh(self, table: OfBody, ijk: Indices, points: Positions, body: Indices, are_nodes: bool) -> Mask:
+    def _of_mesh(
+        self, table: OfBody, ijk: Indices, points: Positions, body: Indices, are_nodes: bool
+    ) -> Mask:
         """Return which nodes or cells (n,) bool a region's points or group mean (collective).
 
         Of a group they are the nodes nearest to a point of its triangles, or the cells that these
@@ -149,7 +159,9 @@ class Finder:
             keys = encode_morton((cells[:, None] + CORNERS).reshape(-1, 3) if are_nodes else cells)
             return np.isin(encode_morton(ijk), keys)
         where = np.zeros(len(ijk), bool)
-        for number, group in groups_named(self.bodies, table.key + ".region", region.group, table.body).items():
+        for number, group in groups_named(
+            self.bodies, table.key + ".region", region.group, table.body
+        ).items():
             grid = grids.grids[number]
             # a node is nearest to all points of the cell about it
             corners = grid.to_cells(group.points)[group.triangles] + are_nodes / 2
@@ -167,7 +179,10 @@ class Finder:
 
         def cells() -> Indices:
             assert surface is not None  # it is on rank 0, which alone is asked
-            points, numbers = surface.points, np.array(self._numbers(key, table.table.region.painted))
+            points, numbers = (
+                surface.points,
+                np.array(self._numbers(key, table.table.region.painted)),
+            )
             if numbers.max() >= len(points):
                 raise InputError(
                     f"{key}.region.painted: there is no point {numbers.max()}: the surface has {len(points)}"
@@ -186,11 +201,15 @@ class Finder:
             if path.is_file():
                 numbers = [int(word) for word in path.read_text().split()]
         if not numbers or not 0 <= min(numbers) <= max(numbers) < 2**63:
-            raise InputError(f"{key}.region.painted: {path} must be a file of point numbers, from 0")
+            raise InputError(
+                f"{key}.region.painted: {path} must be a file of point numbers, from 0"
+            )
         return numbers
 
 
-def groups_named(bodies: Sequence[BodySurface], key: str, name: str, number: int | None = None) -> dict[int, Surface]:
+def groups_named(
+    bodies: Sequence[BodySurface], key: str, name: str, number: int | None = None
+) -> dict[int, Surface]:
     """Return the triangles that meshes name, by the numbers of their bodies (collective).
 
     number : of the only body that is asked; None: all
@@ -199,12 +218,18 @@ def groups_named(bodies: Sequence[BodySurface], key: str, name: str, number: int
     """
 
     def found() -> dict[int, Surface]:
-        asked = {n: body.surface.groups for n, body in enumerate(bodies) if body.surface and number in (None, n)}
+        asked = {
+            n: body.surface.groups
+            for n, body in enumerate(bodies)
+            if body.surface and number in (None, n)
+        }
         named = {n: groups[name] for n, groups in asked.items() if name in groups}
         if not named:
             names = list(dict.fromkeys(chain.from_iterable(asked.values())))
             has = f"it has {listed(names)}" if names else "it names none"
-            raise InputError(f"{key}.group: the mesh has no group {name!r}{did_you_mean(name, names)}: {has}")
+            raise InputError(
+                f"{key}.group: the mesh has no group {name!r}{did_you_mean(name, names)}: {has}"
+            )
         return named
 
     groups: dict[int, Surface] = bodies[0].comm.bcast(on_root(bodies[0].comm, found))
@@ -214,7 +239,9 @@ def groups_named(bodies: Sequence[BodySurface], key: str, name: str, number: int
 def listed(names: Sequence[str]) -> str:
     """Return names in printable characters, the first of many."""
     more = len(names) - MOST_LISTED
-    return ", ".join(printable(name, 60) for name in names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
+    return ", ".join(printable(name, 60) for name in names[:MOST_LISTED]) + (
+        f" and {more} more" if more > 0 else ""
+    )
 
 
 def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list[Sequence[float]]:
@@ -232,9 +259,13 @@ def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list
 
         group = next(iter(groups_named(bodies, f"output.probe.{number}", probe.group).values()))
         corners = group.points[group.triangles]
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        areas = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
         middle = np.average(corners.mean(axis=1), axis=0, weights=areas)
-        points.append(igl.point_mesh_squared_distance(middle[None], group.points, group.triangles)[2][0])
+        points.append(
+            igl.point_mesh_squared_distance(middle[None], group.points, group.triangles)[2][0]
+        )
     return points
 
 
@@ -255,9 +286,14 @@ def _extent(region: Region, bounds: Rows) -> str:
     if region.box is not None:
         return _in_words(*(origin + np.array(region.box) * scale))
     if region.sphere is not None:
-        center, reach = origin + np.array(region.sphere.center) * scale, region.sphere.radius * length
+        center, reach = (
+            origin + np.array(region.sphere.center) * scale,
+            region.sphere.radius * length,
+        )
         return _in_words(center - reach, center + reach)
-    assert region.half_space is not None  # the schema has one, and those of the mesh are not asked for
+    assert (
+        region.half_space is not None
+    )  # the schema has one, and those of the mesh are not asked for
     point, normal = origin + np.array(region.half_space.point) * scale, region.half_space.normal
     at, along = (", ".join(f"{x:.4g}" for x in vector) for vector in (point, normal))
     return f"beyond ({at}) m towards ({along})"
@@ -268,7 +304,11 @@ def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
 
     It is None where all cells are of the same material.
     """
-    material, parts, bodies = scene.material, list(scene.tables("part")), [body.material for body in scene.body]
+    material, parts, bodies = (
+        scene.material,
+        list(scene.tables("part")),
+        [body.material for body in scene.body],
+    )
     if not parts and not any(bodies):
         return None
     (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)
@@ -282,7 +322,11 @@ def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
         cells = CellMaterial(density[body], stiffness[body], poisson[body])
         for part in parts:
             where, own = finder.find_cells(part, ijk), part.table
-            for values, name in ((cells.density, "density"), (cells.spring, spring), (cells.poisson, "poisson_ratio")):
+            for values, name in (
+                (cells.density, "density"),
+                (cells.spring, spring),
+                (cells.poisson, "poisson_ratio"),
+            ):
                 if getattr(own, name) is not None:
                     values[where] = getattr(own, name)
         return cells
@@ -310,14 +354,20 @@ class ProbePoints:
             place = (np.array(point) - low) / lattice.cell_size
             around = np.flatnonzero(((place >= -SAME) & (place <= 1 + SAME)).all(axis=1))
             own = int(numbers[around].min(initial=lattice.table.total))
-            first = comm.allreduce(own, MPI.MIN)  # of several cells on a face, or of bodies in one place
+            first = comm.allreduce(
+                own, MPI.MIN
+            )  # of several cells on a face, or of bodies in one place
             if first == lattice.table.total:
                 place_text = ", ".join(f"{x:g}" for x in point)
-                raise InputError(f"output.probe.{row}.point: ({place_text}) m lies in no cell of the body at rest")
+                raise InputError(
+                    f"output.probe.{row}.point: ({place_text}) m lies in no cell of the body at rest"
+                )
             if own == first:
                 cell = around[np.argmin(numbers[around])]
                 self.corners[row] = cells[cell]
-                self.weights[row] = np.where(CORNERS == 1, place[cell], 1 - place[cell]).prod(axis=1)
+                self.weights[row] = np.where(CORNERS == 1, place[cell], 1 - place[cell]).prod(
+                    axis=1
+                )
 
     def __call__(self, q: Positions) -> Rows:
         """Return where the points are (w, 3) [m] with nodes at q (l, 3) [m] (collective)."""

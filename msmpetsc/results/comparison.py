@@ -90,7 +90,9 @@ def compare(a: Result, b: Result) -> Comparison:
     for name, (greatest, worst, _) in distances.items():
         errors = np.where(greatest == 0, 0.0, greatest / scales[name])
         fields.append(FieldError(name, a.frames[name].unit, scales[name], errors, worst))
-    return Comparison(pairs, times[pairs[:, 0]], fields, [name for name in either if name not in chosen])
+    return Comparison(
+        pairs, times[pairs[:, 0]], fields, [name for name in either if name not in chosen]
+    )
 
 
 def rest_of(run: Result, name: str) -> Positions | None:
@@ -106,14 +108,21 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
     """
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
-        raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
+        raise InputError(
+            f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}"
+        )
     rest = rest_of(a, name)
-    digits = max(float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0 for rows in (a_rows, b_rows))
+    digits = max(
+        float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0
+        for rows in (a_rows, b_rows)
+    )
     greatest = np.empty(len(pairs))
     worst = np.empty(len(pairs), int)
     size = 0.0
     for number, (a_frame, b_frame) in enumerate(pairs):
-        a_values, b_values = (np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame]))
+        a_values, b_values = (
+            np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame])
+        )
         apart = _row_lengths(difference(a_values, b_values, digits))
         worst[number] = np.argmax(apart) if apart.size else 0
         greatest[number] = apart[worst[number]] if apart.size else 0.0
@@ -141,7 +150,9 @@ def _row_lengths(rows: Array) -> Floats:
     return np.ravel(np.linalg.norm(rows, axis=-1))
 
 
-def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:
+def _scales(
+    a: Result, b: Result, distances: dict[str, Distances], pairs: Indices
+) -> dict[str, float]:
     """Return the scale of each field, by which its errors are divided."""
     scales = {name: size for name, (_, _, size) in distances.items()}
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
@@ -149,7 +160,9 @@ def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indice
     if all(name in a.lattice and len(a.lattice[name]) for name in ("stiffness", "rest_length")):
         longest = a.lattice.rest_length[:].max()
         least = float(0.5 * a.lattice.stiffness[:].max() * (LEAST_STRAIN * longest) ** 2)
-    energy, kinetic = (max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"]))
+    energy, kinetic = (
+        max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"])
+    )
     for name in scales:
         if name in ENERGIES:
             scales[name] = energy
@@ -169,7 +182,12 @@ def longest_side(points: Positions, body: Indices) -> float:
 def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> float:
     """Return the largest size of the named energies at the compared frames of both results."""
     runs = (a, pairs[:, 0]), (b, pairs[:, 1])
-    energies = [(name, run.frames[name][frames]) for run, frames in runs for name in names if name in run.frames]
+    energies = [
+        (name, run.frames[name][frames])
+        for run, frames in runs
+        for name in names
+        if name in run.frames
+    ]
     # the potential energy's zero means nothing
     values = [energy - energy[0] if name == "potential" else energy for name, energy in energies]
     sizes = np.abs(np.concatenate([np.empty(0), *values]))
@@ -192,7 +210,9 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
     nodes, b_nodes = a.lattice.nodes[:], b.lattice.nodes[:]
     sizes = cell_size(a, nodes), cell_size(b, b_nodes)
     if len(nodes) != len(b_nodes):
-        refuse(f"{len(nodes)} and {len(b_nodes)} nodes, cells of {sizes[0]:.4g} m and {sizes[1]:.4g} m")
+        refuse(
+            f"{len(nodes)} and {len(b_nodes)} nodes, cells of {sizes[0]:.4g} m and {sizes[1]:.4g} m"
+        )
     if abs(sizes[0] - sizes[1]) > SAME_POINT * sizes[0]:
         refuse(f"cells of {sizes[0]:.6g} m and {sizes[1]:.6g} m")
     if where := first_apart(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0)):
@@ -231,7 +251,9 @@ def common_times(a: Floats, b: Floats) -> Indices:
     return np.column_stack([np.nonzero(same)[0], near[same]])
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what overflows is far apart, and is reported as that
+@np.errstate(
+    over="ignore", invalid="ignore"
+)  # what overflows is far apart, and is reported as that
 def compare_surfaces(run: Result, reference: Result) -> Comparison:
     """Return the distances between the surfaces of a result and its reference, at the times that both have.
 
@@ -246,7 +268,9 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
     if reference.scene.get("time", {}).get("integrator") == "static":
-        pairs = pairs[times[pairs[:, 0]] > 0]  # when it is in its rest shape, which is no state of equilibrium
+        pairs = pairs[
+            times[pairs[:, 0]] > 0
+        ]  # when it is in its rest shape, which is no state of equilibrium
     if not len(pairs):
         raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
     worst = np.empty(len(pairs), int)

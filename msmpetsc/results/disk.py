@@ -14,8 +14,12 @@ from typing import Any
 
 from msmpetsc.errors import InputError, one_line
 
-PARTS = count()  # numbers of parts: several threads write, and USD remembers the name of what failed
-LONGEST_STEM = 50  # letters of a name that its part keeps: with more it could be too long for the file system
+PARTS = (
+    count()
+)  # numbers of parts: several threads write, and USD remembers the name of what failed
+LONGEST_STEM = (
+    50  # letters of a name that its part keeps: with more it could be too long for the file system
+)
 
 
 @contextmanager
@@ -29,7 +33,9 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises InputError, with the path and the system's reason in one line.
     """
     real = Path(os.path.realpath(path))
-    part = real.with_name(f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PARTS)}.part{real.suffix}")
+    part = real.with_name(
+        f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PARTS)}.part{real.suffix}"
+    )
     try:
         with plain_errors(path):
             refuse_no_file(path)
@@ -104,7 +110,9 @@ class Lock:
         """Take the lock. Raises InputError where another run has it."""
         self.path = path.with_name(f".{path.name}.lock")
         while True:
-            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+            self._file = os.open(
+                self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666
+            )
             try:
                 fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
@@ -115,7 +123,9 @@ class Lock:
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
                     return
-            os.close(self._file)  # who had it took its name away meanwhile: another run may have locked a new one
+            os.close(
+                self._file
+            )  # who had it took its name away meanwhile: another run may have locked a new one
 
     def free(self) -> None:
         """Free the lock and remove its file."""
@@ -140,7 +150,9 @@ def refuse_small_disk(path: Path, planned: int) -> None:
     free = shutil.disk_usage(path.parent).free
     needed = planned - (path.stat().st_blocks * 512 if path.exists() else 0)
     if needed > free:
-        raise InputError(f"{path} will need {needed / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
+        raise InputError(
+            f"{path} will need {needed / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there"
+        )
 
 
 @contextmanager

@@ -12,7 +12,9 @@ def frames_in(text: str) -> Frames:
     try:
         return [_slice(part) if ":" in part else int(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"--frames takes numbers like 0,10,20 or slices like 0:250:5, not {text!r}") from None
+        raise InputError(
+            f"--frames takes numbers like 0,10,20 or slices like 0:250:5, not {text!r}"
+        ) from None
 
 
 def _slice(text: str) -> slice:

@@ -77,17 +77,23 @@ class Layout:
         for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: of_ranks(item[0])):
             if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
                 continue
-            shape = tuple(size if isinstance(size, int) else counts[name] for size in about.shape[1:])
+            shape = tuple(
+                size if isinstance(size, int) else counts[name] for size in about.shape[1:]
+            )
             if of_ranks(name):
                 yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
             else:
-                yield Plan(f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype)
+                yield Plan(
+                    f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype
+                )
         # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
         # file before noting its new length; killed in between, it could not be opened.)
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)
         if self.numbers:
             count = len(self.numbers)
-            yield Plan("checkpoint/numbers", (2, count), (1, count), FIELDS["checkpoint/numbers"].dtype)
+            yield Plan(
+                "checkpoint/numbers", (2, count), (1, count), FIELDS["checkpoint/numbers"].dtype
+            )
         for name, shape in self.rows.items():
             yield _rows_plan(f"checkpoint/{name}", 2, self.nodes, shape, "f8")
 
@@ -113,7 +119,11 @@ class Layout:
         """Return the name of the first dataset that a file lacks, or has in another shape or with other names."""
         for plan in self.plans():
             dataset = file.get(plan.name)
-            if dataset is None or dataset.shape != plan.shape or dataset.dtype != np.dtype(plan.dtype):
+            if (
+                dataset is None
+                or dataset.shape != plan.shape
+                or dataset.dtype != np.dtype(plan.dtype)
+            ):
                 return plan.name
         names = file["checkpoint/numbers"].attrs["names"] if self.numbers else ""
         return None if names == " ".join(self.numbers) else "checkpoint/numbers"
@@ -148,7 +158,9 @@ def _name_axes(frames: h5py.Group, name: str) -> None:
 
     By these netCDF's readers name the axes.
     """
-    for axis, (symbol, size) in enumerate(zip(FRAME_FIELDS[name].shape, frames[name].shape, strict=True)):
+    for axis, (symbol, size) in enumerate(
+        zip(FRAME_FIELDS[name].shape, frames[name].shape, strict=True)
+    ):
         dimension = DIMENSIONS[symbol]
         if dimension == name:
             frames[name].make_scale(name)
@@ -177,7 +189,9 @@ def pieces(rows: Array, counts: Sequence[int]) -> Iterator[tuple[int, slice, sli
         start += count
 
 
-def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[slice, Array], None]) -> None:
+def gather_rows(
+    comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[slice, Array], None]
+) -> None:
     """Call store(part, piece) on rank 0 for the rows of all ranks, in order (collective).
 
     rows   : (counts[rank], ...) this rank's, contiguous
@@ -202,7 +216,9 @@ def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Calla
         raise failure
 
 
-def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Callable[[slice], Any]) -> Exception | None:
+def scatter_rows(
+    comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Callable[[slice], Any]
+) -> Exception | None:
     """Fill each rank's rows with load(part) of rank 0, and return an error of reading there (collective).
 
     rows   : (counts[rank], ...) this rank's, to be filled
@@ -246,7 +262,9 @@ def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
     """Return the byte offsets in the file of the chunks of dataset[index], in the order of its rows."""
     starts = range(0, dataset.shape[1], dataset.chunks[1])
     rest = (0,) * (dataset.ndim - 2)
-    return [dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts]
+    return [
+        dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts
+    ]
 
 
 def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequence[int]) -> None:

@@ -48,7 +48,9 @@ class Progress:
         if self._bar is None:  # whose rate counts from the first frame of a run that goes on
             bar = tqdm_logging_redirect(initial=frame.index, loggers=[log], **self._style)
             self._bar = self._shown.enter_context(bar)
-        self._bar.set_postfix_str(f"its {frame.ksp_its}  error {frame.step_error:.1e}", refresh=False)
+        self._bar.set_postfix_str(
+            f"its {frame.ksp_its}  error {frame.step_error:.1e}", refresh=False
+        )
         self._bar.update(frame.index - self._bar.n)
 
     def close(self) -> None:

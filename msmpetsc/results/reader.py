@@ -91,9 +91,13 @@ class LazyArray:
                 rows = np.arange(len(self))[first]
             values: Array = self._dataset[(rows, *rest)]
         except (TypeError, ValueError) as error:
-            raise IndexError(f"{self.name} cannot be indexed with {key!r}: {one_line(error)}") from error
+            raise IndexError(
+                f"{self.name} cannot be indexed with {key!r}: {one_line(error)}"
+            ) from error
         except (OSError, RuntimeError, MemoryError) as error:
-            raise InputError(f"{self._file}: {self.name} cannot be read: {one_line(error)}") from error
+            raise InputError(
+                f"{self._file}: {self.name} cannot be read: {one_line(error)}"
+            ) from error
         return values
 
 
@@ -106,7 +110,9 @@ class Arrays(dict[str, LazyArray]):
 
     def __getattr__(self, name: str) -> LazyArray:
         if name not in self:
-            raise AttributeError(f"no {self._group}/{name} in this file, but {', '.join(self) or 'nothing'}")
+            raise AttributeError(
+                f"no {self._group}/{name} in this file, but {', '.join(self) or 'nothing'}"
+            )
         return self[name]
 
     def __dir__(self) -> list[str]:
@@ -138,19 +144,30 @@ class Result:
         self.file = open_result(path)
         try:
             with plain_damage(self.path):
-                self.attributes = {name: as_python(value) for name, value in self.file.attrs.items()}
+                self.attributes = {
+                    name: as_python(value) for name, value in self.file.attrs.items()
+                }
                 rows = {"frames": finished(self.file)}
                 datasets = checked_datasets(self.file).items()
-                self._datasets = {name: LazyArray(data, rows.get(name.partition("/")[0])) for name, data in datasets}
+                self._datasets = {
+                    name: LazyArray(data, rows.get(name.partition("/")[0]))
+                    for name, data in datasets
+                }
         except BaseException:
             self.close()
             raise
-        self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
+        self.lattice, self.surface, self._embedding = map(
+            self._group, ("lattice", "surface", "embedding")
+        )
         self.frames = Frames("frames", self._group("frames"))
 
     def _group(self, group: str) -> Arrays:
         start = f"{group}/"
-        arrays = {name.removeprefix(start): array for name, array in self._datasets.items() if name.startswith(start)}
+        arrays = {
+            name.removeprefix(start): array
+            for name, array in self._datasets.items()
+            if name.startswith(start)
+        }
         return Arrays(group, arrays)
 
     def __enter__(self) -> "Result":
@@ -183,7 +200,9 @@ class Result:
         rows, count = self[name][:].astype(np.int64), len(self[NAMED[name]])
         plural = NAMED[name].partition("/")[2]
         if rows.size and not 0 <= rows.min() <= rows.max() < count:
-            raise InputError(f"{self.path} is damaged: {name} names what is not among its {count} {plural}")
+            raise InputError(
+                f"{self.path} is damaged: {name} names what is not among its {count} {plural}"
+            )
         return rows
 
     def surface_at(self, frame: int) -> Positions:
@@ -223,14 +242,18 @@ class Result:
         except ValueError as error:
             raise InputError(f"{self.path}: embedding is no matrix: {one_line(error)}") from error
         if "points" in self.surface and W.shape[0] != len(self.surface.points):
-            raise InputError(f"{self.path}: embedding has {W.shape[0]} rows for {len(self.surface.points)} points")
+            raise InputError(
+                f"{self.path}: embedding has {W.shape[0]} rows for {len(self.surface.points)} points"
+            )
         return W
 
     def body_of(self, group: str) -> Indices:
         """Return the number of the body of each node ("lattice", (n,)) or surface point ("surface", (v,))."""
         if f"{group}/body" in self:
             return self[f"{group}/body"][:].astype(np.int64)
-        return np.zeros(len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64)
+        return np.zeros(
+            len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64
+        )
 
 
 def open_result(path: str | Path) -> h5py.File:
@@ -304,10 +327,14 @@ def newest_slot(steps: Indices) -> int | None:
 def _check_is_result(path: Path, file: h5py.File) -> None:
     name, version = (as_python(file.attrs.get(key)) for key in ("format", "format_version"))
     if not (isinstance(name, str) and name == FORMAT):
-        raise InputError(f"{path} is not a result of msmpetsc run (format_version {FORMAT_VERSION})")
+        raise InputError(
+            f"{path} is not a result of msmpetsc run (format_version {FORMAT_VERSION})"
+        )
     if not (isinstance(version, int) and version == FORMAT_VERSION):
         version = printable(str(version), 20)
-        raise InputError(f"{path} is a result of format_version {version}; {FORMAT_VERSION} is read here")
+        raise InputError(
+            f"{path} is a result of format_version {version}; {FORMAT_VERSION} is read here"
+        )
     if not isinstance(object_at(path, file, "frames"), h5py.Group):
         raise InputError(f"{path} is not a result of msmpetsc run: it has no frames")
     checked_dataset(path, file, "frames/time")
@@ -321,8 +348,18 @@ def plain_damage(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except KeyError as error:
-        raise InputError(f"{path} is damaged: it has no {printable(str(error.args[0]), 40)}") from error
-    except (OSError, RuntimeError, ValueError, TypeError, IndexError, OverflowError, MemoryError) as error:
+        raise InputError(
+            f"{path} is damaged: it has no {printable(str(error.args[0]), 40)}"
+        ) from error
+    except (
+        OSError,
+        RuntimeError,
+        ValueError,
+        TypeError,
+        IndexError,
+        OverflowError,
+        MemoryError,
+    ) as error:
         raise InputError(f"{path} is damaged or cut short: {one_line(error)}") from error
 
 
@@ -356,7 +393,9 @@ def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> N
                 known = sizes.setdefault(symbol, size) if isinstance(symbol, str) else symbol
                 wrong = f"{known} are expected" if size != known else ""
             if wrong:
-                raise InputError(f"{path} is damaged: {name} is {size} long along axis {axis}, and {wrong}")
+                raise InputError(
+                    f"{path} is damaged: {name} is {size} long along axis {axis}, and {wrong}"
+                )
 
 
 def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
@@ -377,7 +416,9 @@ def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     dataset = object_at(path, file, name)
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{path} is damaged: it has no dataset {name}")
-    if dataset.is_virtual or dataset.external:  # to be asked before its shape, which HDF5 may look up there
+    if (
+        dataset.is_virtual or dataset.external
+    ):  # to be asked before its shape, which HDF5 may look up there
         raise InputError(f"{path}: {name} is kept in another file, which is not opened")
     field = FIELDS.get(name)
     kinds = "f" if field is None or field.dtype.startswith("f") else "iu"
@@ -389,5 +430,7 @@ def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     most = max(dataset.size, math.prod(dataset.chunks or ()))  # a packed chunk is read whole
     claimed = most * dataset.dtype.itemsize
     if claimed > file.id.get_filesize() * (DEFLATE_MOST if dataset.compression else 1):
-        raise InputError(f"{path} is damaged: {name} claims {rows} numbers, more than the file holds")
+        raise InputError(
+            f"{path} is damaged: {name} claims {rows} numbers, more than the file holds"
+        )
     return dataset

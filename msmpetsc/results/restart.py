@@ -44,7 +44,9 @@ class Earlier:
     def read(cls, path: Path) -> "Earlier":
         """Read the earlier run on one rank. Raises InputError for no result, or a damaged one."""
         with Result(path) as result:  # which checks it
-            texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
+            texts = {
+                name: value for name, value in result.attributes.items() if isinstance(value, str)
+            }
             true_error = result.attributes.get("true_error")
             count, planned = len(result.frames.time), result.frames.time.planned[0]
             newest = _newest(result)
@@ -75,7 +77,9 @@ def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
         with plain_damage(run.path):
             names = str(as_python(run.file["checkpoint/numbers"].attrs.get("names", ""))).split()
     if len(names) != len(values):
-        raise InputError(f"{run.path} is damaged: checkpoint/numbers has {len(values)} numbers of {len(names)} names")
+        raise InputError(
+            f"{run.path} is damaged: checkpoint/numbers has {len(values)} numbers of {len(names)} names"
+        )
     numbers = dict(zip(names, values.tolist(), strict=True))
     rows = [name for name in stored if name not in ("step", "numbers")]
     return slot, Checkpoint(int(steps[slot]), numbers=numbers), rows
@@ -87,11 +91,18 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
     owned : nodes of this rank; the ranks' follow each other
     """
     with opened_on_root(comm, path) as run:
-        newest: tuple[int, Checkpoint, list[str]] | None = comm.bcast(on_root(comm, lambda: _newest(run)))
+        newest: tuple[int, Checkpoint, list[str]] | None = comm.bcast(
+            on_root(comm, lambda: _newest(run))
+        )
         if newest is None:
             return None
         slot, empty, names = newest
-        return replace(empty, rows={name: _own_rows(comm, run, (f"checkpoint/{name}", slot), owned) for name in names})
+        return replace(
+            empty,
+            rows={
+                name: _own_rows(comm, run, (f"checkpoint/{name}", slot), owned) for name in names
+            },
+        )
 
 
 def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
@@ -110,7 +121,9 @@ def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
         moved = np.abs(frame - run.frames.position[number - 1]).max() if number else 0.0
         size = np.ptp(run.lattice.nodes[:], axis=0).max()
     far, step = (np.abs(a - b).max(axis=1) for a, b in ((q, frame), (q, q_previous)))
-    most, usual = (size + moved, NEAR * size + moved) if is_frame else (FARTHEST * size, FARTHEST * size)
+    most, usual = (
+        (size + moved, NEAR * size + moved) if is_frame else (FARTHEST * size, FARTHEST * size)
+    )
     in_step = most if number else FARTHEST * size  # a body may start fast
     if not (far.max() <= most and np.median(far) <= usual and step.max() <= in_step):
         raise InputError(
@@ -125,7 +138,9 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
     lattice : this rank's rows by dataset, "lattice/nodes"
     """
     with opened_on_root(comm, path) as run:
-        counts = comm.bcast(on_root(comm, lambda: {name: len(run[name]) for name in lattice if name in run}))
+        counts = comm.bcast(
+            on_root(comm, lambda: {name: len(run[name]) for name in lattice if name in run})
+        )
         for name, count in (counts or {}).items():
             rows = lattice[name]
             same = count == comm.allreduce(len(rows))
@@ -135,7 +150,9 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
                 agree = rows_agree(np.asarray(rows, float), stored, SAME * greatest).all()
                 same = all(comm.allgather(bool(agree)))
             if not same:
-                raise InputError(f"{path}: the mesh has changed: {name} is not what this run makes of it")
+                raise InputError(
+                    f"{path}: the mesh has changed: {name} is not what this run makes of it"
+                )
 
 
 @contextmanager
@@ -149,7 +166,9 @@ def _own_rows(comm: MPI.Comm, run: Any, place: tuple[str] | tuple[str, int], cou
     """Return this rank's `count` rows of a dataset, or of one of its slots (collective)."""
     name, *index = place
     counts = comm.allgather(count)
-    dtype, shape = comm.bcast(on_root(comm, lambda: (run[name].dtype, run[name].shape[1 + len(index) :])))
+    dtype, shape = comm.bcast(
+        on_root(comm, lambda: (run[name].dtype, run[name].shape[1 + len(index) :]))
+    )
     own = np.empty((count, *shape), dtype)
     failure = scatter_rows(comm, own, counts, lambda part: run[name][(*index, part)])
     with together(comm):

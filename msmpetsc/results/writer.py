@@ -44,9 +44,18 @@ from msmpetsc.results.layout import (
     open_to_write,
     write_bytes,
 )
-from msmpetsc.results.reader import FORMAT, FORMAT_VERSION, Result, checked_dataset, finished, open_result
+from msmpetsc.results.reader import (
+    FORMAT,
+    FORMAT_VERSION,
+    Result,
+    checked_dataset,
+    finished,
+    open_result,
+)
 
-NOTHING = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))  # what ranks but the first have of surfaces
+NOTHING = Surface(
+    np.empty((0, 3)), np.empty((0, 3), np.int64)
+)  # what ranks but the first have of surfaces
 
 
 class Begin(Enum):
@@ -87,13 +96,21 @@ class ResultFile:
         self._comm, self._begin, self._gathers = comm, begin, gathers
         self._file: h5py.File | None = None  # open on rank 0 only
         self._storage: Storage | None = None  # that it is written to
-        self._numbers: dict[str, h5py.Dataset] = {}  # datasets of one number a frame, once it has frames
-        self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
-        self._opened = ExitStack()  # on rank 0 the lock, the temporary name and the storage, until they are given up
+        self._numbers: dict[
+            str, h5py.Dataset
+        ] = {}  # datasets of one number a frame, once it has frames
+        self._direct: int | None = (
+            None  # descriptor of the same file on each rank, once it has its name
+        )
+        self._opened = (
+            ExitStack()
+        )  # on rank 0 the lock, the temporary name and the storage, until they are given up
         self._copied: int | None = None  # most frames to take over, all if None
         self._rows: dict[str, list[int]] = {}  # fields that ranks have rows of: how many each has
         self._failed = False  # to write
-        self._passing: dict[Path, int] = {}  # inodes of files that last no longer than the run, by name
+        self._passing: dict[
+            Path, int
+        ] = {}  # inodes of files that last no longer than the run, by name
         with self._together():
             if comm.rank == 0:
                 self._open(attributes)
@@ -102,7 +119,9 @@ class ResultFile:
     def __enter__(self) -> "ResultFile":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: object
+    ) -> None:
         if kind is None:
             self.close()
         else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
@@ -139,7 +158,11 @@ class ResultFile:
         self._copied = frames
 
     def start_frames(
-        self, count: int, nodes: int, also: Mapping[str, int] | None = None, saved: Checkpoint | None = None
+        self,
+        count: int,
+        nodes: int,
+        also: Mapping[str, int] | None = None,
+        saved: Checkpoint | None = None,
     ) -> None:
         """Plan the frames and checkpoints, and give the file its name.
 
@@ -151,7 +174,9 @@ class ResultFile:
         given = self._comm.allgather({"position": nodes, **(also or {})})
         counts = {name: [rank[name] for rank in given] for name in given[0]}
         self._rows = {name: counts[name] for name in counts if of_ranks(name)}
-        sizes = {name: sum(rows) if name in self._rows else rows[0] for name, rows in counts.items()}
+        sizes = {
+            name: sum(rows) if name in self._rows else rows[0] for name, rows in counts.items()
+        }
         rows: dict[str, tuple[int, ...]] = {"q": (3,), "q_previous": (3,)}
         if saved:
             rows |= {name: values.shape[1:] for name, values in saved.rows.items()}
@@ -181,7 +206,13 @@ class ResultFile:
         """Store the next frame, so that no kill can lose it once this returns."""
         index = self.finished
         for name, counts in self._rows.items():
-            self._collect(getattr(frame, name), np.dtype(FRAME_FIELDS[name].dtype), counts, f"frames/{name}", index)
+            self._collect(
+                getattr(frame, name),
+                np.dtype(FRAME_FIELDS[name].dtype),
+                counts,
+                f"frames/{name}",
+                index,
+            )
         with self._together():
             if self._file is not None:
                 for name, numbers in self._numbers.items():
@@ -201,11 +232,15 @@ class ResultFile:
                 self._flush(self._file)
         slot = self._comm.bcast(slot)
         for name, values in saved.rows.items():
-            self._collect(values, np.dtype("f8"), self._rows["position"], f"checkpoint/{name}", slot)
+            self._collect(
+                values, np.dtype("f8"), self._rows["position"], f"checkpoint/{name}", slot
+            )
         with self._together():
             if self._file is not None:
                 if saved.numbers:
-                    self._file["checkpoint/numbers"][slot] = [float(value) for value in saved.numbers.values()]
+                    self._file["checkpoint/numbers"][slot] = [
+                        float(value) for value in saved.numbers.values()
+                    ]
                 self._flush(self._file)
                 self._file["checkpoint/step"][slot] = saved.step
                 self._flush(self._file)
@@ -237,7 +272,9 @@ class ResultFile:
             else:
                 self._storage = Storage(self._part, "w+")
                 self._file = open_to_write(self._storage, "w")
-                self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
+                self._file.attrs.update(
+                    attributes | {"format": FORMAT, "format_version": FORMAT_VERSION}
+                )
                 self._passing[self._part] = self._part.stat().st_ino
             opened.callback(self._storage.close)
             self._passing[lock.path] = lock.inode
@@ -257,7 +294,9 @@ class ResultFile:
     def _lay_out(self, file: h5py.File, layout: Layout) -> None:
         if self._begin is Begin.IN_PLACE:
             if name := layout.first_misfit(file):
-                raise InputError(f"{self.path} has no room for {name} as it is now: --force writes the file anew")
+                raise InputError(
+                    f"{self.path} has no room for {name} as it is now: --force writes the file anew"
+                )
             refuse_small_disk(self.path, self.path.stat().st_size)
             self.finished = finished(file)
             return
@@ -269,10 +308,14 @@ class ResultFile:
     def _copy_frames(self, file: h5py.File) -> None:
         """Copy the frames of the earlier file, as many as it has and `keep` allows."""
         with Result(self.path) as earlier:
-            datasets = {name: file["frames"][name] for name in earlier.frames if name in file["frames"]}
+            datasets = {
+                name: file["frames"][name] for name in earlier.frames if name in file["frames"]
+            }
             for name, dataset in datasets.items():
                 if dataset.shape[1:] != earlier.frames[name].shape[1:]:
-                    raise InputError(f"{self.path} is damaged: frames/{name} has shape {earlier.frames[name].shape}")
+                    raise InputError(
+                        f"{self.path} is damaged: frames/{name} has shape {earlier.frames[name].shape}"
+                    )
             count = len(earlier.frames.time)
             if self._copied is not None:
                 count = min(self._copied, count)
@@ -307,7 +350,12 @@ class ResultFile:
             raise
 
     def _collect(
-        self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
+        self,
+        rows: Array,
+        dtype: np.dtype[Any],
+        counts: Sequence[int],
+        name: str,
+        index: int | None = None,
     ) -> None:
         """Write the ranks' rows, `counts` of each, into dataset `name`, or into its row `index`."""
         rows = np.ascontiguousarray(rows, dtype)
@@ -322,7 +370,9 @@ class ResultFile:
         with self._together():
             gather_rows(self._comm, rows, counts, store)
 
-    def _write_directly(self, descriptor: int, rows: Array, counts: Sequence[int], name: str, index: int) -> None:
+    def _write_directly(
+        self, descriptor: int, rows: Array, counts: Sequence[int], name: str, index: int
+    ) -> None:
         chunk, offsets = 0, []
         with self._together():
             if self._file is not None:

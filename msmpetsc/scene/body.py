@@ -38,7 +38,9 @@ class StepTable(Table):
 
     one_of = ("simplify", "refine", "rotate")
     simplify: int | None = Field(None, ge=4, lt=2**63, description="triangles to keep [-]")
-    refine: float | None = Field(None, ge=1e-3, le=1, description="longest edge, of the body's longest side [-]")
+    refine: float | None = Field(
+        None, ge=1e-3, le=1, description="longest edge, of the body's longest side [-]"
+    )
     rotate: Rotate | None = Field(None, description="turn the surface")
 
 
@@ -71,8 +73,12 @@ class MeshTable(Table):
         "{ simplify = triangles [-] }, { refine = longest edge, of the longest side [-] }, "
         "{ rotate = { axis = [x, y, z] [-], degrees = angle [degrees] } }",
     )
-    size: Positive | None = Field(None, description="longest side of the bounding box [m]; as in the file if absent")
-    base: Vector | None = Field(None, description="where the middle of the bounding box's bottom face stands [m]")
+    size: Positive | None = Field(
+        None, description="longest side of the bounding box [m]; as in the file if absent"
+    )
+    base: Vector | None = Field(
+        None, description="where the middle of the bounding box's bottom face stands [m]"
+    )
 
 
 class CagesTable(Table):
@@ -85,8 +91,12 @@ class CagesTable(Table):
         "fill",
         description="boundary cells weigh and resist by the share of them that is inside, or whole, as the paper's",
     )
-    embedding: Literal["affine", "cages", "mvc"] = Field("affine", description="how the surface follows the nodes")
-    smoothing: float = Field(1.0, gt=0, le=1, description='width h of f_h in Eq. 9, with embedding = "cages" [cells]')
+    embedding: Literal["affine", "cages", "mvc"] = Field(
+        "affine", description="how the surface follows the nodes"
+    )
+    smoothing: float = Field(
+        1.0, gt=0, le=1, description='width h of f_h in Eq. 9, with embedding = "cages" [cells]'
+    )
     max_cells: Count = Field(5_000_000, description="refuse a lattice of more cells than this [-]")
 
     _has_a_use = field_validator("smoothing")(only_for("embedding", "cages"))
@@ -97,26 +107,35 @@ class Material(Table):
 
     one_of = ("young_modulus", "stiffness")
     young_modulus: Positive | None = Field(None, description="Young's modulus [Pa]")
-    stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
+    stiffness: Positive | None = Field(
+        None, description="the same stiffness for every spring [N/m]"
+    )
     density: Positive = Field(description="mass density [kg/m^3]")
     law: Literal["neo-hookean", "linear"] = Field(
         SOLID, description="neo-hookean: a solid; linear: springs, whose Poisson's ratio is 1/4"
     )
-    poisson_ratio: PoissonRatio = Field(0.25, description='of law = "neo-hookean"; tissue has 0.45 to 0.49 [-]')
+    poisson_ratio: PoissonRatio = Field(
+        0.25, description='of law = "neo-hookean"; tissue has 0.45 to 0.49 [-]'
+    )
     damping: NotNegative = Field(
-        0.0, description="of velocities, by the mass: what nothing else moves slows down as exp(-damping t) [1/s]"
+        0.0,
+        description="of velocities, by the mass: what nothing else moves slows down as exp(-damping t) [1/s]",
     )
     retardation_time: NotNegative = Field(
-        0.0, description='of law = "neo-hookean": its viscosity over its stiffness, as of Kelvin and Voigt\'s solid [s]'
+        0.0,
+        description='of law = "neo-hookean": its viscosity over its stiffness, as of Kelvin and Voigt\'s solid [s]',
     )
 
-    _is_of_solids = field_validator("poisson_ratio", "retardation_time")(only_for("law", "neo-hookean"))
+    _is_of_solids = field_validator("poisson_ratio", "retardation_time")(
+        only_for("law", "neo-hookean")
+    )
 
     @model_validator(mode="after")
     def _solids_have_no_springs(self) -> Self:
         if self.law == SOLID and self.stiffness is not None:
             raise rule(
-                'has stiffness, which is of springs: give law = "linear", or young_modulus in its place', "stiffness"
+                'has stiffness, which is of springs: give law = "linear", or young_modulus in its place',
+                "stiffness",
             )
         return self
 
@@ -137,14 +156,18 @@ class Sphere(Table):
     """A ball."""
 
     center: Vector = Field(description="[m], or [-] if relative")
-    radius: Positive = Field(description="[m], or in longest sides of the rest bounding box [-] if relative")
+    radius: Positive = Field(
+        description="[m], or in longest sides of the rest bounding box [-] if relative"
+    )
 
 
 class HalfSpace(Table):
     """All that lies on one side of a plane."""
 
     point: Vector = Field(description="a point of the plane [m], or [-] if relative")
-    normal: UnitVector = Field(description="towards the side that is meant, normalised on reading [-]")
+    normal: UnitVector = Field(
+        description="towards the side that is meant, normalised on reading [-]"
+    )
 
 
 class Region(Table):
@@ -152,10 +175,13 @@ class Region(Table):
 
     one_of = ("box", "sphere", "half_space", "painted", "group")
     box: Box | None = Field(
-        None, description="two corners, each coordinate of the first the lower [m], or [-] if relative"
+        None,
+        description="two corners, each coordinate of the first the lower [m], or [-] if relative",
     )
     sphere: Sphere | None = Field(None, description="a ball [m], or [-] if relative")
-    half_space: HalfSpace | None = Field(None, description="one side of a plane [m], or [-] if relative")
+    half_space: HalfSpace | None = Field(
+        None, description="one side of a plane [m], or [-] if relative"
+    )
     painted: Painted | None = Field(
         None,
         description="numbers, from 0, of points of the prepared surface (/surface/points of the result), or a "
@@ -167,7 +193,9 @@ class Region(Table):
         "them): the nodes nearest to its triangles are meant, of a part the cells that these cut, and "
         "all that a closed group encloses [-]",
     )
-    relative: bool = Field(False, description="coordinates run 0..1 along each axis of the rest bounding box")
+    relative: bool = Field(
+        False, description="coordinates run 0..1 along each axis of the rest bounding box"
+    )
 
     @field_validator("relative")
     @classmethod
@@ -186,16 +214,26 @@ class Region(Table):
 class OwnMaterial(Table):
     """Material of a part; a key that is absent is that of the scene's material."""
 
-    density: Positive | None = Field(None, description="mass density; the material's if absent [kg/m^3]")
-    young_modulus: Positive | None = Field(None, description="Young's modulus; the material's if absent [Pa]")
-    poisson_ratio: PoissonRatio | None = Field(None, description="Poisson's ratio; the material's if absent [-]")
+    density: Positive | None = Field(
+        None, description="mass density; the material's if absent [kg/m^3]"
+    )
+    young_modulus: Positive | None = Field(
+        None, description="Young's modulus; the material's if absent [Pa]"
+    )
+    poisson_ratio: PoissonRatio | None = Field(
+        None, description="Poisson's ratio; the material's if absent [-]"
+    )
     stiffness: Positive | None = Field(
-        None, description="of springs; one between cells of several parts has the mean of its cells' [N/m]"
+        None,
+        description="of springs; one between cells of several parts has the mean of its cells' [N/m]",
     )
 
     @model_validator(mode="after")
     def _says_something(self) -> Self:
-        if all(each is None for each in (self.density, self.young_modulus, self.poisson_ratio, self.stiffness)):
+        if all(
+            each is None
+            for each in (self.density, self.young_modulus, self.poisson_ratio, self.stiffness)
+        ):
             raise rule("needs density, young_modulus, poisson_ratio or stiffness")
         return self
 

@@ -39,7 +39,11 @@ class WithoutNull(GenerateJsonSchema):
 
     def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
         """Return the schema without a default that is null."""
-        return {name: value for name, value in super().default_schema(schema).items() if value is not None}
+        return {
+            name: value
+            for name, value in super().default_schema(schema).items()
+            if value is not None
+        }
 
 
 def json_schema() -> dict[str, Any]:
@@ -52,7 +56,11 @@ def keys(prefix: str = "") -> list[SceneKey]:
     schema = json_schema()
     every = list(_keys(schema, schema, ""))
     wanted = NUMBERED.sub("", prefix)
-    chosen = [key for key in every if f"{NUMBERED.sub('', key.name)}.".startswith(f"{wanted}." if wanted else "")]
+    chosen = [
+        key
+        for key in every
+        if f"{NUMBERED.sub('', key.name)}.".startswith(f"{wanted}." if wanted else "")
+    ]
     if not chosen:
         names = [NUMBERED.sub("", key.name) for key in every]
         tables = {name.rpartition(".")[0] for name in names} - {""}
@@ -65,20 +73,30 @@ def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterato
     for name, field in table["properties"].items():
         inner = field.get("items", field).get("$ref", "").rpartition("/")[2]
         if inner:
-            yield from _keys(schema, schema["$defs"][inner], f"{prefix}{name}{'.N' * ('items' in field)}.")
+            yield from _keys(
+                schema, schema["$defs"][inner], f"{prefix}{name}{'.N' * ('items' in field)}."
+            )
             continue
         if name in one_of:
             default = f"one of {', '.join(one_of)}"
         elif name in table.get("required", ()):
             default = "required"
         else:
-            default = "none" if field.get("default") in (None, "", []) else toml_value(field["default"])
+            default = (
+                "none" if field.get("default") in (None, "", []) else toml_value(field["default"])
+            )
         yield SceneKey(prefix + name, default, _bounds(field), field.get("description", ""))
 
 
 def _bounds(field: dict[str, Any]) -> str:
     if "enum" in field:
         return " | ".join(map(str, field["enum"]))
-    bounds = [f"{sign} {field[word]:g}" for word, sign in BOUNDS.items() if abs(field.get(word, UNREACHED)) < UNREACHED]
-    kind = {"boolean": "true | false", "integer": "whole", "array": "list", "string": "text"}.get(field.get("type", ""))
+    bounds = [
+        f"{sign} {field[word]:g}"
+        for word, sign in BOUNDS.items()
+        if abs(field.get(word, UNREACHED)) < UNREACHED
+    ]
+    kind = {"boolean": "true | false", "integer": "whole", "array": "list", "string": "text"}.get(
+        field.get("type", "")
+    )
     return " ".join(filter(None, [kind, ", ".join(bounds)]))

@@ -7,7 +7,16 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator,
 
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import TAGS, rule
-from msmpetsc.scene.values import Direction, FunctionName, ListOf, NotNegative, Positive, Table, Vector, after_start
+from msmpetsc.scene.values import (
+    Direction,
+    FunctionName,
+    ListOf,
+    NotNegative,
+    Positive,
+    Table,
+    Vector,
+    after_start,
+)
 
 
 class Twist(Table):
@@ -15,7 +24,9 @@ class Twist(Table):
 
     axis: Direction = Field(description="of any length but zero [-]")
     degrees: float = Field(
-        lt=1e6, gt=-1e6, description="turn of the far end against the near one, right-handed about the axis [degrees]"
+        lt=1e6,
+        gt=-1e6,
+        description="turn of the far end against the near one, right-handed about the axis [degrees]",
     )
 
 
@@ -32,15 +43,22 @@ class Start(Table):
     )
     twist: Twist | None = Field(None, description="a turn that grows along an axis")
     scatter: float = Field(
-        0.0, ge=0, le=1, description="every node goes so much of the way to a random place in the rest bounding box [-]"
+        0.0,
+        ge=0,
+        le=1,
+        description="every node goes so much of the way to a random place in the rest bounding box [-]",
     )
     velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s]")
-    spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre of mass [rad/s]")
+    spin: Vector = Field(
+        (0.0, 0.0, 0.0), description="angular velocity about the centre of mass [rad/s]"
+    )
 
     @model_validator(mode="after")
     def _is_no_point(self) -> Self:
         if not any(self.scale) and not self.scatter:
-            raise rule("scales the body to a point, where springs have no direction; give 0.01 or scatter")
+            raise rule(
+                "scales the body to a point, where springs have no direction; give 0.01 or scatter"
+            )
         return self
 
 
@@ -90,7 +108,9 @@ class ForceTable(Table):
         if any(a >= b for a, b in pairwise(self.times)):
             raise rule("must have ascending times")
         if not self.times or len(self.times) != len(self.values):
-            raise rule(f"has {len(self.times)} times and {len(self.values)} values: one value a time")
+            raise rule(
+                f"has {len(self.times)} times and {len(self.values)} values: one value a time"
+            )
         return self
 
 
@@ -112,7 +132,8 @@ class Force(Table):
         "straight lines between [N]",
     )
     function: FunctionName | None = Field(
-        None, description="name of a force of positions, velocities and time, registered in Python or installed"
+        None,
+        description="name of a force of positions, velocities and time, registered in Python or installed",
     )
     start: float = Field(0.0, description="acts from this time [s]")
     stop: float | None = Field(None, description="acts until this time [s]; to the end if absent")

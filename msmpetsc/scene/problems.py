@@ -15,8 +15,14 @@ from msmpetsc.errors import nearest, printable
 KeyPath = tuple[str | int, ...]
 Broken = tuple[str, PydanticCustomError]  # a key of a table, and the rule that it breaks
 
-SEARCHED_LINES, SEARCHED = 300, 30_000  # lines, characters: finding a line parses every prefix of the file: 0.2 s
-TAGS = ("a vector", "a table")  # of the kinds of a value that may be either: pydantic adds them to the path of its key
+SEARCHED_LINES, SEARCHED = (
+    300,
+    30_000,
+)  # lines, characters: finding a line parses every prefix of the file: 0.2 s
+TAGS = (
+    "a vector",
+    "a table",
+)  # of the kinds of a value that may be either: pydantic adds them to the path of its key
 MOST_REPORTED = 100  # problems of a file
 
 WORDS = {  # pydantic's error types: {gt} and the like are its own figures
@@ -85,11 +91,15 @@ def one_of_problems(data: Any, names: tuple[str, ...], known: list[str]) -> list
     if not names or not isinstance(data, dict):
         return []
     given = [name for name in names if name in data]
-    misspelt = not given and any(key not in known for key in data)  # reported as unknown: one mistake, one line
+    misspelt = not given and any(
+        key not in known for key in data
+    )  # reported as unknown: one mistake, one line
     if len(given) == 1 or misspelt:
         return []
     context = {"names": ", ".join(names), "given": " and ".join(given) or "none", "inner": given}
-    return [InitErrorDetails(type=PydanticCustomError("one_of", "one of", context), loc=(), input=data)]
+    return [
+        InitErrorDetails(type=PydanticCustomError("one_of", "one of", context), loc=(), input=data)
+    ]
 
 
 def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]:
@@ -118,7 +128,9 @@ def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]
     return list(problems.values())
 
 
-def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict[KeyPath, str]) -> list[str]:
+def problem_lines(
+    path: Path, error: ValidationError, text: str, overrides: dict[KeyPath, str]
+) -> list[str]:
     """Return a line for each problem: file, key, what is wrong, and the line of ``text`` or the override at fault."""
     prefixes = _prefixes(text)
     lines = []
@@ -129,9 +141,15 @@ def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict
         deepest = max(depths, default=0)
         number = prefixes[depths.index(deepest)][0] if deepest else None
         where = (
-            f" (--set {as_given(culprit)}{_in_place(e, culprit)})" if culprit else f" (line {number})" if number else ""
+            f" (--set {as_given(culprit)}{_in_place(e, culprit)})"
+            if culprit
+            else f" (line {number})"
+            if number
+            else ""
         )
-        key = ".".join(key if re.fullmatch(r"[\w-]+", key) else _got(key) for key in map(str, e["loc"]))
+        key = ".".join(
+            key if re.fullmatch(r"[\w-]+", key) else _got(key) for key in map(str, e["loc"])
+        )
         lines.append(": ".join(filter(None, [str(path), key, f"{_words(e)}{where}"])))
     more = len(problems) - MOST_REPORTED
     return [*lines, f"{path}: and {more} more"] if more > 0 else lines
@@ -152,7 +170,11 @@ def as_given(value: Any) -> str:
 
 
 def _got(value: Any) -> str:
-    return as_given(value) if not isinstance(value, str) else json.dumps(as_given(value), ensure_ascii=False)
+    return (
+        as_given(value)
+        if not isinstance(value, str)
+        else json.dumps(as_given(value), ensure_ascii=False)
+    )
 
 
 def _words(e: ErrorDetails) -> str:
@@ -220,7 +242,9 @@ def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
 def _depth(data: Any, loc: KeyPath) -> int:
     """Return how many keys of ``loc`` lead somewhere in ``data``."""
     for depth, key in enumerate(loc):
-        inside = (isinstance(data, dict) and key in data) or (isinstance(data, list) and key in range(len(data)))
+        inside = (isinstance(data, dict) and key in data) or (
+            isinstance(data, list) and key in range(len(data))
+        )
         if not inside:
             return depth
         data = data[key]

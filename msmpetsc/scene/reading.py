@@ -43,7 +43,9 @@ class Scene(SceneFile):
         return load_scene(Path(path), changes)
 
     @classmethod
-    def of(cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Changes = ()) -> "Scene":
+    def of(
+        cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Changes = ()
+    ) -> "Scene":
         """Make a scene of tables as a file would have them: {"mesh": {"source": "body.obj"}, ...}.
 
         folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
@@ -67,7 +69,9 @@ class Scene(SceneFile):
         """Return one line: title, meshes, cells, integrator and steps; ``text`` has all of it."""
         meshes = ", ".join(mesh.source for mesh in self.meshes.values())
         cages, time = self.cages, self.time
-        cells = f"{cages.count} cells" if cages.cell_size is None else f"cells of {cages.cell_size:g} m"
+        cells = (
+            f"{cages.count} cells" if cages.cell_size is None else f"cells of {cages.cell_size:g} m"
+        )
         return f"Scene({self.title!r}: {cells} of {meshes}, {time.integrator}, {time.steps} steps)"
 
     __str__ = __repr__
@@ -88,7 +92,9 @@ def load_scene(path: str | Path, changes: Changes = (), by_user: bool = True) ->
     return scene_of(path, _read(path, "scene"), changes, by_user)
 
 
-def scene_of(path: Path, text: str, changes: Changes = (), by_user: bool = True, to_read: bool = True) -> Scene:
+def scene_of(
+    path: Path, text: str, changes: Changes = (), by_user: bool = True, to_read: bool = True
+) -> Scene:
     """Check the text of a scene file as ``load_scene`` does the file.
 
     to_read : whether the files that it names are to be read
@@ -132,14 +138,18 @@ def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | N
             continue
         key = ".".join(map(str, keys))
         allows = "" if given is None else f"; --set {key}=PATH allows it"
-        raise InputError(f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it{allows}")
+        raise InputError(
+            f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it{allows}"
+        )
 
 
 def lies_below(folder: Path, name: str) -> bool:
     """Return whether a path from ``folder`` leads to what lies in it, links followed."""
     path = folder / name
     try:
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # whoever opens it says so
+        with suppress(
+            FileNotFoundError, NotADirectoryError, PermissionError
+        ):  # whoever opens it says so
             path.resolve(strict=True)  # from Python 3.13 on a loop of links is an error only so
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a long name
@@ -153,7 +163,9 @@ def _read(path: Path, kind: str) -> str:
         with open(path, "rb") as file:
             content = file.read(LONGEST + 1)
         if len(content) > LONGEST:
-            raise InputError(f"{path}: is too long for a {kind} file: more than {LONGEST / 2**20:g} MiB")
+            raise InputError(
+                f"{path}: is too long for a {kind} file: more than {LONGEST / 2**20:g} MiB"
+            )
         return content.decode("utf-8-sig")  # -sig: some editors begin with a byte order mark
     except FileNotFoundError:
         raise InputError(f"{path}: no such {kind} file") from None
@@ -186,7 +198,10 @@ def _override(data: dict[str, Any], override: str) -> KeyPath:
         if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text
             raise InputError("is not UTF-8 text")
         name, equals, raw = override.partition("=")
-        path = tuple(int(key) if key.isdecimal() and len(key) < 10 else key for key in name.strip().split("."))
+        path = tuple(
+            int(key) if key.isdecimal() and len(key) < 10 else key
+            for key in name.strip().split(".")
+        )
         if not equals or not raw.strip() or "" in path:
             raise InputError("must read key.path=value")
         if len(path) > DEEPEST:
@@ -223,7 +238,9 @@ def _put(holder: Any, key: str | int, value: Any, replace: bool) -> Any:
     elif not isinstance(holder, list):
         raise InputError(f"{key!r} has no place in {as_given(holder)}, which is no table or list")
     elif not isinstance(key, int) or key > len(holder):
-        raise InputError(f"{key!r} is no item of a list of {len(holder)}: the next would be {len(holder)}")
+        raise InputError(
+            f"{key!r} is no item of a list of {len(holder)}: the next would be {len(holder)}"
+        )
     elif key == len(holder):
         holder.append(value)
     elif replace:

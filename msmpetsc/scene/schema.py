@@ -11,7 +11,17 @@ from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable, SelfContactTable
 from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.time import Time, one_state, unlike_the_integrator
-from msmpetsc.scene.values import Count, Direction, FileName, GroupName, ListOf, NotNegative, PresetName, Table, Vector
+from msmpetsc.scene.values import (
+    Count,
+    Direction,
+    FileName,
+    GroupName,
+    ListOf,
+    NotNegative,
+    PresetName,
+    Table,
+    Vector,
+)
 
 MOST_CONTRAST = 1e6  # of parts: at 1e8 a squashed body took newton over 1,200 iterations a step
 OF_REGIONS = ("part", "pin", "anchor", "force")  # tables that take a region of one body, or of all
@@ -21,9 +31,13 @@ class BodyTable(Table):
     """One of several bodies. Regions of its tables are of this body alone."""
 
     mesh: MeshTable = Field(description="its closed surface")
-    material: OwnMaterial | None = Field(None, description="what it is made of, where that is not the scene's material")
+    material: OwnMaterial | None = Field(
+        None, description="what it is made of, where that is not the scene's material"
+    )
     part: ListOf[PartTable] = Field((), description="cells of it of another material")
-    start: Start | None = Field(None, description="how it is at time 0; as the scene's start says if absent")
+    start: Start | None = Field(
+        None, description="how it is at time 0; as the scene's start says if absent"
+    )
     pin: ListOf[Pin] = Field((), description="nodes of it that stay where they are")
     anchor: ListOf[AnchorTable] = Field((), description="nodes of it led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of it")
@@ -58,7 +72,11 @@ def unlike_the_material(scene: Any) -> Iterator[Broken]:
     Stiffness and Young's modulus are two ways to name all springs.
     """
     others: dict[str, OwnMaterial] = {part.key: part.table for part in scene.tables("part")}
-    others |= {f"body.{number}.material": body.material for number, body in enumerate(scene.body) if body.material}
+    others |= {
+        f"body.{number}.material": body.material
+        for number, body in enumerate(scene.body)
+        if body.material
+    }
     for key, other in others.items():
         for name in Material.one_of:
             if getattr(other, name) is not None and getattr(scene.material, name) is None:
@@ -68,7 +86,11 @@ def unlike_the_material(scene: Any) -> Iterator[Broken]:
             words = f'may give poisson_ratio only where material.law = "neo-hookean", as {key} does'
             yield key.partition(".")[0], rule(words, "material")
     for name in (*Material.one_of, "density"):
-        values = {key: value for key, table in others.items() if (value := getattr(table, name)) is not None}
+        values = {
+            key: value
+            for key, table in others.items()
+            if (value := getattr(table, name)) is not None
+        }
         given = [*values.values(), *filter(None, [getattr(scene.material, name)])]
         if values and max(given) > MOST_CONTRAST * min(given):
             yield (
@@ -94,7 +116,9 @@ class Solver(Table):
     """Solver of a step."""
 
     preset: PresetName = Field("newton", min_length=1, description="named set of PETSc options")
-    error: float | None = Field(None, gt=0, lt=1, description="relative error of a step to aim at [-]")
+    error: float | None = Field(
+        None, gt=0, lt=1, description="relative error of a step to aim at [-]"
+    )
     max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
 
 
@@ -102,7 +126,8 @@ class Safety(Table):
     """Recovery of steps that fail."""
 
     on_failure: Literal["stop", "substep", "fallback"] = Field(
-        "stop", description="stop the run; take that step in shorter ones; or solve it with a slower, robust method"
+        "stop",
+        description="stop the run; take that step in shorter ones; or solve it with a slower, robust method",
     )
 
 
@@ -111,9 +136,12 @@ class Probe(Table):
 
     one_of = ("point", "group")
     name: FileName = Field(description="of its columns in `msmpetsc series`")
-    point: Vector | None = Field(None, description="where it is at rest; it goes with the cell that it lies in [m]")
+    point: Vector | None = Field(
+        None, description="where it is at rest; it goes with the cell that it lies in [m]"
+    )
     group: GroupName | None = Field(
-        None, description="name that a mesh gives to triangles: the point of them nearest to their middle [-]"
+        None,
+        description="name that a mesh gives to triangles: the point of them nearest to their middle [-]",
     )
 
 
@@ -122,7 +150,8 @@ class Output(Table):
 
     surface: bool = Field(True, description="store the surface of every frame")
     stress: bool = Field(
-        False, description='store stress and strain energy of every frame; with material.law = "neo-hookean"'
+        False,
+        description='store stress and strain energy of every frame; with material.law = "neo-hookean"',
     )
     probe: ListOf[Probe] = Field((), description="points of the body whose places are stored")
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
@@ -139,7 +168,8 @@ class Picture(Table):
     """View of the result in pictures."""
 
     eye: Direction | None = Field(
-        None, description="direction from the body to the eye, of any length; across its longer side if absent [-]"
+        None,
+        description="direction from the body to the eye, of any length; across its longer side if absent [-]",
     )
     times: ListOf[NotNegative] = Field(
         (), description="moments drawn beside the start [s]; chosen by their energies if absent"
@@ -155,21 +185,34 @@ class SceneFile(Table):
     cages: CagesTable = Field(description="the cells that fill it")
     material: Material = Field(description="what it is made of")
     time: Time = Field(description="time step and duration")
-    body: ListOf[BodyTable] = Field((), min_length=1, description="each of several bodies, in place of mesh")
+    body: ListOf[BodyTable] = Field(
+        (), min_length=1, description="each of several bodies, in place of mesh"
+    )
     part: ListOf[PartTable] = Field((), description="cells of another material")
-    start: Start | None = Field(None, description="how it is at time 0; at rest in its rest shape if absent")
+    start: Start | None = Field(
+        None, description="how it is at time 0; at rest in its rest shape if absent"
+    )
     gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
     obstacle: ListOf[ObstacleTable] = Field((), description="what nodes bounce off")
-    self_contact: SelfContactTable | None = Field(None, description="what keeps the surface from crossing itself")
+    self_contact: SelfContactTable | None = Field(
+        None, description="what keeps the surface from crossing itself"
+    )
     pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
     anchor: ListOf[AnchorTable] = Field((), description="nodes led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
-    solver: Solver = Field(default_factory=lambda: Solver.model_validate({}), description="how a step is solved")
-    safety: Safety = Field(
-        default_factory=lambda: Safety.model_validate({}), description="what is done about a failed step"
+    solver: Solver = Field(
+        default_factory=lambda: Solver.model_validate({}), description="how a step is solved"
     )
-    output: Output = Field(default_factory=lambda: Output.model_validate({}), description="what is stored")
-    picture: Picture = Field(default_factory=lambda: Picture.model_validate({}), description="how the result is drawn")
+    safety: Safety = Field(
+        default_factory=lambda: Safety.model_validate({}),
+        description="what is done about a failed step",
+    )
+    output: Output = Field(
+        default_factory=lambda: Output.model_validate({}), description="what is stored"
+    )
+    picture: Picture = Field(
+        default_factory=lambda: Picture.model_validate({}), description="how the result is drawn"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -181,7 +224,9 @@ class SceneFile(Table):
         if self.output.stress and self.material.poisson is None:
             words = f'may not have stress = true with material.law = "{self.material.law}": springs have no stress'
             yield "output", rule(words, "material")
-        yield from chain(unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self))
+        yield from chain(
+            unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self)
+        )
 
     @property
     def stored(self) -> int:
@@ -221,7 +266,11 @@ class SceneFile(Table):
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:
         """Yield key path and name of each file that it names; a mesh's name may be one of the registry's too."""
-        solids = {("obstacle", number, "mesh"): o.mesh for number, o in enumerate(self.obstacle) if o.mesh is not None}
+        solids = {
+            ("obstacle", number, "mesh"): o.mesh
+            for number, o in enumerate(self.obstacle)
+            if o.mesh is not None
+        }
         for path, mesh in (self.meshes | solids).items():
             yield (*path, "source"), mesh.source
         for path, _, table in chain.from_iterable(self.tables(kind) for kind in OF_REGIONS):

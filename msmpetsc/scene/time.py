@@ -27,18 +27,26 @@ class Time(Table):
     """Simulated time."""
 
     model_config = ConfigDict(json_schema_extra=_wanted_in_motion)
-    step: Positive = Field(description="time step; required but of statics that stay the same if absent [s]")
-    duration: Positive = Field(description="simulated time; required but of statics that stay the same if absent [s]")
+    step: Positive = Field(
+        description="time step; required but of statics that stay the same if absent [s]"
+    )
+    duration: Positive = Field(
+        description="simulated time; required but of statics that stay the same if absent [s]"
+    )
     integrator: IntegratorName = Field(
         "implicit-euler",
         description="how a step is taken: solved at once, of first or second order; in explicit substeps; or as a "
         "state of equilibrium",
     )
     substep: Positive | None = Field(
-        None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
+        None,
+        description='longest substep of integrator = "verlet"; under the stability limit if absent [s]',
     )
     error: float | None = Field(
-        None, gt=0, lt=1, description="of the motion, relative: steps are as long as it allows, all alike if absent [-]"
+        None,
+        gt=0,
+        lt=1,
+        description="of the motion, relative: steps are as long as it allows, all alike if absent [-]",
     )
 
     _has_a_use = field_validator("substep")(only_for("integrator", "verlet"))
@@ -69,7 +77,11 @@ def one_state(data: Any) -> Any:
     if not isinstance(time, dict) or time.get("integrator") != STATIC:
         return data
     for load in _loads(data):
-        if isinstance(load.get("total"), dict) or "function" in load or any(name in load for name in OF_TIME):
+        if (
+            isinstance(load.get("total"), dict)
+            or "function" in load
+            or any(name in load for name in OF_TIME)
+        ):
             return data
     one = time.get("step", time.get("duration", 1.0))
     return {**data, "time": {"step": one, "duration": one, **time}}
@@ -88,7 +100,9 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
     """Yield the rules that tables of a scene break by its integrator."""
     integrator = scene.time.integrator
     if scene.material.retardation_time and integrator not in IMPLICIT:
-        words = f'may not have integrator = "{integrator}" where material.retardation_time is given: '
+        words = (
+            f'may not have integrator = "{integrator}" where material.retardation_time is given: '
+        )
         yield "time", rule(f'{words}"implicit-euler" and "bdf2" have', "material")
     if integrator == STATIC:
         yield from _moving(scene)
@@ -104,13 +118,20 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
             yield "obstacle", rule(f'{words}one step; "reflect" and "penalty" go', "time")
         if scene.touching:
             words = f'may not have response = "exchange" where surfaces meet, as obstacle.{number} has it: that moves '
-            yield "obstacle", rule(f'{words}nodes past each other; "reflect" and "penalty" press', "self_contact")
+            yield (
+                "obstacle",
+                rule(
+                    f'{words}nodes past each other; "reflect" and "penalty" press', "self_contact"
+                ),
+            )
 
 
 def _moving(scene: Any) -> Iterator[Broken]:
     """Yield the rules that a scene of statics breaks by what moves, depends on motion or rubs."""
     if scene.material.damping:
-        words = f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves'
+        words = (
+            f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves'
+        )
         yield "time", rule(words, "material")
     bodies = [("body", f"body.{number}.", body) for number, body in enumerate(scene.body)]
     for key, whose, tables in [("", "", scene), *bodies]:
@@ -120,11 +141,20 @@ def _moving(scene: Any) -> Iterator[Broken]:
         for number, force in enumerate(tables.force):
             if force.function is not None:
                 words = f'may be no function where time.integrator = "{STATIC}", as {whose}force.{number} is: it is '
-                yield key or "force", rule(f"{words}that of the state before, which is not at rest under it", "time")
+                yield (
+                    key or "force",
+                    rule(f"{words}that of the state before, which is not at rest under it", "time"),
+                )
     for number, obstacle in enumerate(scene.obstacle):
         if obstacle.response not in ("penalty", "barrier"):
             words = f'may not {obstacle.response} where time.integrator = "{STATIC}", as obstacle.{number} does: '
-            yield "obstacle", rule(f'{words}nothing strikes it; response = "penalty" presses', "time")
+            yield (
+                "obstacle",
+                rule(f'{words}nothing strikes it; response = "penalty" presses', "time"),
+            )
         if obstacle.friction:
             words = f'may have no friction where time.integrator = "{STATIC}", as obstacle.{number} has: it depends on '
-            yield "obstacle", rule(f"{words}the way there, which steps in motion with damping take", "time")
+            yield (
+                "obstacle",
+                rule(f"{words}the way there, which steps in motion with damping take", "time"),
+            )

@@ -12,7 +12,9 @@ from typing import Any
 
 DEEPEST = 50  # parts of a key: tomllib takes time by their square
 KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
-DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPEST}}}", re.MULTILINE)
+DEEP_KEY = re.compile(
+    rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPEST}}}", re.MULTILINE
+)
 
 
 def toml_of(text: str) -> dict[str, Any]:
@@ -38,7 +40,11 @@ def toml_value(value: Any) -> str:
     value = plain(value)
     if isinstance(value, dict):
         return (
-            "{" + ", ".join(f"{key} = {toml_value(inner)}" for key, inner in value.items() if inner is not None) + "}"
+            "{"
+            + ", ".join(
+                f"{key} = {toml_value(inner)}" for key, inner in value.items() if inner is not None
+            )
+            + "}"
         )
     if isinstance(value, list):
         return f"[{', '.join(map(toml_value, value))}]"

@@ -29,7 +29,9 @@ def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     longest = max(map(abs, _nonzero(vector)))
-    x, y, z = (c / longest for c in vector)  # or the squares of very large or small components leave the range
+    x, y, z = (
+        c / longest for c in vector
+    )  # or the squares of very large or small components leave the range
     length = math.hypot(x, y, z)
     return x / length, y / length, z / length
 
@@ -60,7 +62,9 @@ def _painted(value: Any) -> str | tuple[int, ...]:
     """Return a file's name, or numbers of points."""
     if isinstance(value, str) and 0 < len(value) <= 1000:
         return _printable(value)
-    numbers = isinstance(value, list | tuple) and all(type(n) is int and 0 <= n < 2**63 for n in value)
+    numbers = isinstance(value, list | tuple) and all(
+        type(n) is int and 0 <= n < 2**63 for n in value
+    )
     if not numbers or not value:
         raise rule("must be a list of point numbers, from 0, or the name of a file that has them")
     return tuple(value)
@@ -115,7 +119,11 @@ class Table(BaseModel):
     """A table of the scene file; ``one_of`` names the keys of which exactly one must be given."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, json_schema_extra=_one_of_in_schema
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        json_schema_extra=_one_of_in_schema,
     )
     one_of: ClassVar[tuple[str, ...]] = ()
 
@@ -132,7 +140,8 @@ class Table(BaseModel):
         try:
             table = handler(data)
             problems += [
-                InitErrorDetails(type=broken, loc=(key,), input=data.get(key)) for key, broken in table.broken_rules()
+                InitErrorDetails(type=broken, loc=(key,), input=data.get(key))
+                for key, broken in table.broken_rules()
             ]
         except ValidationError as error:
             problems += restated(error, known)

@@ -73,7 +73,9 @@ class EnergyBalance:
         self.comm = self.lattice.table.comm
         self.credit = CREDIT * self.swings
         self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
-        self.known: tuple[Positions, Energies] | None = None  # positions that the last step ended at, energies there
+        self.known: tuple[Positions, Energies] | None = (
+            None  # positions that the last step ended at, energies there
+        )
         self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
 
     def show(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> None:
@@ -95,7 +97,9 @@ class EnergyBalance:
             *(lattice.mass @ v),
         )
         return Energies(
-            **dict(zip(("kinetic", "free", "elastic", "contact", "potential"), sums[:5], strict=True)),
+            **dict(
+                zip(("kinetic", "free", "elastic", "contact", "potential"), sums[:5], strict=True)
+            ),
             momentum=sums[5:],
             touch=environment.touch(q, time),
         )
@@ -108,13 +112,17 @@ class EnergyBalance:
         """
         result, after = integrator.advance(before, time)
         budget = self._examine(before, result, after, time, integrator.time_step)
-        if before.history is not None and self._history_gains(before, result, after, time, integrator.time_step):
+        if before.history is not None and self._history_gains(
+            before, result, after, time, integrator.time_step
+        ):
             again, after = self.step(integrator, replace(before, history=None), time)
             cost = replace(result.cost + again.cost, steps=1, step_error=again.cost.step_error)
             return replace(again, cost=cost), after
         return result, replace(after, budget=budget)
 
-    def _history_gains(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> bool:
+    def _history_gains(
+        self, before: State, result: StepResult, after: State, time: float, time_step: float
+    ) -> bool:
         """Return whether a solved step gains more than MUCH of all energy (collective).
 
         Energy and work are those in a frame that goes with the obstacles that press, or with the body where none does:
@@ -126,23 +134,35 @@ class EnergyBalance:
             (result.position[owned], after.sides), time, time_step
         )
         is_held = self.environment.anchors.fixed_at(time)[owned].any()
-        sums = self._sums(lattice.mass.sum(), pressing, is_held, *led, *(lattice.mass @ way / time_step))
+        sums = self._sums(
+            lattice.mass.sum(), pressing, is_held, *led, *(lattice.mass @ way / time_step)
+        )
         mass, pressing, is_held, momentum = *sums[:3], sums[6:]
-        frame = sums[3:6] / (pressing * time_step) if pressing > 0 else np.where(is_held, 0.0, momentum / mass)
+        frame = (
+            sums[3:6] / (pressing * time_step)
+            if pressing > 0
+            else np.where(is_held, 0.0, momentum / mass)
+        )
         start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
         return bool(ended - start - work - struck > MUCH * max(start + max(work, 0.0), self.floor))
 
-    def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> EnergyBudget:
+    def _examine(
+        self, before: State, result: StepResult, after: State, time: float, time_step: float
+    ) -> EnergyBudget:
         v = (result.position - result.previous) / time_step
         self.show(result.position, v, time, after.sides)
         solved = ended = self.energies
         if not np.isfinite(solved.kinetic + solved.inner):
-            raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
+            raise StepFailed(
+                f"left numbers that are not finite, {self._worst(result.position)}", "not finite"
+            )
         if result.static:  # which owes nothing to the state before
             return before.budget
         own = after.q is not result.position or after.q_previous is not result.previous
-        bounces = self.environment.obstacles.strikes and self.comm.allreduce(own, MPI.LOR)  # once the step was solved
+        bounces = self.environment.obstacles.strikes and self.comm.allreduce(
+            own, MPI.LOR
+        )  # once the step was solved
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
@@ -152,7 +172,11 @@ class EnergyBalance:
                 f"gained {budget.gained:.2e} J from nowhere, of {budget.put_in:.2e} J that were there: "
                 f"{self._worst(v)}{describe_inverted(self.comm, self.lattice, result.position)}; "
                 f"try {self.remedy(result.explicit)}"
-                + ("" if self.environment.obstacles.exchanges else ', or safety.on_failure = "fallback"'),
+                + (
+                    ""
+                    if self.environment.obstacles.exchanges
+                    else ', or safety.on_failure = "fallback"'
+                ),
                 "energy",
             )
         self.known = after.q, ended
@@ -163,14 +187,22 @@ class EnergyBalance:
     ) -> EnergyBudget:
         start, pushed, work, struck, swing = sums
         gained = solved.inner - start - work + budget.bounced - (0.0 if bounces else struck)
-        bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
-        by_right = start - max(budget.bounced, 0.0) - pushed - max(budget.gained, 0.0)  # an exchange puts nothing in
+        bounced = (
+            ended.inner + ended.potential - solved.inner - solved.potential - struck
+            if bounces
+            else 0.0
+        )
+        by_right = (
+            start - max(budget.bounced, 0.0) - pushed - max(budget.gained, 0.0)
+        )  # an exchange puts nothing in
         put_in = max(budget.put_in, by_right + max(work, 0.0), self.floor)
         put_in = max(put_in, solved.inner - max(budget.gained + gained, 0.0))
         least = -self.credit * put_in
         steady = max(least, budget.steady + gained - swing)
         since_frame = budget.since_frame + gained
-        return EnergyBudget(put_in, max(least, budget.gained + gained), steady, since_frame, bounced)
+        return EnergyBudget(
+            put_in, max(least, budget.gained + gained), steady, since_frame, bounced
+        )
 
     def remedy(self, explicit: bool) -> str:
         """Return a remedy, in words, for energy that comes from nowhere."""
@@ -214,7 +246,9 @@ class EnergyBalance:
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned] + way) if contact else 0.0,
             np.vdot(environment.forces.at(time), result.position[owned] - q[owned] - way)
-            + environment.obstacles.friction_work_bound((q[owned], sides), ended, time, time_step, along)
+            + environment.obstacles.friction_work_bound(
+                (q[owned], sides), ended, time, time_step, along
+            )
             + result.viscous_work
             + (surface.of_obstacles(result.position, along)[1] / self.comm.size if surface else 0.0)
             + (pressing.released(result.position) if pressing else 0.0),
@@ -231,4 +265,6 @@ class EnergyBalance:
 
     def _worst(self, vectors: Rows) -> str:
         owned = np.arange(self.lattice.owned)
-        return "worst at " + node_of_greatest(self.comm, self.lattice, owned, np.linalg.norm(vectors[owned], axis=1))
+        return "worst at " + node_of_greatest(
+            self.comm, self.lattice, owned, np.linalg.norm(vectors[owned], axis=1)
+        )

@@ -21,7 +21,16 @@ from msmpetsc.solve.energy_balance import MUCH
 from msmpetsc.solve.integrators.integrator import EnergyBudget
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.events import CYCLE, FINE, GRIDS, HIERARCHY, LOCAL, REFERENCE, begun, seconds
+from msmpetsc.solve.petsc.events import (
+    CYCLE,
+    FINE,
+    GRIDS,
+    HIERARCHY,
+    LOCAL,
+    REFERENCE,
+    begun,
+    seconds,
+)
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
@@ -65,7 +74,11 @@ class TrueErrors:
             self.stepper = stepper
             preset = find_preset(REFERENCE_PRESET)
             self.reference = replace(
-                stepper, preset=preset, error=REFERENCE_ERROR, max_iterations=None, prefix=REFERENCE_PREFIX
+                stepper,
+                preset=preset,
+                error=REFERENCE_ERROR,
+                max_iterations=None,
+                prefix=REFERENCE_PREFIX,
             )
             self.reference.set_up()
         return self.reference
@@ -92,7 +105,9 @@ def event_times() -> dict[str, float]:
 
 def times(comm: MPI.Comm, before: dict[str, float]) -> dict[str, float]:
     """Return the seconds in events since there were so many ``before``, the greatest of all ranks (collective)."""
-    return {name: comm.allreduce(now - before[name], MPI.MAX) for name, now in event_times().items()}
+    return {
+        name: comm.allreduce(now - before[name], MPI.MAX) for name, now in event_times().items()
+    }
 
 
 class Monitors:
@@ -151,7 +166,11 @@ class Monitors:
             fixed = self.environment.anchors.fixed_at(time)
             overlap = describe_overlap(self.comm, self.lattice, obstacle, q, fixed, time)
             if overlap:
-                self._warn(index, time, f'{overlap}; "exchange" leaves nodes inside, other responses push them out')
+                self._warn(
+                    index,
+                    time,
+                    f'{overlap}; "exchange" leaves nodes inside, other responses push them out',
+                )
 
     def gain(self, index: int, time: float, budget: EnergyBudget, remedy: str) -> None:
         """Take note of what the body has from nowhere after a step, and of what mends that."""
@@ -167,10 +186,18 @@ class Monitors:
         """Log at the end of a run how often each warning was due."""
         if self.frames:
             left = f"{self.now} still are" if self.now else "none is at the end"
-            log.warning("cells were inside out in %d frames, at most %d; %s", self.frames, self.most, left)
+            log.warning(
+                "cells were inside out in %d frames, at most %d; %s", self.frames, self.most, left
+            )
         if self.far:
-            log.warning("steps ended far off their solution in %d frames, by up to %.2g", self.far, self.worst_error)
+            log.warning(
+                "steps ended far off their solution in %d frames, by up to %.2g",
+                self.far,
+                self.worst_error,
+            )
         if self.gaining:
             log.warning(
-                "in %d frames there was energy from nowhere, up to %.2g%% of all", self.gaining, 100 * self.worst_gain
+                "in %d frames there was energy from nowhere, up to %.2g%% of all",
+                self.gaining,
+                100 * self.worst_gain,
             )

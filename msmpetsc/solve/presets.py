@@ -41,7 +41,12 @@ MOST_ITERATIONS = 100_000
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
 NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search
-PLAIN = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": "1000", **NO_STOP_BY_SIZE}
+PLAIN = {
+    "snes_type": "newtonls",
+    "snes_linesearch_type": "basic",
+    "snes_max_it": "1000",
+    **NO_STOP_BY_SIZE,
+}
 MANY = "3000"  # a hard step takes hundreds of newton's cheap iterations (tests/test_recovery.py), and gets there
 LATTICE_MULTIGRID = {  # the cycle of -pc_type mg
     "mg_levels_ksp_type": "chebyshev",
@@ -137,7 +142,9 @@ BOUND_TO_TYPE = {"pc_type": "pc_factor_mat_solver_type", "ksp_type": "ksp_norm_t
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
 
 
-in_use: Counter[str] = Counter()  # by how many solvers: the options in PETSc's database that are not the user's
+in_use: Counter[str] = (
+    Counter()
+)  # by how many solvers: the options in PETSc's database that are not the user's
 
 
 def preset_names() -> list[str]:
@@ -150,7 +157,9 @@ def find_preset(name: str) -> Preset:
     if name in PRESETS:
         return PRESETS[name]
     if name not in ADDED.names():
-        raise InputError(f"solver.preset: unknown preset {name!r}{did_you_mean(name, preset_names())}")
+        raise InputError(
+            f"solver.preset: unknown preset {name!r}{did_you_mean(name, preset_names())}"
+        )
     added = ADDED.find(name)  # {"options": ..., "based_on": ..., "about": ...}
     try:
         base = PRESETS[added.get("based_on", "newton")]
@@ -171,7 +180,9 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
     """
     ours = [SolverOptions(preset, prefix, budget) for prefix, (preset, budget) in solvers.items()]
     adapting = {
-        f"{each.prefix}ksp_rtol" for each in ours if each.preset.iterations is None and each.is_default("ksp_rtol")
+        f"{each.prefix}ksp_rtol"
+        for each in ours
+        if each.preset.iterations is None and each.is_default("ksp_rtol")
     }
     lines = []
     for name, value in sorted(PETSc.Options().getAll().items()):
@@ -196,7 +207,9 @@ class SolverOptions:
 
     def __init__(self, preset: Preset, prefix: str, budget: int):
         self.preset, self.prefix = preset, prefix
-        options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
+        options = preset.options | {
+            "snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))
+        }
         database = PETSc.Options()
         given = [name for name in database.getAll() if name.startswith(prefix) and not in_use[name]]
         users = {name.removeprefix(prefix) for name in given}

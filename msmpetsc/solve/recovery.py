@@ -35,7 +35,13 @@ class Recovery:
     state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
 
     def __init__(self, scene: Scene, make: MakeIntegrator, balance: EnergyBalance, take: TakeStep):
-        self.time, self.solver, self.make, self.balance, self.take = scene.time, scene.solver, make, balance, take
+        self.time, self.solver, self.make, self.balance, self.take = (
+            scene.time,
+            scene.solver,
+            make,
+            balance,
+            take,
+        )
         self.on_failure, self.time_step = scene.safety.on_failure, scene.time.step
         self.spare: dict[int, Integrator] = {}  # by how often the step is halved
         self.recovered = 0  # steps
@@ -52,7 +58,9 @@ class Recovery:
                     raise
                 if not self.recovered:
                     reason = str(failure).split("; try ")[0]
-                    log.warning("t = %.6g s: the step %s: it is %s", time, reason, WORDS[self.on_failure])
+                    log.warning(
+                        "t = %.6g s: the step %s: it is %s", time, reason, WORDS[self.on_failure]
+                    )
         self.recovered += 1
         for integrator in self.spare.values():
             integrator.forget()  # so that a checkpoint need not remember them
@@ -73,7 +81,9 @@ class Recovery:
         pieces = 2**level
         cost = Work()
         for piece in range(1, pieces + 1):
-            result, state = self._piece(state, time - self.time_step + piece * self.time_step / pieces, level)
+            result, state = self._piece(
+                state, time - self.time_step + piece * self.time_step / pieces, level
+            )
             cost += result.cost
         self.level = self.deepest if self.deepest > level else level - 1
         self.destroy()  # a resumed run has not seen what the spare solvers did in this step
@@ -86,7 +96,9 @@ class Recovery:
             return replace(result, cost=result.cost + Work(substeps=1)), after
         except StepFailed as failure:
             if level == DEEPEST:
-                raise StepFailed(f"{failure} (and failed in {2**level} pieces)", failure.kind) from None
+                raise StepFailed(
+                    f"{failure} (and failed in {2**level} pieces)", failure.kind
+                ) from None
         half = self.time_step / 2 ** (level + 1)
         first, state = self._piece(state, time - half, level + 1)
         second, state = self._piece(state, time, level + 1)
@@ -111,7 +123,9 @@ class Recovery:
         name = self.time.integrator if self.time.integrator in kept else "implicit-euler"
         time = self.time.model_copy(update={"step": short, "integrator": name})
         if is_fallback:
-            return self.make(time, Solver(preset=ROBUST, error=self.solver.error, max_iterations=None), PREFIX)
+            return self.make(
+                time, Solver(preset=ROBUST, error=self.solver.error, max_iterations=None), PREFIX
+            )
         return self.make(time, self.solver, "")
 
     def destroy(self) -> None:

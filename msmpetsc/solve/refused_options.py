@@ -20,8 +20,18 @@ READ_AT_THE_END = re.compile(
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
 OF_STEPPERS = re.compile(r"^(reference_|fallback_)")
 
-OFTEN_GIVEN = {"ksp_view", "ksp_monitor", "ksp_max_it", "ksp_atol", "snes_view", "snes_monitor", "mat_type"}
-USUAL = OFTEN_GIVEN.union(*(preset.options for preset in PRESETS.values()))  # what a misspelt option may have meant
+OFTEN_GIVEN = {
+    "ksp_view",
+    "ksp_monitor",
+    "ksp_max_it",
+    "ksp_atol",
+    "snes_view",
+    "snes_monitor",
+    "mat_type",
+}
+USUAL = OFTEN_GIVEN.union(
+    *(preset.options for preset in PRESETS.values())
+)  # what a misspelt option may have meant
 
 NO_PART = "no part of this run uses this PETSc option"
 BY_ERROR = "a step ends when its error is below solver.error (--error), or by solver.max_iterations"
@@ -44,7 +54,9 @@ NO_USE = {  # what PETSc would take, but not do here, or crash by; a name and it
 }
 
 # names of options by their last words: counts, and sizes
-COUNT = re.compile(r"(.*_)?(max_it|its|lits|cycles|levels|(jacobi|asm)_(local_)?blocks|restart|steps|anderson_m|qn_m)")
+COUNT = re.compile(
+    r"(.*_)?(max_it|its|lits|cycles|levels|(jacobi|asm)_(local_)?blocks|restart|steps|anderson_m|qn_m)"
+)
 POSITIVE = re.compile(r"(.*_)?(rtol|divtol|damping|maxstep|minlambda|alpha|omega)")
 
 
@@ -89,7 +101,13 @@ def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...]
         and (at_end or not READ_WHILE_SOLVING.search(name))
         and not name.startswith(awaited)
     ]
-    _refuse(comm, (f"-{name}: {NO_PART}" + (did_you_mean(name, USUAL) if name not in USUAL else "") for name in unused))
+    _refuse(
+        comm,
+        (
+            f"-{name}: {NO_PART}" + (did_you_mean(name, USUAL) if name not in USUAL else "")
+            for name in unused
+        ),
+    )
 
 
 def _refuse(comm: MPI.Comm, lines: Iterable[str]) -> None:
@@ -104,9 +122,13 @@ def _left() -> list[str]:
     library = petsc_library()
     strings = ctypes.POINTER(ctypes.c_char_p)
     count, names, values = Integer(), strings(), strings()
-    library.PetscOptionsLeftGet(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
+    library.PetscOptionsLeftGet(
+        None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
+    )
     left = [names[i].decode() for i in range(count.value)]
-    library.PetscOptionsLeftRestore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
+    library.PetscOptionsLeftRestore(
+        None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
+    )
     return left
 
 

@@ -43,7 +43,12 @@ from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
 Integrators = dict[str, type[ImplicitEuler] | type[Verlet]]
-INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet, "static": Static}
+INTEGRATORS: Integrators = {
+    "implicit-euler": ImplicitEuler,
+    "bdf2": Bdf2,
+    "verlet": Verlet,
+    "static": Static,
+}
 REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
 
 
@@ -87,11 +92,18 @@ class TimeLoop:
         model = to_device(model, sender(comm))
         if model.collision and not on_host(model.lattice.nodes):
             raise InputError("contact of surfaces is computed on CPUs: --device cpu")
-        self.comm, self.model, self.true_error, self.time_step = comm, model, true_error, scene.time.step
+        self.comm, self.model, self.true_error, self.time_step = (
+            comm,
+            model,
+            true_error,
+            scene.time.step,
+        )
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
         points = probe_points(model.bodies, scene.output.probe)
-        self.probe = ProbePoints(comm, model.lattice, points) if points else None  # may refuse: no PETSc objects yet
+        self.probe = (
+            ProbePoints(comm, model.lattice, points) if points else None
+        )  # may refuse: no PETSc objects yet
         self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
         swings = scene.time.integrator != "implicit-euler"
         self.balance = EnergyBalance(self.environment, self.elasticity, swings)
@@ -104,12 +116,16 @@ class TimeLoop:
             take = self.adaptive.advance
         self.recovery = Recovery(scene, self._make, self.balance, take)
         self.monitors, self.true_errors = Monitors(self.environment, self.time_step), TrueErrors()
-        self.surface = None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
+        self.surface = (
+            None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
+        )
         self.forces = Forces(model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
-        sides = self.environment.obstacles.contact_faces(q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0))
+        sides = self.environment.obstacles.contact_faces(
+            q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0)
+        )
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
         self.awaits_solve = False  # a step that reads what options are left
         self.saved = Checkpoint()
@@ -129,7 +145,9 @@ class TimeLoop:
         """Yield the same, and None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
             self.monitors.overlaps(0, 0.0, self.state.q)
-            self.balance.show(self.state.q, self.state.velocity(self.time_step), 0.0, self.state.sides)
+            self.balance.show(
+                self.state.q, self.state.velocity(self.time_step), 0.0, self.state.sides
+            )
             yield self._frame(0, self.state.q)
         while self.step < self.steps:
             with STEPS:
@@ -148,18 +166,26 @@ class TimeLoop:
         try:
             result, self.state = self.recovery.step(self.state, time)
         except StepFailed as failure:
-            raise StepFailed(f"frame {index} (t = {time:.6g} s) {failure}", failure.kind, index) from None
+            raise StepFailed(
+                f"frame {index} (t = {time:.6g} s) {failure}", failure.kind, index
+            ) from None
         self.monitors.work += result.cost + Work(wall_time=perf_counter() - begin)
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
         if self.true_error and index % self.true_error == 0 and result.problem and not is_recovered:
             assert isinstance(self.integrator, ImplicitEuler)  # which solves them
-            true, energy = self.true_errors.errors(self.integrator.stepper, result.problem, result.position)
+            true, energy = self.true_errors.errors(
+                self.integrator.stepper, result.problem, result.position
+            )
             self.monitors.work += Work(true_error=true, energy_error=energy)
         self.monitors.gain(index, time, self.state.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.awaits_solve and (result.explicit or result.cost.ksp_its):
             self.refuse_unused_options()
-        frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
+        frame = (
+            self._frame(index, result.position, result)
+            if index % self.every == 0 or index == self.steps
+            else None
+        )
         if index % REMEMBERED == 0:
             self.saved = self._save()
         return frame
@@ -168,7 +194,10 @@ class TimeLoop:
         """Store the state, and forget what is no part of it: a resumed run would not have it."""
         checkpoint = Checkpoint(self.step)
         self.state.save(
-            checkpoint, self.model.lattice.owned, self.integrator.looks_back, self.environment.obstacles.has_sides
+            checkpoint,
+            self.model.lattice.owned,
+            self.integrator.looks_back,
+            self.environment.obstacles.has_sides,
         )
         self.integrator.save(checkpoint)
         self.environment.forget()
@@ -194,7 +223,10 @@ class TimeLoop:
         Called before the first step, it does so once more after the first that solves anything.
         """
         self.awaits_solve = self.step == 0 and not at_end
-        awaited = {FALLBACK: self.recovery.on_failure == "fallback", REFERENCE_PREFIX: self.true_error and not at_end}
+        awaited = {
+            FALLBACK: self.recovery.on_failure == "fallback",
+            REFERENCE_PREFIX: self.true_error and not at_end,
+        }
         prefixes = tuple(prefix for prefix, may_come in awaited.items() if may_come)
         refuse_unused(self.comm, not self.awaits_solve, prefixes)
 
@@ -214,7 +246,10 @@ class TimeLoop:
             time=time,
             position=position,
             surface=self.surface(position) if self.surface else None,
-            **{name: getattr(energies, name) for name in ("kinetic", "elastic", "potential", "contact", "momentum")},
+            **{
+                name: getattr(energies, name)
+                for name in ("kinetic", "elastic", "potential", "contact", "momentum")
+            },
             inverted=self.monitors.inverted(index, time, q),
             energy_gained=max(gained, 0.0),
             self_contacts=energies.touch.contacts,
@@ -236,7 +271,10 @@ class TimeLoop:
         if self.surface:
             rows["surface"] = self.surface.weights.shape[0]
         if self.stress:
-            rows |= {name: lattice.cells_owned if "c" in FRAME_FIELDS[name].shape else lattice.owned for name in STRESS}
+            rows |= {
+                name: lattice.cells_owned if "c" in FRAME_FIELDS[name].shape else lattice.owned
+                for name in STRESS
+            }
         return rows
 
     def __enter__(self) -> "TimeLoop":
@@ -287,10 +325,17 @@ class Forces:
         self.keys = [obstacle.key for obstacle in model.obstacles]
         bodies = len(model.lattice.first_of_body) if model.collision else 0
         held = len(model.holders.keys)
-        rows = {"reaction": held, "torque": held, "push": len(model.obstacles), "contact_push": bodies}
+        rows = {
+            "reaction": held,
+            "torque": held,
+            "push": len(model.obstacles),
+            "contact_push": bodies,
+        }
         self.rows = {name: count for name, count in rows.items() if count}
 
-    def __call__(self, q: Positions, time: float, sides: Indices | None, step: StepResult | None) -> dict[str, Any]:
+    def __call__(
+        self, q: Positions, time: float, sides: Indices | None, step: StepResult | None
+    ) -> dict[str, Any]:
         """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
         environment, owned = self.environment, self.model.lattice.owned
         problem = step.problem if step else None
@@ -298,10 +343,16 @@ class Forces:
         load = environment.forces.at(time)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "reaction" in self.rows:
-            held = (self._held(q, contact, step) - load) * environment.anchors.fixed_at(time)[:owned, None]
+            held = (self._held(q, contact, step) - load) * environment.anchors.fixed_at(time)[
+                :owned, None
+            ]
             sums["reaction"] = self.model.holders.totals(held)
             sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
-        return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
+        return {
+            name: self.comm.allreduce(sums[name])
+            for name in sums
+            if name == "load" or name in self.rows
+        }
 
     def _torque_points(self, time: float) -> Positions:
         """Return the points (a, 3) [m] about which the torques of pins and anchors are counted, which these lead."""
@@ -320,7 +371,11 @@ class Forces:
         if step and step.viscous is not None:
             held += step.viscous
         if step and step.problem:
-            held += self.model.lattice.mass[:, None] * (q[:owned] - step.problem.y[:owned]) / step.tau**2
+            held += (
+                self.model.lattice.mass[:, None]
+                * (q[:owned] - step.problem.y[:owned])
+                / step.tau**2
+            )
         return held
 
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:

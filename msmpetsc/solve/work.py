@@ -13,7 +13,9 @@ class Work:
     iterations: int = 0  # of SNES; substeps of an explicit integrator
     ksp_its: int = 0  # KSP iterations of all of them, and of what examines their results
     products: int = 0  # with the Hessian, those at multigrid's finest level included
-    proof_products: int = 0  # of these, for estimates of errors and in searches for a negative curvature
+    proof_products: int = (
+        0  # of these, for estimates of errors and in searches for a negative curvature
+    )
     steps: int = 0  # that stand
     substeps: int = 0  # shorter steps taken in place of one that failed
     fallbacks: int = 0  # steps solved by the robust method

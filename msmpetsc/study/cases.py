@@ -26,7 +26,15 @@ OVERRIDES = {  # values of a case that stand in tables of its scene
     "error": ("solver", "error"),
     "max_iterations": ("solver", "max_iterations"),
 }
-IN_TABLE = ("scene", "options", "label", "ranks", "repeats", "cells", *OVERRIDES)  # values that are columns
+IN_TABLE = (
+    "scene",
+    "options",
+    "label",
+    "ranks",
+    "repeats",
+    "cells",
+    *OVERRIDES,
+)  # values that are columns
 SURFACE = "output.surface=true"  # the override of a case whose surface is compared
 NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference")
 
@@ -105,7 +113,9 @@ def launcher(ranks: int) -> list[str]:
 
 def command(case: Case, result: Path, measure: Path) -> list[str]:
     """Return the command of one run: its frames go to ``result``, its figures to ``measure``."""
-    name, scene, *rest = run_arguments(case)  # the last of which may be an option of PETSc's without a value
+    name, scene, *rest = run_arguments(
+        case
+    )  # the last of which may be an option of PETSc's without a value
     outputs = ["-o", str(result), "--overwrite", "--measure", str(measure)]
     return [*launcher(case.ranks), *COLD, name, scene, *outputs, *rest]
 
@@ -119,7 +129,9 @@ def digest(file: Path, scene: Scene) -> str:
     """Return the digest of a scene file and of the files that it names."""
     names = sorted({name for _, name in scene.named_files()})
     paths = [file, *(file.parent / name for name in names)]
-    return hashlib.sha256(b"\0".join(path.read_bytes() for path in paths if path.is_file())).hexdigest()[:16]
+    return hashlib.sha256(
+        b"\0".join(path.read_bytes() for path in paths if path.is_file())
+    ).hexdigest()[:16]
 
 
 def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -127,7 +139,10 @@ def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
     Verlet solves nothing, so it has no solver table; implicit Euler is what a scene means that names no integrator.
     """
-    values = {**values, "integrator": None if values["integrator"] == "implicit-euler" else values["integrator"]}
+    values = {
+        **values,
+        "integrator": None if values["integrator"] == "implicit-euler" else values["integrator"],
+    }
     names = ("time",) if values["integrator"] == "verlet" else ("time", "solver")
     tables: dict[str, dict[str, Any]] = {name: {} for name in names}
     for name, (table, key) in OVERRIDES.items():
@@ -136,12 +151,20 @@ def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return tables
 
 
-def with_tables(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
+def with_tables(
+    case: Case, duration: float, every: int, scene: Scene, surface: bool = False
+) -> Case:
     """Return a case with the overrides of its solver, time and output tables."""
     tables = scene_tables(vars(case))
-    time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration} | tables["time"]
+    time = (
+        scene.time.model_dump(exclude_unset=True)
+        | {"step": case.time_step, "duration": duration}
+        | tables["time"]
+    )
     solver = [f"solver={toml_value(tables['solver'])}"] if "solver" in tables else []
-    case = case.changed(*solver, f"time={toml_value(time)}", SURFACE if surface else "output.surface=false")
+    case = case.changed(
+        *solver, f"time={toml_value(time)}", SURFACE if surface else "output.surface=false"
+    )
     return case.changed(f"output.every={every}") if every > 1 else case
 
 
@@ -150,7 +173,9 @@ def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:
-            if (sweep.scenes and scene.name not in sweep.scenes) or (not full and (sweep.full or scene.full)):
+            if (sweep.scenes and scene.name not in sweep.scenes) or (
+                not full and (sweep.full or scene.full)
+            ):
                 continue
             for own in of_laws(scene, sweep):
                 for case in sweep_cases(study, *own, folder):
@@ -172,7 +197,10 @@ def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep
         yield scene, sweep
     for law in sweep.laws:
         changed = scene.model_copy(update={"set": (*scene.set, f"material.law={law}")})
-        yield changed, sweep.model_copy(update={"label": ", ".join(filter(None, (sweep.label, law)))})
+        yield (
+            changed,
+            sweep.model_copy(update={"label": ", ".join(filter(None, (sweep.label, law)))}),
+        )
 
 
 def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> Iterator[Case]:
@@ -188,7 +216,9 @@ def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> 
         )  # fmt: skip
         base = replace(base, reference=_reference(base, scene, as_given))
         for case in _methods(base, scene, sweep, as_given):
-            load_scene(file, case.set, by_user=False)  # what is wrong is said before anything is run
+            load_scene(
+                file, case.set, by_user=False
+            )  # what is wrong is said before anything is run
             yield case
 
 
@@ -201,7 +231,9 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
         base = replace(base, true_error=scene.true_error)
         goals: list[dict[str, Any]] = [{"error": error} for error in sweep.errors]
         goals += [{"max_iterations": budget} for budget in sweep.max_iterations]
-        goals = goals or [{"error": as_given.solver.error, "max_iterations": as_given.solver.max_iterations}]
+        goals = goals or [
+            {"error": as_given.solver.error, "max_iterations": as_given.solver.max_iterations}
+        ]
         presets = sweep.presets or (as_given.solver.preset,)
         lists = {"preset": presets, "options": sweep.options, "time_step": steps, "goal": goals}
     for values in combinations(lists | {"ranks": sweep.ranks}):
@@ -212,7 +244,9 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 def _label(sweep: Sweep, case: Case) -> str:
     integrator = case.integrator.removeprefix("implicit-euler")  # the usual one
     name = sweep.label or " ".join(filter(None, (integrator, case.preset, case.options)))
-    return name if case.ranks == 1 or sweep.ranks == (case.ranks,) else f"{name}, {case.ranks} ranks"
+    return (
+        name if case.ranks == 1 or sweep.ranks == (case.ranks,) else f"{name}, {case.ranks} ranks"
+    )
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
@@ -241,13 +275,20 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     if reference is None:
         return None
     if reference.cells:
-        base = replace(base, cells=reference.cells, set=(*scene.set, f"cages.count={reference.cells}"))
+        base = replace(
+            base, cells=reference.cells, set=(*scene.set, f"cages.count={reference.cells}")
+        )
     if reference.law:
         base = base.changed(f"material.law={reference.law}")
     frame = scene.frame or as_given.time.step
     duration = scene.seconds(as_given.time.step, as_given.time.duration)
     case = replace(
-        base, integrator=reference.integrator, time_step=frame, repeats=1, timeout=reference.timeout, label="reference"
+        base,
+        integrator=reference.integrator,
+        time_step=frame,
+        repeats=1,
+        timeout=reference.timeout,
+        label="reference",
     )
     surface = reference.cells is not None
     if reference.integrator == "verlet":
@@ -255,7 +296,9 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     step = reference.step or frame  # the schema asks for it
     every = round(frame / step)
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
-        raise InputError(f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s")
+        raise InputError(
+            f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s"
+        )
     case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
     return with_tables(case, duration, every, as_given, surface)
 
@@ -293,7 +336,17 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
     if map.x and map.y and map.file:
         for y, x in product(map.y.values, map.x.values):
             changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
-            yield x, y, MapCase(name=map.name, file=map.file, steps=map.steps, duration=map.duration, set=changes)
+            yield (
+                x,
+                y,
+                MapCase(
+                    name=map.name,
+                    file=map.file,
+                    steps=map.steps,
+                    duration=map.duration,
+                    set=changes,
+                ),
+            )
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:

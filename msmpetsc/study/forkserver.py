@@ -44,7 +44,9 @@ class Forked:
         theirs.close()
         self.pid = int(self.process.pid or 0)
 
-    def begin(self, arguments: Sequence[str], log: Path, errors: Path | None = None, last: bool = False) -> None:
+    def begin(
+        self, arguments: Sequence[str], log: Path, errors: Path | None = None, last: bool = False
+    ) -> None:
         """Begin a command of ``msmpetsc``.
 
         log, errors : where its output goes, and its errors, if not there too
@@ -90,7 +92,9 @@ def _serve(commands: Connection, folder: str, environment: dict[str, str]) -> No
             speak_into(files)
             _forget()
             if not last:
-                start_for_runs(MPI.COMM_WORLD, [])  # options are then lent to a run, and no later one has them
+                start_for_runs(
+                    MPI.COMM_WORLD, []
+                )  # options are then lent to a run, and no later one has them
             sys.argv = ["msmpetsc", *arguments]
             status = import_module(PROGRAM).main()
             sys.stdout.flush()

@@ -57,8 +57,13 @@ def costs(record: dict[str, Any]) -> Row:
         row[f"time_{part}"] = record.get("time", {}).get(part)
     machine = record.get("machine", {})
     parts = [machine.get("cpu"), machine.get("cores") and f"{machine['cores']} cores"]
-    parts += [machine.get("memory") and f"{machine['memory'] / 2**30:.0f} GiB", machine.get("system")]
-    versions = ", ".join(f"{name} {version}" for name, version in record.get("versions", {}).items())
+    parts += [
+        machine.get("memory") and f"{machine['memory'] / 2**30:.0f} GiB",
+        machine.get("system"),
+    ]
+    versions = ", ".join(
+        f"{name} {version}" for name, version in record.get("versions", {}).items()
+    )
     return row | {"machine": ", ".join(str(part) for part in parts if part), "versions": versions}
 
 
@@ -81,13 +86,18 @@ def of_frames(result: Path, time_step: float) -> Row:
 
 def _soundness(series: dict[str, Floats]) -> Row:
     """Return counts of failures, inverted cells at the end, and the energy left where no load acts."""
-    row: Row = {name: float(np.nansum(series[name][1:])) for name in ("substeps", "fallbacks", "energy_gained")}
+    row: Row = {
+        name: float(np.nansum(series[name][1:]))
+        for name in ("substeps", "fallbacks", "energy_gained")
+    }
     if series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])
     if series["self_contacts"].any():
         row["self_contacts"] = float(series["self_contacts"].max())
         row["self_distance"] = float(np.nanmin(series["self_distance"]))
-    energy = np.sum([series[name] for name in ("kinetic", "elastic", "contact", "self_contact")], axis=0)
+    energy = np.sum(
+        [series[name] for name in ("kinetic", "elastic", "contact", "self_contact")], axis=0
+    )
     if energy[0] > 0 and not series["potential"].any():
         row["energy_left"] = float(energy[-1] / energy[0])
     return row
@@ -191,9 +201,13 @@ def distance_of_shapes(x: Floats, rest: Floats, mass: Floats) -> float:
     x, rest = (points - mass @ points / mass.sum() for points in (x, rest))
     size = max(np.abs(x).max(), side)  # what has flown apart must not overflow
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of a flat body several rotations are the best: any will do
+        warnings.simplefilter(
+            "ignore", UserWarning
+        )  # of a flat body several rotations are the best: any will do
         rotation, _ = Rotation.align_vectors(x / size, rest / size, weights=mass / mass.sum())
-    squared = ((x - rotation.apply(rest)) ** 2).sum(axis=1) / size**2  # scipy's own figure ends at 1e-8
+    squared = ((x - rotation.apply(rest)) ** 2).sum(
+        axis=1
+    ) / size**2  # scipy's own figure ends at 1e-8
     return float(np.sqrt(mass @ squared / mass.sum()) * size / side)
 
 
@@ -211,7 +225,9 @@ def trajectory_error(result: Path, reference: Path) -> float:
         rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
         pairs = common_times(run.frames.time[:], true.frames.time[:])
         if len(pairs) < 2:
-            raise InputError(f"{result} and {reference} have {len(pairs)} times in common, 2 are needed")
+            raise InputError(
+                f"{result} and {reference} have {len(pairs)} times in common, 2 are needed"
+            )
         off = moved = 0.0
         for of_run, of_reference in pairs:
             x, x_ref = run.frames.position[of_run], true.frames.position[of_reference]

@@ -52,7 +52,11 @@ class Processes:
         status: int | None = None
         try:
             status = process.wait(timeout)
-            reason = "" if status == 0 else last_error(log.read_text(errors="replace")) or f"exit status {status}"
+            reason = (
+                ""
+                if status == 0
+                else last_error(log.read_text(errors="replace")) or f"exit status {status}"
+            )
         except subprocess.TimeoutExpired:
             reason = too_long(timeout)
         finally:
@@ -69,7 +73,9 @@ class Processes:
         for process in idle:
             process.close()
 
-    def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen[bytes] | Forked | None:
+    def _start(
+        self, command: Sequence[str], log: Path, warm: bool
+    ) -> subprocess.Popen[bytes] | Forked | None:
         variables = environment(alone=command[0] != "mpiexec")
         with self._lock, open(log, "w") as out:
             if self.stopped:
@@ -80,14 +86,24 @@ class Processes:
                 process.begin(command[3:], log)
             else:
                 process = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, env=variables
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=out,
+                    start_new_session=True,
+                    env=variables,
                 )
             self._running.add(process)
             return process
 
     def _put_away(self, process: subprocess.Popen[bytes] | Forked, status: int | None) -> None:
         """Keep a process whose command went well for another one; end any other, with what it may have left running."""
-        serves = isinstance(process, Forked) and status == 0 and process.poll() is None and not self.stopped
+        serves = (
+            isinstance(process, Forked)
+            and status == 0
+            and process.poll() is None
+            and not self.stopped
+        )
         if not serves:
             end(process)
         with self._lock:

@@ -58,11 +58,16 @@ def write_report(folder: Path) -> Path:
 
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     """Return the whole page, which is self-contained."""
-    environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
+    environment = Environment(
+        autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True
+    )
     environment.filters |= {"svg": lambda chart: Markup(svg_text(chart)), "html": html}
     between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]
     filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
-    tables = {"table": table[[*FIRST, *filled, "command"]], "failures": failed(swept(table))[OF_FAILURES]}
+    tables = {
+        "table": table[[*FIRST, *filled, "command"]],
+        "failures": failed(swept(table))[OF_FAILURES],
+    }
     template = environment.get_template("report.html.j2")
     return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
 
@@ -70,11 +75,18 @@ def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
 def facts(table: DataFrame) -> dict[str, Any]:
     """Return machine, versions and how many cases there are."""
     plain = swept(table)
-    maps = {name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()}
-    platforms = {name.capitalize(): [text for text in table[name].unique() if text] for name in ("machine", "versions")}
+    maps = {
+        name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()
+    }
+    platforms = {
+        name.capitalize(): [text for text in table[name].unique() if text]
+        for name in ("machine", "versions")
+    }
     counts = {"cases": len(plain), "failed": len(failed(plain)), "empty": table.empty}
     rows = timed(plain)
-    often = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))  # nothing without cases
+    often = " or ".join(
+        map(str, sorted(set(rows["repeats"].fillna(1).astype(int))))
+    )  # nothing without cases
     note = often and f"{often}. {ONCE_NOTE}"
     if not rows.empty and is_repeated(rows):
         note = f"{often}: times are medians, ranges and whiskers from the least to the greatest"
@@ -84,4 +96,6 @@ def facts(table: DataFrame) -> dict[str, Any]:
 def html(table: DataFrame) -> Markup:
     """Return a table as HTML that is sorted by a click on a heading."""
     with option_context("display.max_colwidth", None):
-        return Markup(table.map(formatting.plain).to_html(index=False, border=0, classes="sortable"))
+        return Markup(
+            table.map(formatting.plain).to_html(index=False, border=0, classes="sortable")
+        )

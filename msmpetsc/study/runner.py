@@ -16,7 +16,15 @@ from tqdm import tqdm
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
-from msmpetsc.study.metrics import costs, of_frames, outcome, read_record, surface_error, together, trajectory_error
+from msmpetsc.study.metrics import (
+    costs,
+    of_frames,
+    outcome,
+    read_record,
+    surface_error,
+    together,
+    trajectory_error,
+)
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, records, require_extra, write_table
@@ -107,7 +115,9 @@ def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
 
 def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
     """Return the error of a run against its reference, by its column, or why there is none."""
-    name, measure = ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
+    name, measure = (
+        ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
+    )
     try:
         return {f"{name}_error": measure(path, reference)}, ""
     except InputError as error:
@@ -148,7 +158,9 @@ class StudyPart:
     count: int
 
     def of(self, cases: Sequence[str]) -> Sequence[str]:
-        return cases[len(cases) * (self.index - 1) // self.count : len(cases) * self.index // self.count]
+        return cases[
+            len(cases) * (self.index - 1) // self.count : len(cases) * self.index // self.count
+        ]
 
     def folder(self, study: Path) -> Path:
         return study / PARTS / f"{self.index}-of-{self.count}"
@@ -203,7 +215,9 @@ def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Seque
     return every, [case.id for case in study_cases(study, path.parent, full)]
 
 
-def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:
+def _carry_out(
+    bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int
+) -> None:
     """Run cases and add their results, with a progress bar that begins at ``done``."""
     bar = tqdm(total=done + len(todo), initial=done, unit="case", dynamic_ncols=True, disable=None)
     pool = ThreadPoolExecutor(jobs)
@@ -211,7 +225,9 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
         with bar:
             futures = [pool.submit(_carry_out_one, bench, case, results) for case in todo]
             for count, future in enumerate(as_completed(futures), done + 1):
-                bar.write(f"case {count}/{bar.total}  {described(future.result())}", file=sys.stderr)
+                bar.write(
+                    f"case {count}/{bar.total}  {described(future.result())}", file=sys.stderr
+                )
                 bar.update()
     finally:  # what ends this early ends the runs under way
         bench.processes.close()
@@ -257,11 +273,15 @@ def _earlier_rows(folder: Path) -> list[Row]:
         return []
     table = read_table(folder)
     if (table["case"] == "").any() or table[["ranks", "repeats"]].isna().any(axis=None):
-        raise InputError(f"{path} is not the table of a study of this version: --restart begins anew")
+        raise InputError(
+            f"{path} is not the table of a study of this version: --restart begins anew"
+        )
     return records(table)
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
     """Return whether a case need not be run; one that timed out is run again with a longer limit."""
     row = rows.get(case.id)
-    return row is not None and not (row["status"] == "timeout" and row["reason"] != too_long(case.timeout))
+    return row is not None and not (
+        row["status"] == "timeout" and row["reason"] != too_long(case.timeout)
+    )

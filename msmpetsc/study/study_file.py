@@ -5,12 +5,27 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.scene.problems import problem_lines, rule
 from msmpetsc.scene.reading import OF_STUDIES, read_toml
-from msmpetsc.scene.values import Count, FileName, IntegratorName, ListOf, Positive, PresetName, Table
+from msmpetsc.scene.values import (
+    Count,
+    FileName,
+    IntegratorName,
+    ListOf,
+    Positive,
+    PresetName,
+    Table,
+)
 from msmpetsc.solve.petsc.words import unsafe_word
 from msmpetsc.solve.presets import preset_names
 
@@ -25,7 +40,9 @@ def _words(options: str) -> str:
     except ValueError as error:
         raise rule(f"cannot be taken apart: {str(error).lower()}") from None
     if refused is not None:
-        raise rule(f"has {refused!r}: only options of solvers, and plain values, may stand in a file")
+        raise rule(
+            f"has {refused!r}: only options of solvers, and plain values, may stand in a file"
+        )
     return options
 
 
@@ -90,7 +107,9 @@ class StudyScene(Length):
     name: Name
     file: FileName  # a path from the study file
     set: ListOf[Override] = ()
-    frame: Positive | None = None  # [s] between moments compared with the reference; the scene's time step if absent
+    frame: Positive | None = (
+        None  # [s] between moments compared with the reference; the scene's time step if absent
+    )
     reference: ReferenceRun | None = None
     true_error: Count | None = None  # every so many steps the true step error is measured
     full: bool = False  # only with --full

@@ -48,7 +48,9 @@ def require_extra() -> None:
 
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
     """Write table.csv, with columns of counts as integers and empty entries for what was not measured."""
-    table = as_table(rows).replace([math.inf, -math.inf], math.nan).convert_dtypes(convert_string=False)
+    table = (
+        as_table(rows).replace([math.inf, -math.inf], math.nan).convert_dtypes(convert_string=False)
+    )
     write_whole(folder / "table.csv", table.to_csv(index=False, lineterminator="\r\n"))
 
 
@@ -62,7 +64,9 @@ def read_table(folder: Path) -> "DataFrame":
     try:
         texts = pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna("")
     except ValueError as error:  # of pandas' parser, of text that is not UTF-8
-        raise InputError(f"{path} is not the table of a study: {str(error).splitlines()[0]}") from None
+        raise InputError(
+            f"{path} is not the table of a study: {str(error).splitlines()[0]}"
+        ) from None
     return typed(texts.to_dict("records"))  # type: ignore[arg-type]  # columns are called by text
 
 
@@ -76,7 +80,9 @@ def as_table(rows: Sequence[Row]) -> "DataFrame":
 
 def typed(texts: Iterable[Mapping[str, str]]) -> "DataFrame":
     """Return rows of text as a table; a number that is missing, infinite or unreadable is NaN."""
-    return as_table([{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts])
+    return as_table(
+        [{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts]
+    )
 
 
 def records(table: "DataFrame") -> list[Row]:
@@ -140,7 +146,9 @@ def spread(table: "DataFrame", cost: str) -> "DataFrame":
     else:
         least, greatest = (table[cost] / table["time_frame"] * end for end in ends)
     known = least.notna() & greatest.notna()
-    return table.assign(least=least.where(known), greatest=greatest.where(known))[["least", "greatest"]]
+    return table.assign(least=least.where(known), greatest=greatest.where(known))[
+        ["least", "greatest"]
+    ]
 
 
 def is_repeated(table: "DataFrame") -> bool:

@@ -14,13 +14,18 @@ from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK,
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
 
-CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its lines, size and middle
+CAPTION, LINES = (
+    68,
+    ((21, 22), (16, 50)),
+)  # [px]: height of a caption; of its lines, size and middle
 
 
 @cache
 def typeface(size: int) -> ImageFont.FreeTypeFont:
     """Return the font DejaVu Sans, which comes with matplotlib, in a size [px]."""
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size)
+    return ImageFont.truetype(
+        str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size
+    )
 
 
 def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
@@ -60,13 +65,19 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     entries: list[Entry] = []
     if colouring.classes:
         pairs = enumerate(colouring.classes)
-        entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
+        entries += [
+            Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name
+        ]
     else:
         entries.append(Entry("bar", colouring.label, ticks=colouring.ticks))
     kinds = {kind for still in stills if still.cut for kind in still.cut}
-    entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
+    entries += [
+        Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds
+    ]
     if any(composition.subject.fixed(still.index).any() for still in (stills[0], stills[-1])):
-        held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
+        held = [
+            word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))
+        ]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
     if any(still.overlays.arrows for still in stills):
         entries.append(Entry("arrow", "force", ARROW))
@@ -96,7 +107,9 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
         for entry in line:
             picture.paste(entry, (left, FINE * LINE * number))
             left += entry.width
-    return np.array(picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS))
+    return np.array(
+        picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS)
+    )
 
 
 def _entry_picture(entry: Entry) -> Image.Image:
@@ -105,7 +118,9 @@ def _entry_picture(entry: Entry) -> Image.Image:
     half, gap = 8 * FINE, (18 if entry.ticks else 8) * FINE  # beside the number of the last tick
     width = FINE * WIDTHS[entry.kind]
     right = left + width
-    picture = Image.new("RGB", (round(right + gap + font.getlength(entry.text) + left), FINE * LINE), "white")
+    picture = Image.new(
+        "RGB", (round(right + gap + font.getlength(entry.text) + left), FINE * LINE), "white"
+    )
     draw = ImageDraw.Draw(picture)
     box = (left, middle - half, right, middle + half)
     if entry.kind == "bar":
@@ -125,7 +140,8 @@ def _entry_picture(entry: Entry) -> Image.Image:
     elif entry.kind == "arrow":
         draw.line((left, middle, right - half, middle), entry.colour, 2 * FINE)
         draw.polygon(
-            [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)], entry.colour
+            [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)],
+            entry.colour,
         )
     draw.text((right + gap, middle), entry.text, INK, font, anchor="lm")
     return picture

@@ -9,7 +9,10 @@ from numpy.typing import ArrayLike
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 
-YAW, ELEVATION = math.radians(25), math.radians(14)  # how far the eye stands to the side, and above, if nothing is said
+YAW, ELEVATION = (
+    math.radians(25),
+    math.radians(14),
+)  # how far the eye stands to the side, and above, if nothing is said
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,9 @@ class Camera:
         return points @ np.stack([self.right, self.upward], axis=1)
 
 
-def camera_facing(points: Positions, gravity: Sequence[float] | None, eye: Sequence[float] | None = None) -> Camera:
+def camera_facing(
+    points: Positions, gravity: Sequence[float] | None, eye: Sequence[float] | None = None
+) -> Camera:
     """Return a camera in direction `eye` (3,) of points (n, 3); up is against gravity, z without it.
 
     Without eye, or with one straight above or below, the longer horizontal extent lies across the picture.
@@ -63,5 +68,7 @@ def camera_facing(points: Positions, gravity: Sequence[float] | None, eye: Seque
 def unit(vector: ArrayLike) -> Floats:
     """Return a vector (3,) normalised to length 1."""
     given: Floats = np.asarray(vector, float)
-    scaled: Floats = given / np.abs(given).max()  # squares of very large or small components leave the range
+    scaled: Floats = (
+        given / np.abs(given).max()
+    )  # squares of very large or small components leave the range
     return np.divide(scaled, np.linalg.norm(scaled))

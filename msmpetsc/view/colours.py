@@ -23,7 +23,9 @@ CLASSES = (  # of bodies and of a body's parts
 # red, green and blue (256, 3), 0 to 255: along the scale, and of classes over and over
 ALONG_SCALE = LinearSegmentedColormap.from_list("", SCALE)(np.arange(256))[:, :3]
 SCALE_TABLE: Array = np.rint(255 * ALONG_SCALE).astype(np.uint8)
-CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256, 3))).astype(np.uint8)
+CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256, 3))).astype(
+    np.uint8
+)
 
 
 # Fields on the surface
@@ -85,7 +87,11 @@ class Colouring:
     @property
     def _size(self) -> float:
         """One unit of the ticks, in the unit of the values."""
-        return 0.01 if self.unit == "%" else next((size for size in PREFIXES if self.high >= size), 1.0)
+        return (
+            0.01
+            if self.unit == "%"
+            else next((size for size in PREFIXES if self.high >= size), 1.0)
+        )
 
 
 def colouring_of(subject: Drawable, name: str | None) -> Colouring:
@@ -95,7 +101,9 @@ def colouring_of(subject: Drawable, name: str | None) -> Colouring:
         return Colouring("body", "", lambda _: number, classes=("",) * len(CLASSES))
     if name not in COLOURINGS:
         near = did_you_mean(name, COLOURINGS)
-        raise InputError(f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}")
+        raise InputError(
+            f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}"
+        )
     return COLOURINGS[name](subject)
 
 
@@ -118,10 +126,17 @@ def _speed(subject: Drawable) -> Colouring:
         before, after = max(index - 1, 0), min(index + 1, last)
         if before == after:
             return np.zeros(len(subject.rest.points))
-        velocity = (subject.surface(after) - subject.surface(before)) / (subject.times[after] - subject.times[before])
+        velocity = (subject.surface(after) - subject.surface(before)) / (
+            subject.times[after] - subject.times[before]
+        )
         return np.asarray(np.linalg.norm(velocity, axis=1))
 
-    return Colouring("speed", "m/s", values, natural=abs(subject.rest.points).max() / (np.ptp(subject.times) or 1.0))
+    return Colouring(
+        "speed",
+        "m/s",
+        values,
+        natural=abs(subject.rest.points).max() / (np.ptp(subject.times) or 1.0),
+    )
 
 
 def _strain(subject: Drawable) -> Colouring:
@@ -133,7 +148,9 @@ def _strain(subject: Drawable) -> Colouring:
         nodes = subject.nodes(index)
         length = np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1)
         squares = np.repeat((length / rest_length - 1) ** 2, 2)
-        return subject.on_surface(np.sqrt(np.bincount(springs.ravel(), squares, len(nodes)) / count))
+        return subject.on_surface(
+            np.sqrt(np.bincount(springs.ravel(), squares, len(nodes)) / count)
+        )
 
     return Colouring("strain of the springs", "%", values, natural=1.0)
 
@@ -143,10 +160,16 @@ def _stress(subject: Drawable) -> Colouring:
     von_mises = subject.von_mises
     if von_mises is None:
         if subject.scene.material.poisson is None:
-            raise InputError(f"--colour stress: {subject.name} is of springs, whose law has no stress")
-        raise InputError(f"--colour stress: {subject.name} has no stress: run its scene with output.stress = true")
+            raise InputError(
+                f"--colour stress: {subject.name} is of springs, whose law has no stress"
+            )
+        raise InputError(
+            f"--colour stress: {subject.name} has no stress: run its scene with output.stress = true"
+        )
     young = subject.scene.material.young_modulus or 0.0
-    return Colouring("von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)), natural=young)
+    return Colouring(
+        "von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)), natural=young
+    )
 
 
 def _part(subject: Drawable) -> Colouring:
@@ -158,7 +181,9 @@ def _part(subject: Drawable) -> Colouring:
     for index, part in enumerate(parts):
         number[rest.find_cells(part)] = index + 1
     of_points = number[rest.cells_around(rest.points, rest.body_of_point)]
-    return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts)))
+    return Colouring(
+        "part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts))
+    )
 
 
 COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {

@@ -77,7 +77,9 @@ class Composition:
         stills = []
         for index in frames:
             overlays = overlays_at(self.subject, index, self.extremes, self.camera)
-            stills.append(Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
+            stills.append(
+                Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut)
+            )
         return stills
 
     def room(self, stills: Sequence[Still]) -> tuple[Floats, Floats, float]:
@@ -91,7 +93,9 @@ class Composition:
         for still in stills:
             shown = still.overlays
             below = [ground.below(self.extremes) for ground in shown.grounds]
-            flat = self.camera.flat(np.concatenate([self.extremes, *below, *shown.arrows, shown.obstacles]))
+            flat = self.camera.flat(
+                np.concatenate([self.extremes, *below, *shown.arrows, shown.obstacles])
+            )
             ends += [flat.min(axis=0) - margin, flat.max(axis=0) + margin]
             corners += [shown.obstacles, *(ground.corners for ground in shown.grounds)]
         depth = float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))
@@ -125,7 +129,9 @@ def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Co
     gravity = subject.scene.gravity
     pull = gravity.acceleration if gravity else None
     camera = camera_facing(shown, pull, style.eye or subject.scene.picture.eye)
-    return Composition(subject, style, shown, bounds, camera, scaled(colouring, subject, distinct), note)
+    return Composition(
+        subject, style, shown, bounds, camera, scaled(colouring, subject, distinct), note
+    )
 
 
 def around(points: Positions) -> Positions:
@@ -154,4 +160,6 @@ def staying(boxes: Positions) -> Mask:
     nearest = np.argsort(way, kind="stable")[: max(1, len(way) // 2)]
     home = around(np.concatenate([begin, boxes[:, nearest].reshape(-1, 3)]))
     reach = np.ptp(home, axis=0).max()
-    return np.asarray(((boxes[:, :, 0] >= home[0] - reach) & (boxes[:, :, 1] <= home[1] + reach)).all(axis=(0, 2)))
+    return np.asarray(
+        ((boxes[:, :, 0] >= home[0] - reach) & (boxes[:, :, 1] <= home[1] + reach)).all(axis=(0, 2))
+    )

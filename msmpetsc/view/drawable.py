@@ -21,7 +21,14 @@ if TYPE_CHECKING:
     from msmpetsc.build import Model
     from msmpetsc.scene.reading import Scene
 
-DRAWN = ("lattice/cells", "surface/points", "surface/triangles", "frames/kinetic", "frames/elastic", "frames/potential")
+DRAWN = (
+    "lattice/cells",
+    "surface/points",
+    "surface/triangles",
+    "frames/kinetic",
+    "frames/elastic",
+    "frames/potential",
+)
 FARTHEST = 1e15  # [m]: what is drawn has single precision, and its squares must be numbers, too
 
 
@@ -41,7 +48,10 @@ class BodiesAtRest:
     @property
     def bounds(self) -> Positions:
         """Corners (b, 2, 3) of the bounding box of each body's surface [m]."""
-        of_bodies = (self.points[self.body_of_point == number] for number in range(self.body_of_point.max() + 1))
+        of_bodies = (
+            self.points[self.body_of_point == number]
+            for number in range(self.body_of_point.max() + 1)
+        )
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
     def find(self, table: OfBody) -> Mask:
@@ -49,8 +59,12 @@ class BodiesAtRest:
         region = table.table.region
         if region.is_of_mesh:
             return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
-        low, high = np.moveaxis(self.bounds[self.body_of_node], 1, 0)  # what sticks out is where its body is
-        return inside_bodies(region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body)
+        low, high = np.moveaxis(
+            self.bounds[self.body_of_node], 1, 0
+        )  # what sticks out is where its body is
+        return inside_bodies(
+            region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body
+        )
 
     @property
     def middles(self) -> Positions:
@@ -62,7 +76,9 @@ class BodiesAtRest:
         region = table.table.region
         if region.is_of_mesh:
             return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
-        return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
+        return inside_bodies(
+            region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body
+        )
 
     def _painted_cells(self, table: OfBody) -> Indices:
         """Return the numbers of the cells of a table's body around its painted points."""
@@ -77,7 +93,9 @@ class BodiesAtRest:
         of_cell, around = self.body_of_node[self.cells[:, 0]], np.empty(len(points), int)
         for number in np.unique(body):
             own, inside = np.flatnonzero(of_cell == number), body == number
-            around[inside] = own[KDTree(self.middles[own]).query(points[inside], p=np.inf)[1]]  # cubes: the nearest
+            around[inside] = own[
+                KDTree(self.middles[own]).query(points[inside], p=np.inf)[1]
+            ]  # cubes: the nearest
         return around
 
 
@@ -134,7 +152,9 @@ def drawable_of_result(run: Result) -> Drawable:
     """Return the bodies of a result. Raises InputError where they cannot be drawn."""
     scene = read_scene(run)
     if "embedding/weights" not in run:
-        raise InputError(f"{run.path} has no surface to draw: its scene says output.surface = false")
+        raise InputError(
+            f"{run.path} has no surface to draw: its scene says output.surface = false"
+        )
     for name in DRAWN:
         if len(run[name]) == 0:
             raise InputError(f"{run.path} is damaged, or has no finished frame: {name} is empty")
@@ -154,13 +174,20 @@ def drawable_of_result(run: Result) -> Drawable:
         embedding=run.embedding,
         array=lambda name: run.indices(name) if name == "lattice/springs" else run[name][:],
         solids=solids_of(run),
-        von_mises=(lambda index: run.frames.von_mises[index].astype(float)) if "von_mises" in run.frames else None,
+        von_mises=(lambda index: run.frames.von_mises[index].astype(float))
+        if "von_mises" in run.frames
+        else None,
     )
 
 
 def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     """Return the bodies of a scene before its first step, from a model on one process."""
-    lattice, surface, embedding, owned = model.lattice, model.surface, model.embedding, model.lattice.owned
+    lattice, surface, embedding, owned = (
+        model.lattice,
+        model.surface,
+        model.embedding,
+        model.lattice.owned,
+    )
     if surface is None or embedding is None:
         raise InputError(f"{path} has no surface to draw: it says output.surface = false")
     start = np.asarray(model.start[0])[:owned]
@@ -188,15 +215,29 @@ def solids_of(run: Result) -> dict[int, Surface]:
     """Return the obstacle surfaces stored in a result. Raises InputError for damaged ones."""
     if "obstacle/points" not in run:
         return {}
-    points, triangles, numbers = run["obstacle/points"][:], run.indices("obstacle/triangles"), run["obstacle/number"][:]
+    points, triangles, numbers = (
+        run["obstacle/points"][:],
+        run.indices("obstacle/triangles"),
+        run["obstacle/number"][:],
+    )
     if not (np.abs(points) < FARTHEST).all():
         raise InputError(f"{run.path} is damaged: the surfaces of its obstacles are none")
-    return {int(number): compact(points, triangles[numbers == number]) for number in np.unique(numbers)}
+    return {
+        int(number): compact(points, triangles[numbers == number]) for number in np.unique(numbers)
+    }
 
 
 def read_scene(run: Result) -> SceneFile:
     """Return the scene of a result with its keys checked. Raises InputError."""
     try:
         return SceneFile.model_validate(run.scene)
-    except (InputError, ValueError, TypeError, AttributeError, RecursionError) as error:  # pydantic's among them
-        raise InputError(f"{run.path} was run by another version, with a scene unknown to this one") from error
+    except (
+        InputError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:  # pydantic's among them
+        raise InputError(
+            f"{run.path} was run by another version, with a scene unknown to this one"
+        ) from error

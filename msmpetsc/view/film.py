@@ -76,11 +76,15 @@ def playback_of(times: Floats, speed: float | None = None) -> Playback:
         return Playback(np.arange(len(times)), FASTEST / 3, 0.0)
     speed = speed or usual_speed(float(times[-1] - times[0]))
     fps = max(1.0, min(FASTEST, speed / float(np.median(steps))))
-    shown = times[0] + np.arange(0, (times[-1] - times[0]) * (1 + 1e-9) + speed / fps / 2, speed / fps)
+    shown = times[0] + np.arange(
+        0, (times[-1] - times[0]) * (1 + 1e-9) + speed / fps / 2, speed / fps
+    )
     return Playback(abs(shown[:, None] - times).argmin(axis=1), fps, speed)
 
 
-def write_film(subject: Drawable, path: Path, frames: Sequence[int], style: Style, playback: Playback) -> None:
+def write_film(
+    subject: Drawable, path: Path, frames: Sequence[int], style: Style, playback: Playback
+) -> None:
     """Write a film of some frames. Raises InputError where it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
     composition = composition_of(drawn(subject), played, style)
@@ -97,7 +101,9 @@ def _usual_size(composition: Composition, stills: list[Still]) -> tuple[int, int
     low, high, _ = composition.room(stills)
     width, height = np.maximum((high - low) * LONGEST / (high - low).max(), SHORTEST)
     letters = _letters(width, height)
-    below = letters * CAPTION + len(legend_picture(entries_of(composition, stills), round(width), letters))
+    below = letters * CAPTION + len(
+        legend_picture(entries_of(composition, stills), round(width), letters)
+    )
     return 2 * round(width / 2), 2 * round((height + below) / 2)
 
 
@@ -106,7 +112,9 @@ def _letters(width: float, height: float) -> float:
     return float(np.clip(((width, height) / USUAL).min(), SMALLEST, 1.0))
 
 
-def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[Array]:
+def _pictures(
+    composition: Composition, stills: list[Still], size: tuple[int, int]
+) -> Iterator[Array]:
     """Yield the picture (height, width, 3) of each still; a frame that stays is drawn once."""
     width, height = size
     letters = _letters(width, height)
@@ -122,7 +130,9 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
             yield from [picture] * (1 + len(others))
 
 
-def write_pictures(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
+def write_pictures(
+    path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float
+) -> None:
     """Write pictures (height, width, 3) as a film. Raises InputError."""
     with whole_file(path) as part:
         if path.suffix.lower() == ".mp4":
@@ -138,7 +148,9 @@ def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], f
     """
     import imageio_ffmpeg
 
-    options: dict[str, Any] = dict(codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="quiet")
+    options: dict[str, Any] = dict(
+        codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="quiet"
+    )
     sent = 0
     try:
         with closing(imageio_ffmpeg.write_frames(str(path), size, fps=fps, **options)) as writer:
@@ -156,5 +168,7 @@ def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], f
 def _write_images(path: Path, pictures: Iterable[Array], fps: float) -> None:
     """Write an endless GIF or animated WebP by Pillow, which takes all pictures at once."""
     images = [Image.fromarray(picture) for picture in pictures]
-    options: dict[str, Any] = dict(duration=1000 / fps, loop=0, quality=80, method=4)  # these two of WebP
+    options: dict[str, Any] = dict(
+        duration=1000 / fps, loop=0, quality=80, method=4
+    )  # these two of WebP
     images[0].save(path, save_all=True, append_images=images[1:], **options)

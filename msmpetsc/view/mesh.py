@@ -20,7 +20,9 @@ from msmpetsc.view.drawable import BodiesAtRest, Drawable
 SHARP = 30.0  # [degrees] between the normals of two triangles: beyond it their edge is sharp
 HELD = 0.5  # pinned or led share of the surface beyond which it is painted as fixed
 MOST = 30_000  # triangles, roughly: however small the cells, edges are not divided into more
-CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])  # of a cell, VTK's order
+CORNERS = np.array(
+    [[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+)  # of a cell, VTK's order
 
 
 def drawn(subject: Drawable) -> Drawable:
@@ -36,7 +38,9 @@ def _refined(subject: Drawable) -> Drawable:
         return subject
     a, b, c = rest.points[subject.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-    points, triangles, part_of = subdivided(rest.points, subject.triangles, max(cell, np.sqrt(2 * area / MOST)))
+    points, triangles, part_of = subdivided(
+        rest.points, subject.triangles, max(cell, np.sqrt(2 * area / MOST))
+    )
     body = np.append(rest.body_of_point, np.empty(len(points) - len(rest.points), int))
     body[triangles] = body[subject.triangles[part_of, :1]]
     T = trilinear(rest, points[len(rest.points) :], body[len(rest.points) :])
@@ -54,7 +58,9 @@ def surface_of(points: Array, triangles: Array) -> pv.PolyData:
     return surface
 
 
-def subdivided(points: Positions, triangles: Indices, longest: float) -> tuple[Positions, Indices, Indices]:
+def subdivided(
+    points: Positions, triangles: Indices, longest: float
+) -> tuple[Positions, Indices, Indices]:
     """Return a surface whose edges longer than `longest` [m] are divided.
 
     It is points (p, 3), the first of which are those given, triangles (f, 3), and of each the number
@@ -91,7 +97,9 @@ def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indi
     Two corners of triangles at one point stay one drawn point where no sharp edge parts them.
     """
     surface = surface_of(points, triangles)
-    options: dict[str, Any] = dict(consistent_normals=False, non_manifold_traversal=False, cell_normals=False)
+    options: dict[str, Any] = dict(
+        consistent_normals=False, non_manifold_traversal=False, cell_normals=False
+    )
     split = surface.compute_normals(split_vertices=True, feature_angle=SHARP, **options)
     return split["pyvistaOriginalPointIds"], split.regular_faces
 

@@ -87,7 +87,9 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
     bodies : (b, 3) surface points of all pictures [m], which say how much of an obstacle is worth showing
     """
     time, solids = float(subject.times[index]), subject.solids
-    shown = Overlays(arrows=[arrow for arrow in _arrows(subject, index) if _is_near(arrow[[0, 0]], bodies)])
+    shown = Overlays(
+        arrows=[arrow for arrow in _arrows(subject, index) if _is_near(arrow[[0, 0]], bodies)]
+    )
     for number, obstacle in enumerate(subject.scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):
             continue
@@ -95,21 +97,35 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
         pose = path.value_at(time)
         seen_from_it = path.unmoved(bodies, pose)
         if obstacle.shape == "box":
-            shown.glass.extend(path.moved(corners, pose) for corners in _box(np.array(obstacle.box), seen_from_it))
+            shown.glass.extend(
+                path.moved(corners, pose) for corners in _box(np.array(obstacle.box), seen_from_it)
+            )
         elif obstacle.shape == "sphere":
             center, radius = np.array(obstacle.center) + pose[:3], obstacle.radius or 0.0
             seen = _box(np.array([center - radius, center + radius]), bodies)
             shown.balls.extend(Ball(center, radius, corners) for corners in seen)
         elif obstacle.shape == "plane":
-            _add_plane(shown, np.array(obstacle.point) + pose[:3], np.array(obstacle.normal), bodies, camera)
+            _add_plane(
+                shown,
+                np.array(obstacle.point) + pose[:3],
+                np.array(obstacle.normal),
+                bodies,
+                camera,
+            )
         elif number in solids and len(solids[number].points):
             origin, *axes = path.moved(np.concatenate([np.zeros((1, 3)), np.eye(3)]), pose)
-            corners = (path.moved(box, pose) for box in _box(bounds_of(solids[number]), seen_from_it))
-            shown.meshes.extend(MeshObstacle(number, np.array(axes) - origin, origin, seen) for seen in corners)
+            corners = (
+                path.moved(box, pose) for box in _box(bounds_of(solids[number]), seen_from_it)
+            )
+            shown.meshes.extend(
+                MeshObstacle(number, np.array(axes) - origin, origin, seen) for seen in corners
+            )
     return shown
 
 
-def _add_plane(shown: Overlays, point: Floats, normal: Floats, bodies: Positions, camera: Camera) -> None:
+def _add_plane(
+    shown: Overlays, point: Floats, normal: Floats, bodies: Positions, camera: Camera
+) -> None:
     """Add a near plane, as ground or, where it hides the body, as a plate of glass."""
     if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
         return
@@ -161,8 +177,14 @@ def _arrows(subject: Drawable, index: int) -> list[Positions]:
     arrows = []
     for table in subject.scene.tables("force"):
         force = table.table
-        total = total_of(force.total or (0.0, 0.0, 0.0)).value_at(time)  # a function has no one direction
-        if within(time, force.start, force.stop) and any(total) and (where := rest.find(table)).any():
+        total = total_of(force.total or (0.0, 0.0, 0.0)).value_at(
+            time
+        )  # a function has no one direction
+        if (
+            within(time, force.start, force.stop)
+            and any(total)
+            and (where := rest.find(table)).any()
+        ):
             tail = subject.nodes(index)[where].mean(axis=0)
             arrows.append(np.array([tail, tail + length * unit(total)]))
     return arrows

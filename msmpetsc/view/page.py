@@ -50,7 +50,13 @@ def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Styl
         step = max(2, int(np.ceil(size / MOST)))
         chosen = [*chosen[:-1:step], chosen[-1]]
     if len(chosen) < len(frames):
-        log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
+        log.info(
+            "%s has %d of the %d frames: all would be above %.0f MB",
+            path,
+            len(chosen),
+            len(frames),
+            MOST / 1e6,
+        )
     states: dict[bytes, int] = {}  # pinned or led shares of the points times 255, each state once
     fixed = (np.rint(255 * composition.subject.fixed(index)).astype(np.uint8) for index in chosen)
     numbers = [states.setdefault(mask.tobytes(), len(states)) for mask in fixed]
@@ -70,7 +76,9 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
     }
 
 
-def quantised(points: Callable[[int], Positions], frames: Iterable[int], box: Positions) -> Iterator[Indices]:
+def quantised(
+    points: Callable[[int], Positions], frames: Iterable[int], box: Positions
+) -> Iterator[Indices]:
     """Yield the points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
     scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
     for index in counted(list(frames), "frames packed"):
@@ -150,7 +158,9 @@ def solid_facts(surface: Surface) -> dict[str, Floats]:
 
 def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> str:
     """Return the text of the page, which loads no other file."""
-    data = facts | {"streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}}
+    data = facts | {
+        "streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}
+    }
     parts = {
         "title": html.escape(title),
         "css": (PARTS / "page.css").read_text(encoding="utf-8"),

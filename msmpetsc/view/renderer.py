@@ -32,7 +32,9 @@ class Renderer(AbstractContextManager["Renderer"]):
             self._plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
             self._plotter.background_color = pv.Color("white")
             for position, intensity in (((-0.5, 1.1, 1.3), 0.85), ((1, 0.15, 0.65), 0.35)):
-                self._plotter.add_light(pv.Light(position=position, intensity=intensity, light_type="camera light"))
+                self._plotter.add_light(
+                    pv.Light(position=position, intensity=intensity, light_type="camera light")
+                )
             self._plotter.enable_anti_aliasing("ssaa")
             self._face((low + high) / 2, height)
 
@@ -43,7 +45,9 @@ class Renderer(AbstractContextManager["Renderer"]):
     def picture(self, still: Still) -> Array:
         """Return the picture (height, width, 3) of a still. Raises InputError if the graphics library gives none."""
         with quiet_opengl():
-            self._plotter.suppress_rendering = True  # or all that is added would be drawn once more, half done
+            self._plotter.suppress_rendering = (
+                True  # or all that is added would be drawn once more, half done
+            )
             self._plotter.clear_actors()
             self._draw(still)
             self._plotter.suppress_rendering = False
@@ -60,7 +64,11 @@ class Renderer(AbstractContextManager["Renderer"]):
         across, upward = centre
         behind = self._composition.box.mean(axis=0) @ camera.to_eye
         middle = across * camera.right + upward * camera.upward + behind * camera.to_eye
-        view.focal_point, view.position, view.up = middle, middle + far * camera.to_eye, camera.upward
+        view.focal_point, view.position, view.up = (
+            middle,
+            middle + far * camera.to_eye,
+            camera.upward,
+        )
         view.parallel_projection = True
         view.parallel_scale = height / 2
         view.clipping_range = (far / 100, 2 * far)
@@ -72,20 +80,31 @@ class Renderer(AbstractContextManager["Renderer"]):
         surface["fixed"] = subject.fixed(still.index)
         for ground in still.overlays.grounds:
             _draw_ground(self._plotter, ground, surface)
-        shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
+        shading: dict[str, Any] = dict(
+            smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08
+        )
         shading["opacity"] = THROUGH if still.cut else 1.0
         # The border crosses triangles, so it is as smooth as the share that is fixed.
         # A clip of PolyData would merge the points along sharp edges.
-        free, held = surface.cast_to_unstructured_grid().clip_scalar(scalars="fixed", value=HELD, both=True)
+        free, held = surface.cast_to_unstructured_grid().clip_scalar(
+            scalars="fixed", value=HELD, both=True
+        )
         for part, paint in (free, dict(scalars="colours", rgb=True)), (held, dict(color=FIXED)):
             if part.n_cells:
                 self._plotter.add_mesh(part, **paint, **shading)
         for kind, cells in (still.cut or {}).items():
-            grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, subject.nodes(still.index)).shrink(SHRUNK)
+            grid = pv.UnstructuredGrid(
+                {pv.CellType.HEXAHEDRON: cells}, subject.nodes(still.index)
+            ).shrink(SHRUNK)
             self._plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
         self._draw_obstacles(still.overlays)
-        for tail, tip in still.overlays.arrows:  # nearer to the eye is the same point of the picture
-            _draw_arrow(self._plotter, tail + 2 * self._depth * self._composition.camera.to_eye, tip - tail)
+        for (
+            tail,
+            tip,
+        ) in still.overlays.arrows:  # nearer to the eye is the same point of the picture
+            _draw_arrow(
+                self._plotter, tail + 2 * self._depth * self._composition.camera.to_eye, tip - tail
+            )
 
     def _draw_obstacles(self, overlays: Overlays) -> None:
         for corners in overlays.glass:
@@ -93,9 +112,16 @@ class Renderer(AbstractContextManager["Renderer"]):
             box.points = corners
             box.dimensions = (2, 2, 2)
             self._plotter.add_mesh(box, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
-            self._plotter.add_mesh(box.extract_all_edges(), color=GLASS_EDGE, line_width=2, lighting=False)
+            self._plotter.add_mesh(
+                box.extract_all_edges(), color=GLASS_EDGE, line_width=2, lighting=False
+            )
         for ball in overlays.balls:
-            sphere = pv.Sphere(radius=ball.radius, center=ball.center.tolist(), theta_resolution=96, phi_resolution=96)
+            sphere = pv.Sphere(
+                radius=ball.radius,
+                center=ball.center.tolist(),
+                theta_resolution=96,
+                phi_resolution=96,
+            )
             look: dict[str, Any] = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
             self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **look)
         for obstacle in overlays.meshes:
@@ -109,11 +135,15 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     """Draw a disk that fades towards its rim, and the body's shadow on it."""
     middle = ground.corners.mean(axis=0)
     radius = float(np.linalg.norm(ground.corners[1] - ground.corners[0])) / 2
-    disk = pv.Disc(center=middle, inner=0, outer=radius, normal=ground.normal.tolist(), r_res=20, c_res=AROUND)
+    disk = pv.Disc(
+        center=middle, inner=0, outer=radius, normal=ground.normal.tolist(), r_res=20, c_res=AROUND
+    )
     share = np.linalg.norm(disk.points - middle, axis=1) / radius
     share = np.clip((1 - share) / (1 - FADING), 0, 1)
     opacity = 255 * share**2 * (3 - 2 * share)
-    disk["look"] = np.column_stack([np.tile(pv.Color(GROUND).int_rgb, (disk.n_points, 1)), opacity]).astype(np.uint8)
+    disk["look"] = np.column_stack(
+        [np.tile(pv.Color(GROUND).int_rgb, (disk.n_points, 1)), opacity]
+    ).astype(np.uint8)
     plotter.add_mesh(disk, scalars="look", rgb=True, lighting=False)
     shadow = body.copy()
     lift = 1e-3 * radius  # or the two surfaces would flicker into each other
@@ -125,7 +155,9 @@ def _draw_arrow(plotter: pv.Plotter, tail: Floats, along: Floats) -> None:
     shape: dict[str, Any] = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045)
     shape |= dict(tip_resolution=40, shaft_resolution=40, scale=float(np.linalg.norm(along)))
     arrow = pv.Arrow(start=tail.tolist(), direction=along.tolist(), **shape)
-    plotter.add_mesh(arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.7, diffuse=0.4)
+    plotter.add_mesh(
+        arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.7, diffuse=0.4
+    )
 
 
 @contextmanager

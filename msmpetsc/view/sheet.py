@@ -42,7 +42,11 @@ def contact_sheet(
         chosen = _moments(run, subject, frames, count)
         composition = composition_of(drawn(subject), list(chosen), style)
         stills = zip(composition.stills(list(chosen)), chosen.values(), strict=True)
-        draw_panels(composition, [replace(still, caption=(still.caption[0], text)) for still, text in stills], png_path)
+        draw_panels(
+            composition,
+            [replace(still, caption=(still.caption[0], text)) for still, text in stills],
+            png_path,
+        )
     return Path(png_path)
 
 
@@ -53,7 +57,9 @@ def draw_panels(composition: Composition, stills: Sequence[Still], path: str | P
     """
     low, high, _ = composition.room(stills)
     scale = ((composition.style.size or PANEL) / (high - low)).min()  # [px/m]
-    width, height = (int(side) for side in np.maximum([NARROWEST, 1], np.round(scale * (high - low))))  # [px]
+    width, height = (
+        int(side) for side in np.maximum([NARROWEST, 1], np.round(scale * (high - low)))
+    )  # [px]
     rows = -(-len(stills) // max(1, ROW // width))
     columns = -(-len(stills) // rows)
     sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
@@ -64,16 +70,23 @@ def draw_panels(composition: Composition, stills: Sequence[Still], path: str | P
     sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
     entries = entries_of(composition, stills)
     with whole_file(Path(path)) as part:
-        Image.fromarray(np.concatenate([sheet, legend_picture(entries, columns * width)])).save(part)
+        Image.fromarray(np.concatenate([sheet, legend_picture(entries, columns * width)])).save(
+            part
+        )
 
 
-def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int | None) -> dict[int, str]:
+def _moments(
+    run: Result, subject: Drawable, frames: Frames | None, count: int | None
+) -> dict[int, str]:
     """Return the chosen frames, each with its reason or ""."""
     if frames:
         return dict.fromkeys(frames_of(subject.name, frames, len(subject.times)), "")
     if count is not None or not subject.scene.picture.times:
         return choose_moments(run, count or COUNT)
-    nearest = {0, *(int(np.argmin(abs(subject.times - wanted))) for wanted in subject.scene.picture.times)}
+    nearest = {
+        0,
+        *(int(np.argmin(abs(subject.times - wanted))) for wanted in subject.scene.picture.times),
+    }
     return {index: "" if index else "start" for index in sorted(nearest)}
 
 
@@ -84,13 +97,19 @@ def choose_moments(run: Result, count: int) -> dict[int, str]:
     energy (a falling body is fastest just before it touches the ground); after it the greatest potential energy
     (the top of the leap). Where these coincide, the middle of the longest gap between chosen frames is added.
     """
-    kinetic, elastic, potential = (run.frames[name][:] for name in ("kinetic", "elastic", "potential"))
+    kinetic, elastic, potential = (
+        run.frames[name][:] for name in ("kinetic", "elastic", "potential")
+    )
     total = len(elastic)
     most_elastic = int(np.argmax(elastic))
     fastest = int(np.argmax(kinetic[: most_elastic + 1]))
     highest = most_elastic + int(np.argmax(potential[most_elastic:]))
     moments = {0: "start", total - 1: "end"}
-    for index, reason in (most_elastic, "most elastic energy"), (fastest, "fastest"), (highest, "highest"):
+    for index, reason in (
+        (most_elastic, "most elastic energy"),
+        (fastest, "fastest"),
+        (highest, "highest"),
+    ):
         if len(moments) < count:
             moments.setdefault(index, reason)
     while len(moments) < min(count, total):

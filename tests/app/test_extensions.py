@@ -27,11 +27,15 @@ def nothing_stays():
         extensions._registered.clear()
 
 
-def flying(folder: Path, name: str, steps: int = 10, step: float = STEP, begin: float = 0.0, **tables) -> Path:
+def flying(
+    folder: Path, name: str, steps: int = 10, step: float = STEP, begin: float = 0.0, **tables
+) -> Path:
     """A block without gravity that flies upwards, under the force of this name from a time on."""
     time = {"step": step, "duration": steps * step, **tables.pop("time", {})}
     own = [{"region": ALL, "function": name, "start": begin}]
-    return block_scene(folder, time=time, force=own, **{"start": {"velocity": [0, 0, SPEED]}} | tables)
+    return block_scene(
+        folder, time=time, force=own, **{"start": {"velocity": [0, 0, SPEED]}} | tables
+    )
 
 
 def heights(scene: Path) -> np.ndarray:
@@ -44,7 +48,9 @@ def heights(scene: Path) -> np.ndarray:
 def test_drag_is_that_of_the_velocity_that_starts_a_step(tmp_path: Path):
     msm.register_force("drag", lambda x, v, t: -RATE * v)
     velocities = SPEED * (1 - RATE * STEP) ** np.arange(1, 11)  # v_(n+1) = v_n - t c v_n
-    assert np.allclose(heights(flying(tmp_path, "drag")), np.append(0, STEP * np.cumsum(velocities)), rtol=1e-9)
+    assert np.allclose(
+        heights(flying(tmp_path, "drag")), np.append(0, STEP * np.cumsum(velocities)), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -52,8 +58,12 @@ def test_it_is_of_first_order_in_the_step(tmp_path: Path, integrator: str):
     errors, below = [], np.array([0, 0, -0.1])  # so that it pulls from the start
     for halvings in range(2):
         step, start = STEP / 2**halvings, {}
-        msm.register_force("spring", lambda x, v, t, at=start: RATE**2 * (at.setdefault("x", x.copy()) + below - x))
-        *_, last = heights(flying(tmp_path, "spring", 20 * 2**halvings, step, time={"integrator": integrator}))
+        msm.register_force(
+            "spring", lambda x, v, t, at=start: RATE**2 * (at.setdefault("x", x.copy()) + below - x)
+        )
+        *_, last = heights(
+            flying(tmp_path, "spring", 20 * 2**halvings, step, time={"integrator": integrator})
+        )
         turn = RATE * 20 * STEP
         errors.append(abs(last - SPEED / RATE * np.sin(turn) + 0.1 * (1 - np.cos(turn))))
     assert 1.7 < errors[0] / errors[1] < 2.4
@@ -86,10 +96,15 @@ def test_it_acts_on_its_region_and_in_its_time(tmp_path: Path):
 
 
 WRONG = {
-    "no force 'drga' is registered, or installed under msmpetsc.forces, did you mean 'drag'?": {"function": "drga"},
+    "no force 'drga' is registered, or installed under msmpetsc.forces, did you mean 'drag'?": {
+        "function": "drga"
+    },
     "force.0.function: returned numbers of shape (2,), not (75, 3)": {"function": "flat"},
     "force.0.function: returned numbers that are not finite (t = 0 s)": {"function": "nan"},
-    "must give exactly one of total, function; has total and function": {"function": "drag", "total": [0, 0, 1.0]},
+    "must give exactly one of total, function; has total and function": {
+        "function": "drag",
+        "total": [0, 0, 1.0],
+    },
 }
 
 
@@ -99,14 +114,19 @@ def test_what_is_no_force_is_said_in_one_line(tmp_path: Path, words: str):
     msm.register_force("flat", lambda x, v, t: np.zeros(2))
     msm.register_force("nan", lambda x, v, t: np.full_like(x, np.nan))
     scene = flying(tmp_path, "drag")
-    assert words in input_error(lambda: list(msm.frames(scene, set={"force": [{"region": ALL, **WRONG[words]}]})))
+    assert words in input_error(
+        lambda: list(msm.frames(scene, set={"force": [{"region": ALL, **WRONG[words]}]}))
+    )
 
 
 def test_presets_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     msm.register_preset("tight", {"ksp_rtol": 1e-8, "ksp_max_it": 400}, about="a narrow one")
     msm.register_force("drag", lambda x, v, t: -RATE * v * x[:, :1])  # it bends the block
     scene = flying(tmp_path, "drag", 2)
-    tight, usual = ([frame for frame in msm.frames(scene, set={"solver.preset": name})] for name in ("tight", "newton"))
+    tight, usual = (
+        [frame for frame in msm.frames(scene, set={"solver.preset": name})]
+        for name in ("tight", "newton")
+    )
     assert np.allclose(tight[-1].position, usual[-1].position, atol=1e-8)
     assert tight[-1].ksp_its > usual[-1].ksp_its  # its option has a say
     path = msm.run(scene, tmp_path / "x.h5", preset="tight", quiet=True)
@@ -144,7 +164,9 @@ def test_a_scene_file_names_what_is_installed(tmp_path: Path):
     environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{ENVIRONMENT['PYTHONPATH']}"}
 
     def command(*words: object) -> subprocess.CompletedProcess:
-        return python("-m", "msmpetsc", "run", scene, "-o", tmp_path / "x.h5", *words, env=environment)
+        return python(
+            "-m", "msmpetsc", "run", scene, "-o", tmp_path / "x.h5", *words, env=environment
+        )
 
     assert (done := command()).returncode == 0, done.stderr
     with msm.open(tmp_path / "x.h5") as result:
@@ -152,5 +174,8 @@ def test_a_scene_file_names_what_is_installed(tmp_path: Path):
     velocity = np.diff((positions - positions[0])[:, 0, 2]) / STEP
     assert np.allclose(velocity, SPEED * (1 - RATE * STEP) ** np.arange(1, 11), rtol=1e-9)
     broken = command("--overwrite", "--set", "force.0.function=broken")
-    assert broken.returncode == 2 and "the force 'broken' that is installed cannot be imported" in broken.stderr
+    assert (
+        broken.returncode == 2
+        and "the force 'broken' that is installed cannot be imported" in broken.stderr
+    )
     assert broken.stderr.count("\n") == 1

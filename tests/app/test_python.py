@@ -32,7 +32,9 @@ def positions(path: Path) -> np.ndarray:
 
 
 def test_it_writes_what_the_command_writes(scene: Path, tmp_path: Path, capsys):
-    path = msmpetsc.run(scene, tmp_path / "python.h5", frames=2, set={"material.density": 900.0}, preset="newton")
+    path = msmpetsc.run(
+        scene, tmp_path / "python.h5", frames=2, set={"material.density": 900.0}, preset="newton"
+    )
     assert path == tmp_path / "python.h5" and path.with_suffix(".xdmf").is_file()
     assert "frame 2/2" in capsys.readouterr().err
     words = ["--frames", "2", "--set", "material.density=900.0", "--preset", "newton"]
@@ -40,7 +42,9 @@ def test_it_writes_what_the_command_writes(scene: Path, tmp_path: Path, capsys):
     assert np.array_equal(positions(path), positions(tmp_path / "command.h5"))
     with msmpetsc.open(path) as result:  # what it was is a command that can be pasted
         command = result.attributes["command"]
-        assert command.startswith(f"msmpetsc run {scene} --output={path} --preset=newton --frames=2 --set=")
+        assert command.startswith(
+            f"msmpetsc run {scene} --output={path} --preset=newton --frames=2 --set="
+        )
 
 
 def test_petsc_options_are_those_of_one_run(scene: Path, tmp_path: Path):
@@ -50,7 +54,13 @@ def test_petsc_options_are_those_of_one_run(scene: Path, tmp_path: Path):
     before = PETSc.Options().getAll()
     for options in ("-ksp_rtol 1e-3 -ksp_max_it 77", {"ksp_rtol": 1e-3, "-ksp_max_it": 77}):
         path = msmpetsc.run(
-            scene, tmp_path / "x.h5", frames=1, overwrite=True, quiet=True, preset="newton", petsc_options=options
+            scene,
+            tmp_path / "x.h5",
+            frames=1,
+            overwrite=True,
+            quiet=True,
+            preset="newton",
+            petsc_options=options,
         )
         with msmpetsc.open(path) as result:
             assert options_of(result.attributes["petsc_options"].split()) | before == {
@@ -93,7 +103,10 @@ def test_an_interrupt_raises_and_the_run_goes_on(scene: Path, tmp_path: Path, mo
 
 
 def test_a_request_is_recorded_as_its_command():
-    changes = {"pin": [{"region": {"box": [[0, 0, 0], [1, 1, 1]], "relative": True}}], "title": "a b"}
+    changes = {
+        "pin": [{"region": {"box": [[0, 0, 0], [1, 1, 1]], "relative": True}}],
+        "title": "a b",
+    }
     options = {"ksp_view": None, "options_left": False}
     asked = RunRequest("s.toml", true_error=3, picture=True, set=changes, petsc_options=options)
     words = shlex.split(asked.command)
@@ -126,7 +139,11 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
     done = run(3, worker, ranks, where, what, "run", scene, "-o", tmp_path / "x.h5")
     said = {"input": "it fails", "memory": "there is not enough memory (Unable"}[what]
     (line,) = errors(done.stderr)
-    assert done.returncode == 2 and line.startswith(f"msmpetsc: error: {said}") and "Traceback" not in done.stderr
+    assert (
+        done.returncode == 2
+        and line.startswith(f"msmpetsc: error: {said}")
+        and "Traceback" not in done.stderr
+    )
     assert not [path.name for path in tmp_path.glob("*x.h5.*")]
 
 

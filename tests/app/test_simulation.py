@@ -35,10 +35,14 @@ def test_frames_are_those_of_the_file(scene: Path, tmp_path: Path, integrator: s
     assert np.ptp(frames[-1].position - frames[0].position) > 1e-4  # it does bend
 
 
-def test_tables_and_scenes_are_as_good_as_a_file(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_tables_and_scenes_are_as_good_as_a_file(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     expected = [frame.position for frame in msm.frames(scene, 2)]
     tables = tomllib.loads(scene.read_text())
-    tables["mesh"]["source"] = tmp_path / "scene.ply"  # a path, an array and a number of numpy's stand in Python
+    tables["mesh"]["source"] = (
+        tmp_path / "scene.ply"
+    )  # a path, an array and a number of numpy's stand in Python
     tables["gravity"]["acceleration"] = np.array([0, 0, -G])
     tables["material"]["density"] = np.float64(DENSITY)
     monkeypatch.chdir("/")  # outside which the mesh lies nowhere, but where the tables say
@@ -47,7 +51,9 @@ def test_tables_and_scenes_are_as_good_as_a_file(scene: Path, tmp_path: Path, mo
         path = msm.run(source, tmp_path / "x.h5", frames=2, overwrite=True, quiet=True)
         with msm.open(path) as result:
             assert np.array_equal(result.frames.position[:], expected)
-            assert msm.Scene.of(result.scene).material.density == DENSITY  # what the file says can be run again
+            assert (
+                msm.Scene.of(result.scene).material.density == DENSITY
+            )  # what the file says can be run again
     with pytest.raises(InputError, match="say output"):
         msm.run(tables, quiet=True)
 
@@ -64,7 +70,9 @@ def test_a_run_of_tables_goes_on(scene: Path, tmp_path: Path):
 
 def test_changes_are_checked_as_a_file_is(scene: Path):
     simulation = msm.Simulation(scene)
-    softer = simulation.scene.changed({"material.young_modulus": 1e3, "pin.0.region.box": [[-1, -1, -1], [0.2, 2, 2]]})
+    softer = simulation.scene.changed(
+        {"material.young_modulus": 1e3, "pin.0.region.box": [[-1, -1, -1], [0.2, 2, 2]]}
+    )
     assert softer.material.young_modulus == 1e3 and softer.pin[0].region.box[1][0] == 0.2
     assert simulation.scene.material.young_modulus != 1e3
     for wrong, words in {
@@ -88,15 +96,23 @@ def test_the_lattice_is_kept_while_mesh_and_cages_are(scene: Path):
     for change in (
         {"material.young_modulus": 3e5, "material.density": 500.0},
         {"part": [{"region": {"box": [[0, 0, 0], [0.2, 1, 1]]}, "density": 2000.0}]},
-        {"force": [{"region": {"box": [[0.4, 0, 0], [1, 1, 1]]}, "total": [0, 0, 9.0]}], "time.step": 0.005},
+        {
+            "force": [{"region": {"box": [[0.4, 0, 0], [1, 1, 1]]}, "total": [0, 0, 9.0]}],
+            "time.step": 0.005,
+        },
     ):
         *_, kept = simulation.frames(set={"output.surface": True} | change)
         *_, fresh = msm.frames(scene, set={"output.surface": True} | change)
         assert simulation.model.lattice.table is network and simulation.model.embedding is embedding
-        assert np.array_equal(kept.position, fresh.position) and np.array_equal(kept.surface, fresh.surface)
+        assert np.array_equal(kept.position, fresh.position) and np.array_equal(
+            kept.surface, fresh.surface
+        )
         assert not np.array_equal(kept.position, first.position)
     list(simulation.frames(1, set={"cages.cell_size": 1 / 4}))
-    assert simulation.model.lattice.table is not network and simulation.model.lattice.cell_size == 1 / 4
+    assert (
+        simulation.model.lattice.table is not network
+        and simulation.model.lattice.cell_size == 1 / 4
+    )
 
 
 def test_a_loop_may_end_early_and_leaves_nothing_behind(scene: Path):
@@ -140,7 +156,9 @@ def test_a_step_that_fails_raises_after_the_frames_before_it(tmp_path: Path):
 
 def test_a_callback_sees_each_stored_frame(scene: Path, tmp_path: Path):
     seen = []
-    path = msm.run(scene, tmp_path / "x.h5", set={"output.every": 2}, on_frame=seen.append, quiet=True)
+    path = msm.run(
+        scene, tmp_path / "x.h5", set={"output.every": 2}, on_frame=seen.append, quiet=True
+    )
     with msm.open(path) as result:
         assert [frame.index for frame in seen] == [0, 2, 3]
         assert np.array_equal([frame.position for frame in seen], result.frames.position[:])
@@ -149,7 +167,9 @@ def test_a_callback_sees_each_stored_frame(scene: Path, tmp_path: Path):
 def test_frames_are_those_of_every_third_step_and_the_last(tmp_path: Path):
     """Nothing is computed for those left out, and what the steps cost is summed up."""
     time, solver = {"step": 0.02, "duration": 0.14}, {"preset": "anderson", "error": 1e-6}
-    simulation = msm.Simulation(block_scene(tmp_path, **FALL | HELD | {"time": time, "solver": solver}))
+    simulation = msm.Simulation(
+        block_scene(tmp_path, **FALL | HELD | {"time": time, "solver": solver})
+    )
     changes = {"output.surface": True}
     each, few = (list(simulation.frames(set=changes | {"output.every": every})) for every in (1, 3))
     assert [frame.index for frame in few] == [0, 3, 6, 7]
@@ -197,7 +217,9 @@ for modulus in (1e5, 2e5):
 
 def test_on_ranks_each_has_its_rows(scene: Path, tmp_path: Path):
     done = run(3, "-c", ON_RANKS, scene, tmp_path, status=0)
-    assert done.stdout.count("refused:") == done.stdout.count(" exists") == 3  # the second time, on all ranks
+    assert (
+        done.stdout.count("refused:") == done.stdout.count(" exists") == 3
+    )  # the second time, on all ranks
     assert done.stderr.count("frame 1/1") == 1
     for modulus in (1e5, 2e5):
         *_, last = msm.frames(scene, set={"material.young_modulus": modulus})
@@ -205,7 +227,9 @@ def test_on_ranks_each_has_its_rows(scene: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize("limit", [0.9, 1.5])
-def test_a_frame_of_far_more_work_than_the_median_is_named(scene: Path, tmp_path: Path, monkeypatch, caplog, limit):
+def test_a_frame_of_far_more_work_than_the_median_is_named(
+    scene: Path, tmp_path: Path, monkeypatch, caplog, limit
+):
     monkeypatch.setattr(summary, "HARD", limit)
     with msm.open(msm.run(scene, tmp_path / "x.h5", set={"material.young_modulus": 1e4})) as result:
         products = result.frames.products[1:]

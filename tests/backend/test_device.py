@@ -21,9 +21,13 @@ def no_gpu():
         pytest.skip("there is a GPU here")
 
 
-@pytest.mark.parametrize("words", [["--device", "cuda"], ["-mat_type", "aijcusparse"], ["-mat_type", "mpiaijcusparse"]])
+@pytest.mark.parametrize(
+    "words", [["--device", "cuda"], ["-mat_type", "aijcusparse"], ["-mat_type", "mpiaijcusparse"]]
+)
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_without_a_gpu_one_line_says_what_is_missing(tmp_path: Path, msmpetsc, words: list[str], ranks: int, no_gpu):
+def test_without_a_gpu_one_line_says_what_is_missing(
+    tmp_path: Path, msmpetsc, words: list[str], ranks: int, no_gpu
+):
     path, out = block_scene(tmp_path, **FALL), tmp_path / "out.h5"
     done = msmpetsc(ranks, "run", path, "-o", out, *words)
     assert_one_line(done, 2, device.what_is_missing(), words[-1])
@@ -32,7 +36,10 @@ def test_without_a_gpu_one_line_says_what_is_missing(tmp_path: Path, msmpetsc, w
 
 def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
     done = msmpetsc(1, "run", block_scene(tmp_path, **FALL), "--device", "cuda", "-mat_type", "aij")
-    assert done.returncode == 2 and "--device cuda and -mat_type aij contradict each other" in done.stderr
+    assert (
+        done.returncode == 2
+        and "--device cuda and -mat_type aij contradict each other" in done.stderr
+    )
 
 
 def test_a_package_that_is_not_there_is_named():

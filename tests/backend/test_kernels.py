@@ -56,7 +56,11 @@ def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def environment(package: Path, **variables: object) -> dict[str, str]:
     """Variables with which kernels of this package can be kept in those folders alone that are named here, or /tmp."""
     given = {"HOME": NOWHERE, "PYTHONPATH": str(package.parent), **variables}
-    others = {name: x for name, x in ENVIRONMENT.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    others = {
+        name: x
+        for name, x in ENVIRONMENT.items()
+        if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+    }
     return others | {name: str(x) for name, x in given.items()}
 
 
@@ -77,7 +81,9 @@ def test_kernels_are_found_again_wherever_they_can_be_kept(copied: Path, tmp_pat
 def test_kernels_work_where_nothing_can_be_written(copied: Path):
     command = [copied / "backend" / "caller.py"]
     for _ in range(2):
-        done = python(*command, env=environment(copied), preexec_fn=lambda: resource.setrlimit(FILES, (0, 0)))
+        done = python(
+            *command, env=environment(copied), preexec_fn=lambda: resource.setrlimit(FILES, (0, 0))
+        )
         assert (done.stdout, done.stderr) == ("8.0 0\n", "")
 
 
@@ -86,10 +92,17 @@ def test_kernels_work_where_nothing_can_be_written(copied: Path):
     [
         ("called", "x + 1.0", "x + 2.0", 10.0),
         ("plain", "FACTOR = 2.0", "FACTOR = 20.0", 80.0),
-        ("plain", "    first: float\n    second: float\n", "    second: float\n    first: float\n", 8.0),
+        (
+            "plain",
+            "    first: float\n    second: float\n",
+            "    second: float\n    first: float\n",
+            8.0,
+        ),
     ],
 )
-def test_changed_sources_never_find_old_kernels(copied: Path, tmp_path: Path, name, old, new, value):
+def test_changed_sources_never_find_old_kernels(
+    copied: Path, tmp_path: Path, name, old, new, value
+):
     """Neither a kernel that is called, nor a constant or a named tuple of a file without kernels."""
     assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (8.0, 0)
     path = copied / "backend" / f"{name}.py"
@@ -98,8 +111,14 @@ def test_changed_sources_never_find_old_kernels(copied: Path, tmp_path: Path, na
 
 
 def test_processes_that_keep_the_same_kernel_at_once(copied: Path, tmp_path: Path):
-    command, variables = [sys.executable, copied / "backend" / "caller.py"], environment(copied, HOME=tmp_path)
-    ranks = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables) for _ in range(4)]
+    command, variables = (
+        [sys.executable, copied / "backend" / "caller.py"],
+        environment(copied, HOME=tmp_path),
+    )
+    ranks = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables)
+        for _ in range(4)
+    ]
     assert {rank.communicate()[0].split()[0] for rank in ranks} == {"8.0"}
     assert called(copied, HOME=tmp_path) == (8.0, 1)
 
@@ -125,7 +144,9 @@ def test_a_disk_that_is_full_keeps_nothing(chosen: Path):
     assert kernel_cache.load("a") is None and not any(chosen.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["writable by all", "writable by a group", "a link", "of another user"])
+@pytest.mark.parametrize(
+    "kind", ["writable by all", "writable by a group", "a link", "of another user"]
+)
 def test_no_folder_is_read_that_somebody_else_may_write_to(chosen: Path, kind: str):
     kernel_cache.save("a", b"code")
     assert kernel_cache.load("a") == b"code" and not kernel_cache.is_empty()

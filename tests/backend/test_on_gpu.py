@@ -35,7 +35,11 @@ from msmpetsc.solve.simulate import TimeLoop
 
 PACKAGE = Path(msmpetsc.__file__).parent
 T = 0.01
-FALL = {"time": {"step": T, "duration": 8 * T}, "gravity": GRAVITY, "start": {"velocity": [0.1, 0, -1.0]}}
+FALL = {
+    "time": {"step": T, "duration": 8 * T},
+    "gravity": GRAVITY,
+    "start": {"velocity": [0.1, 0, -1.0]},
+}
 FLOOR = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1]}
 PLATE = {
     "shape": "box", "box": [[-1, -1, 0.25], [2, 2, 0.5]], "response": "penalty", "friction": 0.3,
@@ -48,7 +52,14 @@ LED = {
                 "path": [{"time": 4 * T, "by": [0.05, 0, 0]}]}]
 }  # fmt: skip
 SOFT = {"material": {"young_modulus": 2e4, "density": 1000.0, "law": "linear"}}
-SOLID = {"material": {"young_modulus": 2e4, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.4}}
+SOLID = {
+    "material": {
+        "young_modulus": 2e4,
+        "density": 1000.0,
+        "law": "neo-hookean",
+        "poisson_ratio": 0.4,
+    }
+}
 VISCOUS = {"material": {**SOLID["material"], "retardation_time": 0.01}}
 CASES = {
     "newton": FALL,
@@ -108,7 +119,9 @@ def real() -> Iterator[None]:
         del PETSc.Options()["mat_type"]
 
 
-on_a_gpu = pytest.mark.parametrize("on_gpu", [pretended, pytest.param(real, marks=pytest.mark.cuda)])
+on_a_gpu = pytest.mark.parametrize(
+    "on_gpu", [pretended, pytest.param(real, marks=pytest.mark.cuda)]
+)
 
 
 def play(path: Path) -> list[Frame]:
@@ -149,10 +162,15 @@ def test_a_step_that_fails_is_rescued(tmp_path: Path, on_gpu):
 
 
 @pytest.mark.parametrize("case", ["newton", "held, led and let go", "pressed and rubbed", "verlet"])
-def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_carried(tmp_path: Path, case: str):
+def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_carried(
+    tmp_path: Path, case: str
+):
     """Nothing that grows with the body: a few numbers do go to and fro, as where an obstacle has come to."""
     scene = load_scene(block_scene(tmp_path, **CASES[case], output={"surface": False, "every": 4}))
-    with pretended() as counted, TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+    with (
+        pretended() as counted,
+        TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation,
+    ):
         frame = None
         for frame in simulation.advance():  # noqa: B007  # the last one is asked for
             if simulation.step == 4:
@@ -188,12 +206,17 @@ SIMULATED = {
 
 def test_kernels_do_the_same_as_threads(tmp_path: Path):
     """All of them, in numba's simulator."""
-    paths = [block_scene(tmp_path, name=name, **{**case, **SMALLEST}) for name, case in SIMULATED.items()]
+    paths = [
+        block_scene(tmp_path, name=name, **{**case, **SMALLEST}) for name, case in SIMULATED.items()
+    ]
     ran, *last = python(WORKERS / "simulator_worker.py", *paths, check=True).stdout.splitlines()
     assert set(ran.split()) == {body.__name__ for body in bodies()}
     for path, line in zip(paths, last, strict=True):
         accuracy = 1e-10 if path.stem == "multigrid" else 1e-12
-        here, there = positions(play(path)), np.array([float.fromhex(x) for x in line.split()]).reshape(-1, 3)
+        here, there = (
+            positions(play(path)),
+            np.array([float.fromhex(x) for x in line.split()]).reshape(-1, 3),
+        )
         assert np.abs(here[-1] - here[0]).max() > 1e-2
         np.testing.assert_allclose(there, here[-1], rtol=0, atol=accuracy)
 
@@ -203,7 +226,9 @@ def bodies() -> list[Callable]:
     found = []
     for path in PACKAGE.rglob("*.py"):
         if "\n@kernel\n" in path.read_text():
-            module = importlib.import_module(".".join(("msmpetsc", *path.relative_to(PACKAGE).with_suffix("").parts)))
+            module = importlib.import_module(
+                ".".join(("msmpetsc", *path.relative_to(PACKAGE).with_suffix("").parts))
+            )
             found += [one.__wrapped__ for one in vars(module).values() if hasattr(one, "compiled")]
     return found
 
@@ -254,7 +279,14 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
         struct.pack("q" + "".join(map(launcher.format_of, kinds)), *words)
         if shutil.which("ptxas"):
             (tmp_path / "kernel.ptx").write_text(ptx)
-            command = ["ptxas", "-arch=sm_90", "-v", "-o", tmp_path / "kernel.cubin", tmp_path / "kernel.ptx"]
+            command = [
+                "ptxas",
+                "-arch=sm_90",
+                "-v",
+                "-o",
+                tmp_path / "kernel.cubin",
+                tmp_path / "kernel.ptx",
+            ]
             said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
             print(body.__name__, said)
             assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said

@@ -35,7 +35,19 @@ COMMANDS = [
     ["check", "--update", "{}"],
     ["check", "{}"],
 ]
-PATHS = ["", ".", "..", "/", "folder", "folder/", "x" * 300 + ".h5", "a\nb.h5", "\udcff.h5", "device", "pipe"]
+PATHS = [
+    "",
+    ".",
+    "..",
+    "/",
+    "folder",
+    "folder/",
+    "x" * 300 + ".h5",
+    "a\nb.h5",
+    "\udcff.h5",
+    "device",
+    "pipe",
+]
 PATHS += ["scene.toml/x.h5", "a\x1b[31m.h5", "loop.h5", "\u2028.h5"]
 
 
@@ -44,7 +56,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paths")
     block_scene(folder, time=ONCE)
     small_result.write(folder / "good.h5")
-    (folder / "study.toml").write_text('[[scene]]\nname = "a"\nfile = "nowhere.toml"\n[[sweep]]\npreset = ["newton"]\n')
+    (folder / "study.toml").write_text(
+        '[[scene]]\nname = "a"\nfile = "nowhere.toml"\n[[sweep]]\npreset = ["newton"]\n'
+    )
     (folder / "folder").mkdir()
     (folder / "loop.h5").symlink_to("loop.h5")
     os.mkfifo(folder / "pipe")
@@ -58,14 +72,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("path", PATHS)
 def test_a_path_that_cannot_be_used_is_refused_in_one_line(folder, monkeypatch, capsys, path):
     monkeypatch.chdir(folder)
-    before = {name: (folder / name).lstat().st_mtime_ns for name in os.listdir(folder) if name != "out"}
+    before = {
+        name: (folder / name).lstat().st_mtime_ns for name in os.listdir(folder) if name != "out"
+    }
     for command in COMMANDS:
-        if command[0] == "study" and "-o" in command and path in (".", "..", "/", "folder", "folder/"):
+        if (
+            command[0] == "study"
+            and "-o" in command
+            and path in (".", "..", "/", "folder", "folder/")
+        ):
             continue  # a study has a folder
         status = main([word.format(path) for word in command])
         told = capsys.readouterr().err.splitlines()
-        assert status == 2 and len(told) == 1 and told[0].startswith("msmpetsc: error: "), (command, told)
-    assert {name: (folder / name).lstat().st_mtime_ns for name in os.listdir(folder) if name != "out"} == before
+        assert status == 2 and len(told) == 1 and told[0].startswith("msmpetsc: error: "), (
+            command,
+            told,
+        )
+    assert {
+        name: (folder / name).lstat().st_mtime_ns for name in os.listdir(folder) if name != "out"
+    } == before
 
 
 TOO_MUCH = {
@@ -73,9 +98,15 @@ TOO_MUCH = {
         ["run", "scene.toml", "--set", "cages={count = 1000000000, max_cells = 1000000000000}"],
         "GB a rank or more",
     ),
-    "ranks": (["inspect", "scene.toml", "--ranks", "9999999999"], "--ranks must be at most 1000000"),
+    "ranks": (
+        ["inspect", "scene.toml", "--ranks", "9999999999"],
+        "--ranks must be at most 1000000",
+    ),
     "part": (["study", "study.toml", "--part", "1/" + "9" * 5000], "--part must read I/N"),
-    "frames": (["run", "scene.toml", "--checkpoint-every", "9" * 5000], "--checkpoint-every: invalid int value"),
+    "frames": (
+        ["run", "scene.toml", "--checkpoint-every", "9" * 5000],
+        "--checkpoint-every: invalid int value",
+    ),
 }
 
 
@@ -99,7 +130,9 @@ WRONG = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
+@pytest.mark.parametrize(
+    ("arguments", "words"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG]
+)
 def test_no_format_is_written_under_the_name_of_another(folder, monkeypatch, arguments, words):
     monkeypatch.chdir(folder)
     before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}

@@ -19,8 +19,23 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A block on its way down, and its stored numbers."""
     folder = tmp_path_factory.mktemp("own")
     fall = {"time": {"step": 0.01, "duration": 1.0}, "gravity": {"acceleration": [0, 0, -9.81]}}
-    path = block_scene(folder, **fall, pin=[{"region": {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}}])
-    assert main(["check", "--update", str(path), "--frames", str(STEPS), "--set", "material.density=900.0"]) == 0
+    path = block_scene(
+        folder, **fall, pin=[{"region": {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}}]
+    )
+    assert (
+        main(
+            [
+                "check",
+                "--update",
+                str(path),
+                "--frames",
+                str(STEPS),
+                "--set",
+                "material.density=900.0",
+            ]
+        )
+        == 0
+    )
     return path
 
 
@@ -36,8 +51,16 @@ def numbers(scene: Path) -> Path:
 def test_the_numbers_say_how_they_were_made(numbers: Path):
     stored = json.loads(numbers.read_text())
     assert read(numbers).run == Recipe(cells=None, steps=STEPS, changes=["material.density=900.0"])
-    springs = (60 + 60 + 50) + 2 * (48 + 40 + 40) + 4 * 32  # edges, diagonals of faces, of the 4 x 4 x 2 cells
-    assert stored["counts"] == {"cells": 32, "nodes": 75, "springs": springs, "pinned": 25, "frames": STEPS + 1}
+    springs = (
+        (60 + 60 + 50) + 2 * (48 + 40 + 40) + 4 * 32
+    )  # edges, diagonals of faces, of the 4 x 4 x 2 cells
+    assert stored["counts"] == {
+        "cells": 32,
+        "nodes": 75,
+        "springs": springs,
+        "pinned": 25,
+        "frames": STEPS + 1,
+    }
     assert judged(read(numbers), read(numbers)) == []
 
 
@@ -50,7 +73,9 @@ def test_the_same_scene_has_the_same_numbers_on_any_ranks(scene: Path, ranks: in
 def test_what_differs_is_named(scene: Path, numbers: Path, capfd):
     stored = json.loads(numbers.read_text())
     stored["numbers"]["elastic"]["value"] += 2 * allowed(STEPS, "J") * stored["scales"]["J"]
-    stored["numbers"]["highest corner"]["value"][2] += 0.5 * allowed(STEPS, "m") * stored["scales"]["m"]
+    stored["numbers"]["highest corner"]["value"][2] += (
+        0.5 * allowed(STEPS, "m") * stored["scales"]["m"]
+    )
     stored["counts"]["pinned"] += 1
     numbers.write_text(json.dumps(stored))
     assert main(["check", str(scene), "--json"]) == 1
@@ -59,16 +84,24 @@ def test_what_differs_is_named(scene: Path, numbers: Path, capfd):
     assert not shown["same"] and [line.partition(":")[0] for line in wrong] == ["elastic", "pinned"]
 
 
-def test_a_scene_that_fails_is_named_and_the_others_are_checked(scene: Path, numbers: Path, tmp_path: Path, capfd):
+def test_a_scene_that_fails_is_named_and_the_others_are_checked(
+    scene: Path, numbers: Path, tmp_path: Path, capfd
+):
     alone = tmp_path / "alone.toml"  # without its mesh
     alone.write_text(scene.read_text())
     alone.with_suffix(".baseline.json").write_text(numbers.read_text())
     assert main(["check", str(alone), str(scene)]) == 1
     out = capfd.readouterr().out
-    assert "alone                FAILED\n" in out and " same\n" in out and f"\n{alone}: the run failed: mesh" in out
+    assert (
+        "alone                FAILED\n" in out
+        and " same\n" in out
+        and f"\n{alone}: the run failed: mesh" in out
+    )
 
 
-def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(scene: Path, numbers: Path, capfd):
+def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(
+    scene: Path, numbers: Path, capfd
+):
     text, before = scene.read_text(), json.loads(numbers.read_text())
     scene.write_text(text.replace("young_modulus = 100000.0", "young_modulus = 100010.0"))
     try:
@@ -89,7 +122,14 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
         "are for --update": ["check", str(scene), "--cells", "30"],
         "time.error": ["check", "--update", str(other)],
         "--frames must be at least 1": ["check", "--update", str(other), "--frames", "0"],
-        "the run failed": ["check", "--update", str(other), *few, "--set", "cages={cell_size=0.125, max_cells=1}"],
+        "the run failed": [
+            "check",
+            "--update",
+            str(other),
+            *few,
+            "--set",
+            "cages={cell_size=0.125, max_cells=1}",
+        ],
     }
     for words, command in refused.items():
         assert words in command_error(*command)
@@ -126,10 +166,15 @@ def test_too_great_a_scale_hides_no_difference(numbers: Path):
     assert line.startswith("elastic: ")
 
 
-def test_changes_that_come_with_the_numbers_name_nothing_elsewhere(scene: Path, numbers: Path, ball: Path):
+def test_changes_that_come_with_the_numbers_name_nothing_elsewhere(
+    scene: Path, numbers: Path, ball: Path
+):
     stored = json.loads(numbers.read_text())
     stored["run"]["changes"] = [f"mesh.source={ball}"]
     numbers.write_text(json.dumps(stored))
-    for command in (["check", str(scene)], ["check", "--update", str(scene), "--set", f"mesh.source={ball}"]):
+    for command in (
+        ["check", str(scene)],
+        ["check", "--update", str(scene), "--set", f"mesh.source={ball}"],
+    ):
         assert "is not in the scene's folder" in command_error(*command)
     assert json.loads(numbers.read_text()) == stored

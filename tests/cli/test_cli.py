@@ -72,7 +72,9 @@ def on(ranks: int, *arguments: object, status: int | None = None) -> subprocess.
 # What it writes
 
 
-def test_the_default_output_is_in_out_and_is_not_replaced_unasked(scene: Path, tmp_path: Path, monkeypatch):
+def test_the_default_output_is_in_out_and_is_not_replaced_unasked(
+    scene: Path, tmp_path: Path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     assert on(1, scene).returncode == 0
     result = tmp_path / "out/scene.h5"
@@ -87,7 +89,16 @@ def test_the_default_output_is_in_out_and_is_not_replaced_unasked(scene: Path, t
 
 def test_each_option_changes_the_run(scene: Path, tmp_path: Path):
     out = tmp_path / "new" / "named.h5"
-    more = ("--error", "1e-6", "--frames", "2", "--set", "cages.count=80", "--set", "output.surface=true")
+    more = (
+        "--error",
+        "1e-6",
+        "--frames",
+        "2",
+        "--set",
+        "cages.count=80",
+        "--set",
+        "output.surface=true",
+    )
     on(1, "-ksp_max_it", "400", scene, "-o", out, "--preset", "newton", *more, status=0)
     with h5py.File(out) as file:
         as_run = tomllib.loads(file.attrs["scene"])
@@ -103,12 +114,28 @@ def test_each_option_changes_the_run(scene: Path, tmp_path: Path):
 
 def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path):
     done = on(
-        2, scene, "-o", tmp_path / "o.h5", "-ksp_type", "pipecg", "-ksp_view", "-log_view", "--frames", "1", status=0
+        2,
+        scene,
+        "-o",
+        tmp_path / "o.h5",
+        "-ksp_type",
+        "pipecg",
+        "-ksp_view",
+        "-log_view",
+        "--frames",
+        "1",
+        status=0,
     )
     assert "type: pipecg" in done.stdout and "type: cg\n" not in done.stdout
     assert done.stdout.count("PETSc Performance Summary") == 1
-    stages = [line.split(": ")[1] for line in done.stdout.splitlines() if line.startswith("--- Event Stage")]
-    assert {"Main Stage", "set-up", "steps", "output"} <= set(stages) and "Unknown" not in stages  # 3.22 lists all
+    stages = [
+        line.split(": ")[1]
+        for line in done.stdout.splitlines()
+        if line.startswith("--- Event Stage")
+    ]
+    assert {"Main Stage", "set-up", "steps", "output"} <= set(
+        stages
+    ) and "Unknown" not in stages  # 3.22 lists all
 
 
 @pytest.mark.parametrize(
@@ -123,7 +150,9 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
         ("fast-msm", "-pc_type gamg -ksp_view", "type: gamg"),
     ],
 )
-def test_no_option_is_left_unused_and_the_users_wins(scene: Path, tmp_path: Path, preset: str, options: str, seen: str):
+def test_no_option_is_left_unused_and_the_users_wins(
+    scene: Path, tmp_path: Path, preset: str, options: str, seen: str
+):
     words = f"--preset {preset} --frames 1 {options} -options_left".split()
     done = on(1, scene, "-o", tmp_path / "o.h5", *words, status=0)
     assert "There are no unused options." in done.stdout
@@ -149,10 +178,17 @@ def test_our_options_and_petscs_stand_in_any_order(given: str, ours: str, petsc:
 # What it refuses
 
 
-def test_an_unused_option_of_a_name_that_solving_might_read_is_told_at_the_end(scene: Path, tmp_path: Path):
-    done = on(1, scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view")  # newton has no NPC
+def test_an_unused_option_of_a_name_that_solving_might_read_is_told_at_the_end(
+    scene: Path, tmp_path: Path
+):
+    done = on(
+        1, scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view"
+    )  # newton has no NPC
     assert_one_line(done, 2, "-npc_ksp_view")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["o.h5", "o.xdmf"]  # what was computed is kept, whole
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "o.h5",
+        "o.xdmf",
+    ]  # what was computed is kept, whole
 
 
 def test_a_preconditioner_that_ranks_do_not_share_is_refused(scene: Path, tmp_path: Path):
@@ -195,7 +231,10 @@ def refusals(folder: Path) -> dict[tuple[int, str], Answers]:
         names = [name for number, name in REFUSALS if number == ranks]
         out = folder / f"refused{ranks}" / "o.h5"
         commands = [["run", folder / "scene.toml", "-o", out, *BAD[name][0]] for name in names]
-        found |= {(ranks, name): answers for name, answers in zip(names, answers_on(ranks, commands), strict=True)}
+        found |= {
+            (ranks, name): answers
+            for name, answers in zip(names, answers_on(ranks, commands), strict=True)
+        }
     return found
 
 
@@ -211,8 +250,12 @@ def test_nothing_is_left_of_refused_runs(folder: Path, refusals: dict):
 
 
 def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path):
-    done = on(1, scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh("open.ply", "pin=[]"), status=0)
-    (warning,) = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: warning:")]
+    done = on(
+        1, scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh("open.ply", "pin=[]"), status=0
+    )
+    (warning,) = [
+        line for line in done.stderr.splitlines() if line.startswith("msmpetsc: warning:")
+    ]
     assert "14 boundary edges" in warning
 
 
@@ -227,7 +270,19 @@ def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
     out = tmp_path / "o.h5"
     force = "force.0={region={sphere={center=[0,0,-1],radius=1}},total=[1e4,0,0],start=0.025}"
     at_rest = sets("gravity.acceleration=[0,0,0]", force, "time.duration=0.05")
-    done = on(ranks, scene, "-o", out, *at_rest, "--preset", preset, "--error", "1e-12", "-snes_max_it", "1")
+    done = on(
+        ranks,
+        scene,
+        "-o",
+        out,
+        *at_rest,
+        "--preset",
+        preset,
+        "--error",
+        "1e-12",
+        "-snes_max_it",
+        "1",
+    )
     assert_one_line(done, 3, "frame 3 ", "DIVERGED_MAX_IT", "residual", "try ")
     with h5py.File(out) as file:
         assert finished(file) == len(file["frames/position"]) == 3

@@ -42,7 +42,9 @@ def scene(ball: Path, tmp_path: Path) -> Path:
 
 def counted(scene: Path, cells: int, ranks: int) -> Partition:
     """What count_partition says."""
-    return count_partition(Geometry(SELF, load_scene(scene, [f"cages.count={cells}"])).topology, ranks)
+    return count_partition(
+        Geometry(SELF, load_scene(scene, [f"cages.count={cells}"])).topology, ranks
+    )
 
 
 def assert_counts_are_near_those_of_real_ranks(scene: Path, cells: int, rel: float) -> None:
@@ -62,7 +64,9 @@ def test_the_counts_are_near_those_of_real_ranks(scene: Path, tmp_path: Path):
     turned = "{ rotate = { axis = [0, 1, 0], degrees = 90 } }"
     (tmp_path / "bar.obj").write_text((ROOT / "scenes/studies/beam.obj").read_text())
     bodies = [f"{{ mesh = {{ source = 'bar.obj', prepare = [{turn}] }} }}" for turn in ("", turned)]
-    text = scene.read_text().replace('mesh = { source = "ball.ply" }', f"body = [{', '.join(bodies)}]")
+    text = scene.read_text().replace(
+        'mesh = { source = "ball.ply" }', f"body = [{', '.join(bodies)}]"
+    )
     scene.write_text(text)
     assert_counts_are_near_those_of_real_ranks(scene, 2000, 0.2)
 
@@ -71,8 +75,15 @@ def test_what_is_scaled_is_near_what_is_counted(scene: Path):
     """Eight times the cells on 8 ranks: sums to the surface term, ghosts within a quarter."""
     coarse, fine = (counted(scene, cells, 8) for cells in (4000, 32000))
     scaled = coarse.scaled(fine.cells.sum())
-    for name, tolerance in {"nodes": 0.01, "nonzeros": 0.01, "springs": 0.03, "ghosts": 0.25}.items():
-        assert getattr(scaled, name).mean() == pytest.approx(getattr(fine, name).mean(), rel=tolerance), name
+    for name, tolerance in {
+        "nodes": 0.01,
+        "nonzeros": 0.01,
+        "springs": 0.03,
+        "ghosts": 0.25,
+    }.items():
+        assert getattr(scaled, name).mean() == pytest.approx(
+            getattr(fine, name).mean(), rel=tolerance
+        ), name
     assert scaled.ghosts.mean() > 1.5 * coarse.ghosts.mean()
     assert scaled.neighbours is coarse.neighbours
 
@@ -82,7 +93,9 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     nodes, nonzeros = lattice.owned, lattice.owned + 2 * len(lattice.springs)
     monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", 3 * nodes - 1)
     for holder in (Unknowns, Ghosted):
-        with pytest.raises(InputError, match=f"{nodes} nodes are more than the {3 * nodes - 1} unknowns"):
+        with pytest.raises(
+            InputError, match=f"{nodes} nodes are more than the {3 * nodes - 1} unknowns"
+        ):
             holder(SELF, lattice)
     monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", nonzeros - 1)
     unknowns = Unknowns(SELF, lattice)
@@ -101,24 +114,37 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
     told = capsys.readouterr()
     assert "scaled from a lattice of" in told.out and "run refuses 800000 cells" in told.err
     assert main(["inspect", str(scene), "--set", "cages={cell_size = 0.02}"]) == 0
-    (cells,) = [line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cells")]
+    (cells,) = [
+        line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cells")
+    ]
     volume = 4 / 3 * np.pi * 0.98  # of 320 triangles inside the sphere
     assert int(cells) == pytest.approx(volume / 0.02**3, rel=0.1)
 
 
 @pytest.mark.parametrize("most", [MOST_BUILT, 100])
 @pytest.mark.parametrize(
-    ("cages", "of_a_cell"), [({"count": 300}, 0.33), ({"cell_size": 2e-3}, 0.47), ({"count": 8000}, 0)]
+    ("cages", "of_a_cell"),
+    [({"count": 300}, 0.33), ({"cell_size": 2e-3}, 0.47), ({"count": 8000}, 0)],
 )
 def test_a_body_thinner_than_a_cell_is_told_with_the_cells_that_would_do(
-    tmp_path: Path, capsys, caplog, monkeypatch, cages: dict[str, float], of_a_cell: float, most: int
+    tmp_path: Path,
+    capsys,
+    caplog,
+    monkeypatch,
+    cages: dict[str, float],
+    of_a_cell: float,
+    most: int,
 ):
     """A strip of 100 x 20 x 1 mm, whose tip sinks by 0.08 to 0.66 of beam theory; whether counted or scaled."""
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", most)
-    strip = block_scene(tmp_path, np.array([0.1, 0.02, 0.001]), cages=cages, time={"step": 0.01, "duration": 0.1})
+    strip = block_scene(
+        tmp_path, np.array([0.1, 0.02, 0.001]), cages=cages, time={"step": 0.01, "duration": 0.1}
+    )
     assert main(["inspect", str(strip)]) == 0
     said = capsys.readouterr().err
-    words = re.search(r"m thick on average .2 V / A., (.*) of a cell.* cages.count = (\d+) or (.*) puts 2", said)
+    words = re.search(
+        r"m thick on average .2 V / A., (.*) of a cell.* cages.count = (\d+) or (.*) puts 2", said
+    )
     assert (words is not None) == (of_a_cell > 0)
     if words:
         assert float(words[1]) == pytest.approx(of_a_cell, rel=0.2) and words[2] == "33000"
@@ -159,6 +185,8 @@ def test_the_assembly_says_the_bytes_that_it_takes(lattice: Lattice):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     nonzeros = unknowns.size + 2 * len(lattice.springs)
-    assert assembly_bytes(len(lattice.nodes), len(lattice.springs), nonzeros) == pytest.approx(peak, rel=0.1)
+    assert assembly_bytes(len(lattice.nodes), len(lattice.springs), nonzeros) == pytest.approx(
+        peak, rel=0.1
+    )
     matrix.destroy()
     unknowns.destroy()

@@ -40,16 +40,22 @@ def table(upwards: int) -> trimesh.Trimesh:
     boxes = [[[0, 0.7, 0], [1.2, 0.75, 0.8]]]
     boxes += [[[x, 0, z], [x + 0.06, 0.7, z + 0.06]] for x in (0, 1.14) for z in (0, 0.74)]
     mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in boxes])
-    return mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2 * (upwards == 2), [1, 0, 0]))
+    return mesh.apply_transform(
+        trimesh.transformations.rotation_matrix(np.pi / 2 * (upwards == 2), [1, 0, 0])
+    )
 
 
 @pytest.mark.parametrize("axis", [1, 2])
 def test_furniture_stands_on_its_feet(axis: int):
     for mesh in (chair(axis, 1), chair(axis, -1), table(axis)):
-        assert (uprightness(surface_of(mesh), 1) > uprightness(surface_of(mesh), 2) + SURER) == (axis == 1)
+        assert (uprightness(surface_of(mesh), 1) > uprightness(surface_of(mesh), 2) + SURER) == (
+            axis == 1
+        )
 
 
-@pytest.mark.parametrize(("suffix", "words", "up"), [("stl", [], "z"), ("stl", ["--up", "y"], "y"), ("glb", [], "y")])
+@pytest.mark.parametrize(
+    ("suffix", "words", "up"), [("stl", [], "z"), ("stl", ["--up", "y"], "y"), ("glb", [], "y")]
+)
 def test_new_takes_z_for_upwards_or_what_is_said(suffix, words, up, tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     trimesh.creation.box([0.1, 0.2, 0.1]).export(f"box.{suffix}")
@@ -62,13 +68,18 @@ def test_new_takes_z_for_upwards_or_what_is_said(suffix, words, up, tmp_path, mo
     assert "upwards" in Path("my.toml").read_text()
 
 
-@pytest.mark.parametrize(("side", "unit"), [(0.3, 1.0), (15.0, 1.0), (150.0, 1e-3), (1e-5, None), (1e6, None)])
+@pytest.mark.parametrize(
+    ("side", "unit"), [(0.3, 1.0), (15.0, 1.0), (150.0, 1e-3), (1e-5, None), (1e6, None)]
+)
 def test_the_unit_is_the_one_in_which_the_body_has_a_usual_size(side: float, unit: float | None):
     assert unit_of(side) == unit
 
 
 def test_parts_are_measured_by_their_area_and_thickness_by_volume_and_area():
-    boxes = [trimesh.creation.box([1, 1, 1]), trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0])]
+    boxes = [
+        trimesh.creation.box([1, 1, 1]),
+        trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0]),
+    ]
     two = surface_of(trimesh.util.concatenate(boxes))
     assert measured(two, examine(two), "z").parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
     cube = surface_of(trimesh.creation.box([6, 6, 6]))
@@ -113,12 +124,17 @@ def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
     trimesh.util.concatenate([box, box.copy().apply_translation([0.3, 0, 0])]).export("two.ply")
     assert main(["new", "two.toml", "--mesh", "two.ply"]) == 0
     told = capsys.readouterr().err
-    assert "24 triangles, closed, 2 parts, the largest of 50% of the area" in told and "wound inwards" in told
+    assert (
+        "24 triangles, closed, 2 parts, the largest of 50% of the area" in told
+        and "wound inwards" in told
+    )
     hole = trimesh.Trimesh(box.vertices, box.faces[2:], process=False)
     hole.export("open.ply")
     assert main(["new", "open.toml", "--mesh", "open.ply"]) == 0
     assert "warning: open.ply: the mesh is open (4 boundary edges)" in capsys.readouterr().err
-    cubes = [trimesh.creation.box(bounds=[[at, at, 0], [at + 0.1, at + 0.1, 0.1]]) for at in (0, 0.1)]
+    cubes = [
+        trimesh.creation.box(bounds=[[at, at, 0], [at + 0.1, at + 0.1, 0.1]]) for at in (0, 0.1)
+    ]
     joined = trimesh.util.concatenate(cubes)
     joined.merge_vertices()
     joined.export("edge.ply")
@@ -144,7 +160,10 @@ def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Pat
         assert words in command_error(*command)
     assert sorted(os.listdir()) == ["ball.ply", "flat.ply"]
     Path("my.toml").write_text("mine")
-    assert main(["new", "my.toml", "--mesh", "ball.ply"]) == 2 and Path("my.toml").read_text() == "mine"
+    assert (
+        main(["new", "my.toml", "--mesh", "ball.ply"]) == 2
+        and Path("my.toml").read_text() == "mine"
+    )
     assert main(["new", "my.toml", "--mesh", "ball.ply", "--overwrite"]) == 0
 
 
@@ -167,7 +186,9 @@ def packed(folder: Path, kind: str) -> set[str]:
     assert done.returncode == 0, done.stderr
     if kind != "sdist":
         return set(zipfile.ZipFile(next(folder.glob("*.whl"))).namelist())
-    return {name.partition("/")[2] for name in tarfile.open(next(folder.glob("*.tar.gz"))).getnames()}
+    return {
+        name.partition("/")[2] for name in tarfile.open(next(folder.glob("*.tar.gz"))).getnames()
+    }
 
 
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
@@ -177,12 +198,17 @@ def test_what_is_passed_on_holds_scenes_studies_changes_and_citation(kind: str, 
     shipped = [path for path in scenes.rglob("*") if path.suffix in (".toml", ".obj", ".md")]
     assert {scenes / "bunny_fall.toml", scenes / "studies" / "hard" / "plate.obj"} < set(shipped)
     assert {f"msmpetsc/shipped/{path.relative_to(scenes)}" for path in shipped} <= names
-    assert all(any(name.endswith(own) for name in names) for own in ("CHANGELOG.md", "CITATION.cff", "LICENSE"))
+    assert all(
+        any(name.endswith(own) for name in names)
+        for own in ("CHANGELOG.md", "CITATION.cff", "LICENSE")
+    )
 
 
 def test_an_editable_installation_is_a_path_that_type_checkers_can_follow(tmp_path: Path):
     names = packed(tmp_path, "editable")
-    assert [name for name in names if "/" not in name] == [f"__editable__.msmpetsc-{msmpetsc.__version__}.pth"]
+    assert [name for name in names if "/" not in name] == [
+        f"__editable__.msmpetsc-{msmpetsc.__version__}.pth"
+    ]
 
 
 def test_commands_that_are_shown_can_be_pasted(tmp_path: Path, capsys):
@@ -193,8 +219,16 @@ def test_commands_that_are_shown_can_be_pasted(tmp_path: Path, capsys):
     command = capsys.readouterr().out.splitlines()[-1].removeprefix("to run it: ")
     assert shlex.split(command) == ["msmpetsc", "run", str(scene), "--picture"]
     told = command_error("run", mesh, "-o", tmp_path / "x.h5").partition("no scene: ")[2]
-    assert shlex.split(told) == ["msmpetsc", "new", str(mesh.with_suffix(".toml")), "--mesh", str(mesh)]
+    assert shlex.split(told) == [
+        "msmpetsc",
+        "new",
+        str(mesh.with_suffix(".toml")),
+        "--mesh",
+        str(mesh),
+    ]
     told = command_error("study", scene).partition("no study: ")[2]
     assert shlex.split(told) == ["msmpetsc", "run", str(scene)]
-    told = command_error("check", scene).partition("of ")[2].partition(": ")[2].partition(" stores")[0]
+    told = (
+        command_error("check", scene).partition("of ")[2].partition(": ")[2].partition(" stores")[0]
+    )
     assert shlex.split(told) == ["msmpetsc", "check", "--update", str(scene)]

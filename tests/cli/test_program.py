@@ -29,7 +29,9 @@ def test_every_command_has_examples_that_are_command_lines(capsys):
         with pytest.raises(SystemExit):
             parsed([name, "--help"])
         shown = capsys.readouterr().out
-        assert all(f"\n  {example}\n" in shown for example in command.examples), "the lines are kept whole"
+        assert all(f"\n  {example}\n" in shown for example in command.examples), (
+            "the lines are kept whole"
+        )
 
 
 @pytest.mark.parametrize(
@@ -46,7 +48,9 @@ def test_a_mistaken_command_is_told_the_one_that_is_meant(words: list[str], expe
     assert expected in command_error(*words)
 
 
-def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_them(tmp_path: Path):
+def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_them(
+    tmp_path: Path,
+):
     scene, mesh, study = block_scene(tmp_path), tmp_path / "scene.ply", tmp_path / "study.toml"
     study.write_text('[[scene]]\nname = "a"\nfile = "a.toml"\n[[sweep]]\npreset = ["newton"]\n')
     remedies = {
@@ -64,7 +68,12 @@ def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, c
         time = {"step": step, "duration": step, "integrator": integrator}
         scene = block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -1]})
         assert main(["run", str(scene), "-o", str(tmp_path / "x.h5"), "--overwrite"]) == 0
-        assert capsys.readouterr().err.count("warning: time.step is 1.1 periods of the slowest vibration") == said
+        assert (
+            capsys.readouterr().err.count(
+                "warning: time.step is 1.1 periods of the slowest vibration"
+            )
+            == said
+        )
 
 
 def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):
@@ -95,14 +104,18 @@ def test_doctor_finds_a_sound_installation_sound():
     done = python("-m", "msmpetsc", "doctor")
     states = {line[9:26].strip(): line[:8].strip() for line in done.stdout.splitlines()}
     assert done.returncode == 0, done.stdout + done.stderr
-    assert {"PETSc", "MPI", "GPU", "HDF5"} <= set(states) and f"kept in {kernel_cache.writable()}" in done.stdout
+    assert {"PETSc", "MPI", "GPU", "HDF5"} <= set(
+        states
+    ) and f"kept in {kernel_cache.writable()}" in done.stdout
     needed = ("PETSc", "MPI", "HDF5", "kernels", "extra run")
     assert all(states[name] == "ok" for name in needed) and "BROKEN" not in done.stdout
 
 
 def test_doctor_tells_of_kernels_that_cannot_be_kept():
     code = doctor.PROBES["kernels"].replace("writable()", "None")
-    assert doctor.probed(code) == (doctor.OK, "") and "NUMBA_CACHE_DIR" in doctor.NOTHING["kernels"][1]
+    assert (
+        doctor.probed(code) == (doctor.OK, "") and "NUMBA_CACHE_DIR" in doctor.NOTHING["kernels"][1]
+    )
 
 
 def test_doctor_tells_what_is_missing_from_what_is_broken(tmp_path: Path):
@@ -115,22 +128,35 @@ class Missing:
 sys.meta_path.insert(0, Missing())
 """
     (tmp_path / "sitecustomize.py").write_text(hook)  # of the processes that it starts, too
-    (tmp_path / "tqdm.py").write_text('raise ImportError("libold.so: cannot open shared object file")')
+    (tmp_path / "tqdm.py").write_text(
+        'raise ImportError("libold.so: cannot open shared object file")'
+    )
     environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{ENVIRONMENT['PYTHONPATH']}"}
     done = python("-m", "msmpetsc", "doctor", env=environment)
     lines = {line[9:26].strip(): line for line in done.stdout.splitlines()}
-    assert lines["PETSc"].startswith("missing") and "msmpetsc[run]" in lines["PETSc"], lines["PETSc"]
-    assert lines["extra render"].startswith("BROKEN") and "tqdm: ImportError: libold.so" in lines["extra render"]
+    assert lines["PETSc"].startswith("missing") and "msmpetsc[run]" in lines["PETSc"], lines[
+        "PETSc"
+    ]
+    assert (
+        lines["extra render"].startswith("BROKEN")
+        and "tqdm: ImportError: libold.so" in lines["extra render"]
+    )
     assert lines["extra mesh"].startswith("ok") and done.returncode == 1
 
 
 def test_a_probe_that_dies_is_broken_in_one_line():
-    found = doctor.probed("import os, sys; print('cannot load libpetsc', file=sys.stderr); os.abort()")
+    found = doctor.probed(
+        "import os, sys; print('cannot load libpetsc', file=sys.stderr); os.abort()"
+    )
     assert found == (doctor.BROKEN, "cannot load libpetsc")
 
 
 def test_what_a_program_reads_is_one_json_object(tmp_path: Path, capsys):
-    scene = str(block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0, 0, -1]}))
+    scene = str(
+        block_scene(
+            tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0, 0, -1]}
+        )
+    )
     files = [str(tmp_path / f"{name}.h5") for name in "ab"]
     for file, frames in zip(files, "21", strict=True):
         assert main(["run", scene, "-o", file, "--frames", frames, "--quiet"]) == 0

@@ -14,8 +14,27 @@ GRAVITY = np.array([0, 0, -9.81])
 def fall(tmp_path_factory: pytest.TempPathFactory) -> h5py.File:
     """The shipped scene at its own time step until it has struck the ground, solved tightly by newton."""
     path = tmp_path_factory.mktemp("runs") / "fall.h5"
-    words = "--set", "cages.count=600", "--preset", "newton", "--error", "1e-9", "--frames", 125  # cells of 23 mm
-    run(1, "-m", "msmpetsc", "run", ROOT / "scenes" / "bunny_fall.toml", "-o", path, *words, status=0)
+    words = (
+        "--set",
+        "cages.count=600",
+        "--preset",
+        "newton",
+        "--error",
+        "1e-9",
+        "--frames",
+        125,
+    )  # cells of 23 mm
+    run(
+        1,
+        "-m",
+        "msmpetsc",
+        "run",
+        ROOT / "scenes" / "bunny_fall.toml",
+        "-o",
+        path,
+        *words,
+        status=0,
+    )
     return h5py.File(path)
 
 
@@ -24,7 +43,9 @@ def frames_before_contact(file: h5py.File) -> int:
 
 
 def test_the_residual_of_every_step_before_contact_from_the_file_alone(fall: h5py.File):
-    ends, r, k, m = (fall["lattice"][name][:] for name in ("springs", "rest_length", "stiffness", "mass"))
+    ends, r, k, m = (
+        fall["lattice"][name][:] for name in ("springs", "rest_length", "stiffness", "mass")
+    )
     q, t = fall["frames/position"], fall["frames/time"][1]
     scale = np.linalg.norm(m[:, None] * GRAVITY * t**2)
     for n in range(frames_before_contact(fall) - 1):  # in the step after these the ground pushes

@@ -36,7 +36,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("number", STATUS)
-def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(whole: Path, tmp_path, monkeypatch, capsys, number):
+def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
+    whole: Path, tmp_path, monkeypatch, capsys, number
+):
     path, handler = tmp_path / "x.h5", signal.getsignal(number)
     with monkeypatch.context() as patch:
         signal_after(patch, 10, number)  # between frames
@@ -53,7 +55,12 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(whole: Path, tmp_pat
 
 def test_stopped_again_and_again(whole: Path, tmp_path, monkeypatch):
     path = tmp_path / "x.h5"
-    arguments = ["run", str(whole.parent / "scene.toml"), "--resume", str(path)]  # the same command each time
+    arguments = [
+        "run",
+        str(whole.parent / "scene.toml"),
+        "--resume",
+        str(path),
+    ]  # the same command each time
     for step in (0, 1, 7, 8, 27, 39):
         with monkeypatch.context() as patch:
             signal_after(patch, step, signal.SIGUSR1)
@@ -94,9 +101,20 @@ def wait_until(condition: Callable[[], object]) -> None:
 def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks: int):
     """The step would take 100,000 iterations; a rank that gets the signal takes the other one along."""
     path = tmp_path / "x.h5"
-    scene = hanging(tmp_path, 2, cages={"cell_size": 1 / 32}, material={"young_modulus": 1e9, "density": 1000.0})
-    endless = ["-snes_type", "nrichardson", "-snes_linesearch_type", "basic", "-snes_max_it", "100000"]
-    process = start(scene, "-o", path, "--error", "1e-13", "--preset", "anderson", *endless, ranks=ranks)
+    scene = hanging(
+        tmp_path, 2, cages={"cell_size": 1 / 32}, material={"young_modulus": 1e9, "density": 1000.0}
+    )
+    endless = [
+        "-snes_type",
+        "nrichardson",
+        "-snes_linesearch_type",
+        "basic",
+        "-snes_max_it",
+        "100000",
+    ]
+    process = start(
+        scene, "-o", path, "--error", "1e-13", "--preset", "anderson", *endless, ranks=ranks
+    )
     with process:
         time.sleep(0.5)
         pid = process.pid if ranks == 1 else ranks_of(process)[-1]
@@ -107,18 +125,34 @@ def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks:
     assert "stopped by SIGTERM after step 0 of 2 (t = 0 s); to go on: msmpetsc run --resume" in told
     with h5py.File(path) as file:
         assert finished(file) == 1 and max(file["checkpoint/step"]) == 0
-    able = ["--preset", "newton", "--error", "1e-3", "-snes_type", "newtonls", "-snes_linesearch_type", "bt"]
+    able = [
+        "--preset",
+        "newton",
+        "--error",
+        "1e-3",
+        "-snes_type",
+        "newtonls",
+        "-snes_linesearch_type",
+        "bt",
+    ]
     assert main(["run", "--resume", str(path), "--force", *able]) == 0
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path):
     """Both come within one linear solve, which these settings would not end for minutes."""
     path = tmp_path / "x.h5"
-    scene = hanging(tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9})
-    endless, seen = ["-ksp_rtol", "1e-99", "-ksp_atol", "0", "-ksp_max_it", "100000"], tmp_path / "iterations"
+    scene = hanging(
+        tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9}
+    )
+    endless, seen = (
+        ["-ksp_rtol", "1e-99", "-ksp_atol", "0", "-ksp_max_it", "100000"],
+        tmp_path / "iterations",
+    )
     process = start(scene, "-o", path, *endless, "-ksp_monitor", f"ascii:{seen}")
     with process:
-        wait_until(lambda: seen.exists() and seen.stat().st_size)  # before it, the first interrupt would end the run
+        wait_until(
+            lambda: seen.exists() and seen.stat().st_size
+        )  # before it, the first interrupt would end the run
         for _ in range(20):
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)

@@ -18,13 +18,18 @@ from msmpetsc.solve.simulate import TimeLoop
 T = 0.01
 LEFT = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}
 RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}
-UP = [{"time": 0.05, "by": [0, 0, 0.02]}, {"time": 0.1, "by": [0, 0.01, 0.03]}]  # 0.4 m/s; then 0.2 m/s aside and up
+UP = [
+    {"time": 0.05, "by": [0, 0, 0.02]},
+    {"time": 0.1, "by": [0, 0.01, 0.03]},
+]  # 0.4 m/s; then 0.2 m/s aside and up
 
 
 def place(path: list[dict], time: float) -> np.ndarray:
     """Where a path is."""
     stops = [{"time": 0, "by": [0, 0, 0]}, *path]
-    return np.array([np.interp(time, [s["time"] for s in stops], [s["by"][c] for s in stops]) for c in range(3)])
+    return np.array(
+        [np.interp(time, [s["time"] for s in stops], [s["by"][c] for s in stops]) for c in range(3)]
+    )
 
 
 def led_scene(folder: Path, steps: int, anchors: list[dict], **tables) -> Path:
@@ -37,14 +42,18 @@ def test_anchored_nodes_are_on_their_path_and_the_others_follow(tmp_path: Path):
     prescribed = rest[:, 0] == 0
     assert prescribed.sum() == 15
     for frame in frames:
-        np.testing.assert_array_equal(frame.position[prescribed], rest[prescribed] + place(UP, frame.time))
+        np.testing.assert_array_equal(
+            frame.position[prescribed], rest[prescribed] + place(UP, frame.time)
+        )
     others = (frames[-1].position - rest)[~prescribed]
     # it swings about the end of the path
     assert 0.5 * 0.03 < mass[~prescribed] @ others[:, 2] / mass[~prescribed].sum() < 1.5 * 0.03
     assert np.linalg.norm(others, axis=1).min() > 0
 
 
-def test_of_two_anchors_on_a_node_the_first_leads_it_and_a_pin_is_stronger_than_both(tmp_path: Path):
+def test_of_two_anchors_on_a_node_the_first_leads_it_and_a_pin_is_stronger_than_both(
+    tmp_path: Path,
+):
     low = {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}
     sideways = [{"time": 0.05, "by": [0.01, 0, 0]}]
     anchors = [{"region": LEFT, "path": UP}, {"region": low, "path": sideways}]
@@ -69,16 +78,23 @@ def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
     held, free = frames[6], frames[7]
     assert held.time < stop < free.time
     velocity = (held.position - frames[5].position) / T
-    np.testing.assert_allclose(velocity[prescribed], np.tile([0, 0.2, 0.2], (prescribed.sum(), 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        velocity[prescribed], np.tile([0, 0.2, 0.2], (prescribed.sum(), 1)), atol=1e-12
+    )
     np.testing.assert_allclose(held.momentum, mass @ velocity, atol=1e-12)
     for frame in frames[7:]:
         np.testing.assert_allclose(frame.momentum, held.momentum, rtol=1e-6)
-    assert (np.linalg.norm(free.position[prescribed] - rest[prescribed] - place(UP, free.time), axis=1) > 1e-5).all()
+    assert (
+        np.linalg.norm(free.position[prescribed] - rest[prescribed] - place(UP, free.time), axis=1)
+        > 1e-5
+    ).all()
 
 
 def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
     anchors = [{"region": {"box": [[-1, -1, -1], [1, 1, z]]}, "path": UP} for z in (0.3, 0.2)]
-    with pytest.raises(InputError, match="every node of the lattice is held, nothing is left to move"):
+    with pytest.raises(
+        InputError, match="every node of the lattice is held, nothing is left to move"
+    ):
         play(led_scene(tmp_path, 1, anchors[:1]))
     low = {"region": {"box": [[-1, -1, -1], [1, 1, 0.05]]}}
     high = {"region": {"box": [[-1, -1, 0.1], [1, 1, 1]]}, "path": UP}
@@ -87,7 +103,9 @@ def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
     play(led_scene(tmp_path, 1, anchors[1:]))
 
 
-def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path: Path, petsc_options):
+def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(
+    tmp_path: Path, petsc_options
+):
     """And one of the user's that the first solver used is not called unused, nor taken out with our defaults."""
     scene = load_scene(led_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
     petsc_options(ksp_rtol="1e-8")
@@ -129,12 +147,16 @@ def balls(tmp_path_factory) -> Path:
     return folder
 
 
-def corners_of_cells_of(points: np.ndarray, low: np.ndarray, cell_size: float) -> set[tuple[int, ...]]:
+def corners_of_cells_of(
+    points: np.ndarray, low: np.ndarray, cell_size: float
+) -> set[tuple[int, ...]]:
     """Grid index of the corners of the cells that the points lie in, one by one."""
     found = set()
     for point in points:
         cell = [int((p - least) // cell_size) for p, least in zip(point, low, strict=True)]
-        found |= {(cell[0] + i, cell[1] + j, cell[2] + k) for i in (0, 1) for j in (0, 1) for k in (0, 1)}
+        found |= {
+            (cell[0] + i, cell[1] + j, cell[2] + k) for i in (0, 1) for j in (0, 1) for k in (0, 1)
+        }
     return found
 
 
@@ -146,17 +168,23 @@ def test_painted_points_mean_the_corners_of_their_cells(balls: Path):
     place = np.rint((model.lattice.nodes - points.min(axis=0)) / 0.3).astype(int)
     found = {tuple(p) for p in place[model.lattice.pinned].tolist()}
     assert found == wanted and 8 < len(found) <= 24
-    from_file = build_model(MPI.COMM_SELF, load_scene(balls / "scene.toml", ["pin.0.region.painted=numbers.txt"]))
+    from_file = build_model(
+        MPI.COMM_SELF, load_scene(balls / "scene.toml", ["pin.0.region.painted=numbers.txt"])
+    )
     np.testing.assert_array_equal(from_file.lattice.pinned, model.lattice.pinned)
 
 
 def test_a_point_on_the_far_side_is_in_the_last_cell(tmp_path: Path):
     """The corners of an aligned block: its far faces belong to its last cells."""
-    path = block_scene(tmp_path, time={"step": T, "duration": T}, pin=[{"region": {"painted": [0]}}])
+    path = block_scene(
+        tmp_path, time={"step": T, "duration": T}, pin=[{"region": {"painted": [0]}}]
+    )
     scene = load_scene(path)
     points = read_bodies(MPI.COMM_SELF, scene)[0].surface.points
     far = int(np.argmax(points.sum(axis=1)))
-    lattice = build_model(MPI.COMM_SELF, load_scene(path, [f"pin.0.region.painted=[{far}]"])).lattice
+    lattice = build_model(
+        MPI.COMM_SELF, load_scene(path, [f"pin.0.region.painted=[{far}]"])
+    ).lattice
     last = (lattice.nodes >= SIDES - CELL).all(axis=1)
     np.testing.assert_array_equal(lattice.pinned, last)
     assert last.sum() == 8
@@ -180,19 +208,37 @@ PRESETS = "newton", "anderson", "fast-msm"
 @pytest.fixture(scope="module")
 def runs(balls: Path) -> dict[int, tuple[Path, list]]:
     """On so many ranks: the folder of results, and (status, what was told) of each rank for each of all commands."""
-    half, most_of_it = {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]}, {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]}
-    anchors = [{"region": half, "path": UP, "stop": 0.025}, {"region": most_of_it, "path": UP, "stop": 0.045}]
+    half, most_of_it = (
+        {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]},
+        {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]},
+    )
+    anchors = [
+        {"region": half, "path": UP, "stop": 0.025},
+        {"region": most_of_it, "path": UP, "stop": 0.045},
+    ]
     prescribed = led_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
     found = {}
     for ranks in (1, 2):
         out = balls / f"ranks{ranks}"
         commands = [
-            [prescribed, "-o", out / f"{preset}.h5", "--preset", preset, "--error", "1e-10"] for preset in PRESETS
+            [prescribed, "-o", out / f"{preset}.h5", "--preset", preset, "--error", "1e-10"]
+            for preset in PRESETS
         ]
         commands += [[balls / "scene.toml", "-o", out / "painted.h5"]]
         for value in WRONG:
-            commands += [[balls / "scene.toml", "-o", out / "wrong.h5", "--set", f"pin.0.region.painted={value}"]]
-        found[ranks] = out, answers_on(ranks, [["run", *command, "-ksp_rtol", "1e-8"] for command in commands])
+            commands += [
+                [
+                    balls / "scene.toml",
+                    "-o",
+                    out / "wrong.h5",
+                    "--set",
+                    f"pin.0.region.painted={value}",
+                ]
+            ]
+        found[ranks] = (
+            out,
+            answers_on(ranks, [["run", *command, "-ksp_rtol", "1e-8"] for command in commands]),
+        )
     return found
 
 

@@ -17,7 +17,10 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.toml import toml_value
 
 TIME = {"step": 0.01, "duration": 0.1}
-LEFT, LEFT_HALF = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}, {"box": [[0, 0, 0], [0.26, 0.5, 0.25]]}  # 15, 45 of 75 nodes
+LEFT, LEFT_HALF = (
+    {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]},
+    {"box": [[0, 0, 0], [0.26, 0.5, 0.25]]},
+)  # 15, 45 of 75 nodes
 RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}  # 15
 LEFT_CELLS = {"box": [[0, 0, 0], [CELL, 0.5, 0.25]]}  # 8 cells, whose nodes are in two layers
 TWO_LAYERS = {"box": [[0, 0, 0], [CELL + 0.01, 0.5, 0.25]]}  # 30 nodes: all of those cells
@@ -40,7 +43,10 @@ def heard(caplog):
     caplog.set_level(logging.INFO, "msmpetsc")
 
     def since() -> list[tuple[str, str]]:
-        names = {logging.WARNING: "WARNING", logging.INFO: "INFO"}  # the command line has words of its own for them
+        names = {
+            logging.WARNING: "WARNING",
+            logging.INFO: "INFO",
+        }  # the command line has words of its own for them
         lines = [(names[record.levelno], record.getMessage()) for record in caplog.records]
         caplog.clear()
         return lines
@@ -57,7 +63,10 @@ def force(region: dict, **more) -> dict:
     [
         {"pin": [{"region": LEFT_HALF}], "force": [force(LEFT)]},
         {"anchor": [{"region": LEFT_HALF, "path": UP}], "force": [force(LEFT)]},
-        {"anchor": [{"region": LEFT_HALF, "path": UP, "stop": 0.05}], "force": [force(LEFT, stop=0.05)]},
+        {
+            "anchor": [{"region": LEFT_HALF, "path": UP, "stop": 0.05}],
+            "force": [force(LEFT, stop=0.05)],
+        },
     ],
     ids=["pinned", "led", "led for as long as it acts"],
 )
@@ -77,21 +86,40 @@ def test_a_force_on_no_free_node_is_refused(tmp_path, tables):
 )
 def test_a_force_that_finds_a_free_node_is_not(tmp_path, heard, tables, held):
     words = build(tmp_path, **tables).taken[-1]
-    assert words.startswith("force.0 pulls ") and (f"({held} of them held)" in words) == bool(held) and heard() == []
+    assert (
+        words.startswith("force.0 pulls ")
+        and (f"({held} of them held)" in words) == bool(held)
+        and heard() == []
+    )
 
 
 def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path):
     twice = [{"region": LEFT, "path": UP}, {"region": LEFT, "path": ASIDE}]
-    for number, more in ((1, {"anchor": twice}), (0, {"anchor": twice[:1], "pin": [{"region": LEFT_HALF}]})):
+    for number, more in (
+        (1, {"anchor": twice}),
+        (0, {"anchor": twice[:1], "pin": [{"region": LEFT_HALF}]}),
+    ):
         with pytest.raises(InputError, match=rf"anchor.{number}: .* it leads none"):
             build(tmp_path, **more)
 
 
 def test_nodes_that_two_anchors_want_are_warned_of(tmp_path, heard):
-    low, low_edge = {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}, {"box": [[0, 0, 0], [0.5, 0.01, 0.01]]}  # 25 and 5 nodes
-    build(tmp_path, anchor=[{"region": LEFT, "path": UP}, {"region": low, "path": ASIDE}], pin=[{"region": low_edge}])
+    low, low_edge = (
+        {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]},
+        {"box": [[0, 0, 0], [0.5, 0.01, 0.01]]},
+    )  # 25 and 5 nodes
+    build(
+        tmp_path,
+        anchor=[{"region": LEFT, "path": UP}, {"region": low, "path": ASIDE}],
+        pin=[{"region": low_edge}],
+    )
     first, second = (line for level, line in heard() if level == "WARNING")
-    assert re.findall(r"\d+", first) == ["0", "15", "1", "0"] and re.findall(r"\d+", second) == ["1", "25", "5", "4"]
+    assert re.findall(r"\d+", first) == ["0", "15", "1", "0"] and re.findall(r"\d+", second) == [
+        "1",
+        "25",
+        "5",
+        "4",
+    ]
 
 
 def test_pins_may_overlap(tmp_path, heard):
@@ -110,7 +138,9 @@ def test_pins_may_overlap(tmp_path, heard):
     ],
 )
 def test_a_body_of_an_odd_size_is_warned_of_before_it_is_filled(tmp_path, heard, side, mesh, words):
-    path = block_scene(tmp_path, [side, side / 2, side / 2], mesh={"source": "scene.ply"} | mesh, time=TIME)
+    path = block_scene(
+        tmp_path, [side, side / 2, side / 2], mesh={"source": "scene.ply"} | mesh, time=TIME
+    )
     read_bodies(MPI.COMM_SELF, load_scene(path))
     lines = heard()
     assert len(lines) == (len(words) > 0) and all(word in lines[0][1] for word in words)
@@ -123,9 +153,26 @@ def test_the_first_lines_say_what_a_run_is_of_and_the_last_what_it_left(tmp_path
         anchor=[{"region": RIGHT, "path": UP, "stop": 0.01}], force=[force(LEFT_HALF)],
     )  # fmt: skip
     out = tmp_path / "out" / "x.h5"
-    done = run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", out, "--measure", tmp_path / "cost.json", status=0)
+    done = run(
+        ranks,
+        "-m",
+        "msmpetsc.cli.main",
+        "run",
+        scene,
+        "-o",
+        out,
+        "--measure",
+        tmp_path / "cost.json",
+        status=0,
+    )
     before, after = done.stderr.split("frame 0/2")
-    counts = "32 cells", "75 nodes (15 pinned)", f"{ranks} rank", "anchor.0 leads 15", "force.0 pulls 45 nodes (15"
+    counts = (
+        "32 cells",
+        "75 nodes (15 pinned)",
+        f"{ranks} rank",
+        "anchor.0 leads 15",
+        "force.0 pulls 45 nodes (15",
+    )
     assert all(words in before for words in ("0.5 x 0.5 x 0.25 m", *counts)), before
     left = out, out.with_suffix(".xdmf"), tmp_path / "cost.json"
     assert all(f"{path} (" in after for path in left) and ".png" not in after, after
@@ -149,8 +196,14 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
     block_scene(tmp_path, time=TIME)
     tables = {
         "none is free": {"pin.0.region": LEFT_HALF, "force.0": force(LEFT)},
-        "it leads none": {"anchor.0": {"region": LEFT_HALF, "path": UP}, "anchor.1": {"region": LEFT, "path": ASIDE}},
-        "which it does not lead": {"anchor.0": {"region": LEFT_HALF, "path": UP}, "pin.0.region": LEFT},
+        "it leads none": {
+            "anchor.0": {"region": LEFT_HALF, "path": UP},
+            "anchor.1": {"region": LEFT, "path": ASIDE},
+        },
+        "which it does not lead": {
+            "anchor.0": {"region": LEFT_HALF, "path": UP},
+            "pin.0.region": LEFT,
+        },
     }
     commands = [
         ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / f"{number}.h5"), "--frames", "1"]

@@ -19,7 +19,9 @@ TABLE = {"times": [2 * STEP, 4 * STEP, 7 * STEP], "values": [[0, 0, 0], [8, 0, -
 
 
 def total(time: float) -> np.ndarray:
-    return np.array([np.interp(time, TABLE["times"], along) for along in np.transpose(TABLE["values"])])
+    return np.array(
+        [np.interp(time, TABLE["times"], along) for along in np.transpose(TABLE["values"])]
+    )
 
 
 def pulled(folder: Path, table=TABLE, steps: int = 10, **tables) -> Path:
@@ -30,7 +32,9 @@ def pulled(folder: Path, table=TABLE, steps: int = 10, **tables) -> Path:
 
 def test_implicit_euler_gives_a_free_body_the_force_of_each_steps_end(tmp_path: Path):
     _, frames = play(pulled(tmp_path))
-    impulse = np.cumsum([STEP * total(k * STEP) for k in range(1, 11)], axis=0)  # v_(n+1) = v_n + t f(t_(n+1)) / m
+    impulse = np.cumsum(
+        [STEP * total(k * STEP) for k in range(1, 11)], axis=0
+    )  # v_(n+1) = v_n + t f(t_(n+1)) / m
     momentum = np.array([frame.momentum for frame in frames[1:]])
     np.testing.assert_allclose(momentum, impulse, atol=1e-8 * np.abs(impulse).max())
 
@@ -41,7 +45,9 @@ def test_verlet_gives_it_the_integral_and_gains_nothing_from_nowhere(tmp_path: P
     integral = np.trapezoid if hasattr(np, "trapezoid") else np.trapz
     impulse = integral([total(time) for time in fine], fine, axis=0)
     np.testing.assert_allclose(frames[-1].momentum, impulse, atol=1e-8)
-    assert frames[-1].kinetic == pytest.approx(0.5 * impulse @ impulse / MASS, rel=1e-6), "it moves as a whole"
+    assert frames[-1].kinetic == pytest.approx(0.5 * impulse @ impulse / MASS, rel=1e-6), (
+        "it moves as a whole"
+    )
     assert "nowhere" not in caplog.text
 
 
@@ -51,7 +57,9 @@ def test_statics_find_the_state_of_each_time_and_the_same_load_once(tmp_path: Pa
     _, (_, plain) = play(pulled(tmp_path, list(total(3 * STEP)), 1, **held))
     moved = np.abs(plain.position - frames[0].position).max()
     np.testing.assert_allclose(frames[3].position, plain.position, atol=1e-6 * moved)
-    assert [frame.iterations > 0 for frame in frames[3:]] == [True] * 5 + [False] * 2, "the last value is held"
+    assert [frame.iterations > 0 for frame in frames[3:]] == [True] * 5 + [False] * 2, (
+        "the last value is held"
+    )
 
 
 def test_its_times_are_events_for_adaptive_steps_and_statics(tmp_path: Path):

@@ -21,7 +21,9 @@ def turned(x: np.ndarray, axis: list[float], angle: float, center: np.ndarray) -
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
-def test_nodes_turn_about_an_axis_at_a_steady_speed_and_go_on_as_they_were_let_go(tmp_path: Path, integrator: str):
+def test_nodes_turn_about_an_axis_at_a_steady_speed_and_go_on_as_they_were_let_go(
+    tmp_path: Path, integrator: str
+):
     axis, center = np.array([2.0, 1.0, 2.0]) / 3, [0.1, 0.2, 0.3]
     path = [{"time": 0.05, "by": [0.05, 0, 0], "turn": list(450 * axis)}]
     time = {"step": T, "duration": 4 * T, "integrator": integrator}
@@ -31,7 +33,9 @@ def test_nodes_turn_about_an_axis_at_a_steady_speed_and_go_on_as_they_were_let_g
     led = rest[:, 0] > 0.49
     for frame in frames[:4]:
         share = frame.time / 0.05
-        expected = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array([0.05, 0, 0])
+        expected = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array(
+            [0.05, 0, 0]
+        )
         np.testing.assert_allclose(frame.position[led], expected, atol=1e-14)
     share = frames[4].time / 0.05
     gone_on = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array([0.05, 0, 0])
@@ -47,7 +51,9 @@ def test_without_a_center_nodes_turn_about_their_centre_of_mass(tmp_path: Path):
     center = np.average(rest[led], axis=0, weights=model.lattice.mass[led])
     assert center == pytest.approx([0.5, *SIDES[1:] / 2])
     for frame in frames[1:]:
-        np.testing.assert_allclose(frame.position[led], turned(rest[led], [1, 0, 0], np.pi / 2, center), atol=1e-15)
+        np.testing.assert_allclose(
+            frame.position[led], turned(rest[led], [1, 0, 0], np.pi / 2, center), atol=1e-15
+        )
 
 
 def bar(folder: Path, cells: int, turn: float, **tables) -> Path:
@@ -68,7 +74,9 @@ def test_a_bar_twisted_by_a_handle_resists_as_saint_venants(tmp_path: Path):
     for cells in (4, 8):
         _, (_, frame) = play(bar(tmp_path, cells, 1.0))
         of_sizes.append(frame.torque[1, 0] / theory)
-        np.testing.assert_allclose(frame.torque[0], -frame.torque[1], atol=1e-6 * frame.torque[1, 0])
+        np.testing.assert_allclose(
+            frame.torque[0], -frame.torque[1], atol=1e-6 * frame.torque[1, 0]
+        )
     assert 1.0 < of_sizes[1] < of_sizes[0] < 1.15
     richardson = (4 * of_sizes[1] - of_sizes[0]) / 3
     assert 1.0 < richardson < 1.05
@@ -84,12 +92,22 @@ def test_forces_and_torques_of_a_body_in_balance_add_up(tmp_path: Path):
     mass, q = model.lattice.mass, frame.position
     points = np.array([[0.0, 0.5, 0.5], [5 - 0.3, 0.7, 0.1]])
     pull = mass[:, None] * gravity
-    moment = frame.torque.sum(axis=0) + np.cross(points, frame.reaction).sum(axis=0) + np.cross(q, pull).sum(axis=0)
+    moment = (
+        frame.torque.sum(axis=0)
+        + np.cross(points, frame.reaction).sum(axis=0)
+        + np.cross(q, pull).sum(axis=0)
+    )
     assert moment == pytest.approx(0, abs=1e-6 * np.abs(frame.torque).max())
-    assert frame.reaction.sum(axis=0) + pull.sum(axis=0) == pytest.approx(0, abs=1e-6 * np.abs(frame.reaction).max())
+    assert frame.reaction.sum(axis=0) + pull.sum(axis=0) == pytest.approx(
+        0, abs=1e-6 * np.abs(frame.reaction).max()
+    )
 
 
 def test_what_is_no_turn_is_told_by_its_key(tmp_path: Path):
     path = [{"time": 1.0, "turn": 90}]
     with pytest.raises(InputError, match=r"anchor\.0\.path\.0\.turn"):
-        play(block_scene(tmp_path, time={"step": T, "duration": T}, anchor=[{"region": LEFT, "path": path}]))
+        play(
+            block_scene(
+                tmp_path, time={"step": T, "duration": T}, anchor=[{"region": LEFT, "path": path}]
+            )
+        )

@@ -18,15 +18,25 @@ EDGE = {"box": [[-1, -1, -0.01], [0.01, 1, 0.01]]}
 SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3}
 TIGHT = {"solver": {"error": 1e-12}, "gravity": {"acceleration": G}}
 LIFT = [{"region": BOTTOM, "path": [{"time": 0.015, "by": [0, 0, 0.01]}]}]
-PLATE = {"shape": "plane", "point": [0, 0, 0.252], "normal": [0, 0, -1], "response": "penalty", "friction": 0.3}
+PLATE = {
+    "shape": "plane",
+    "point": [0, 0, 0.252],
+    "normal": [0, 0, -1],
+    "response": "penalty",
+    "friction": 0.3,
+}
 
 
 def totals(frame) -> np.ndarray:
     """Reactions, loads and pushes together (3,) [N]."""
-    return frame.load + sum(rows.sum(axis=0) for rows in (frame.reaction, frame.push) if rows is not None)
+    return frame.load + sum(
+        rows.sum(axis=0) for rows in (frame.reaction, frame.push) if rows is not None
+    )
 
 
-@pytest.mark.parametrize("material", [SOLID, {"young_modulus": 1e5, "density": 1000.0}], ids=["solid", "springs"])
+@pytest.mark.parametrize(
+    "material", [SOLID, {"young_modulus": 1e5, "density": 1000.0}], ids=["solid", "springs"]
+)
 def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
     """A pull and the weight, held by two pins that share an edge: the edge's nodes count once."""
     scene = block_scene(
@@ -95,7 +105,9 @@ def test_series_prints_what_the_file_has_and_replaces_nothing_unasked(tmp_path, 
     column = {name: one[:, number] for number, name in enumerate(head)}
     assert head[0] == "time [s]" and "push obstacle.0 z [N]" in head
     assert column["reaction pin.0 z [N]"][2] == pytest.approx(frames[2].reaction[0, 2], rel=1e-9)
-    assert [column[f"probe top, middle {axis} [m]"][0] for axis in "xyz"] == pytest.approx([0.25, 0.3, 0.2])
+    assert [column[f"probe top, middle {axis} [m]"][0] for axis in "xyz"] == pytest.approx(
+        [0.25, 0.3, 0.2]
+    )
     assert column["probe top, middle z [m]"][2] == pytest.approx(frames[2].probe[0, 2], rel=1e-12)
     capsys.readouterr()
     assert main(["series", str(tmp_path / "1.h5"), "-o", str(tmp_path / "1.csv")]) == 2
@@ -108,6 +120,8 @@ def test_a_probe_goes_with_its_cell(tmp_path):
         output={"surface": False, "probe": [{"name": "edge", "point": [CELL, 0.1, 0.0]}]},
     )  # fmt: skip
     _, frames = play(scene)
-    assert frames[1].probe == pytest.approx(np.array([[CELL, 0.1, 0.02 / 3]]), abs=1e-12)  # a held face, as it is led
+    assert frames[1].probe == pytest.approx(
+        np.array([[CELL, 0.1, 0.02 / 3]]), abs=1e-12
+    )  # a held face, as it is led
     with pytest.raises(InputError, match=r"output\.probe\.0\.point: \(9, 0, 0\) m lies in no cell"):
         play(scene, 'output.probe=[{name="far", point=[9, 0, 0]}]')

@@ -31,7 +31,13 @@ from msmpetsc.solve.simulate import TimeLoop
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"}
-GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
+GROUND = {
+    "shape": "plane",
+    "point": [0, 0, 0],
+    "normal": [0, 0, 1],
+    "response": "penalty",
+    "friction": 0.5,
+}
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +94,9 @@ def test_cubes_side_by_side_in_the_same_plane_of_the_grid_stay_where_they_are(fo
 
 
 def test_bodies_that_overlap_at_rest_are_named(folder: Path):
-    with pytest.raises(InputError, match=r"cut others at rest.* \(of body\.0, body\.1, which must be parted"):
+    with pytest.raises(
+        InputError, match=r"cut others at rest.* \(of body\.0, body\.1, which must be parted"
+    ):
         play(pile(folder, ["block", "block"], -0.1 * SIDE))
 
 
@@ -96,7 +104,10 @@ def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:
     """Scene of a ball that falls from such a height [m] on a block that lies on the ground."""
     bodies = [body("block", [0, 0, 0]), body("ball", [0.02, 0.01, SIDE + height])]
     # Springs come to rest sooner than a solid.
-    tables = {"material": SOLID | {"law": "linear"}, "gravity": {"acceleration": [0, 0, -G]}} | tables
+    tables = {
+        "material": SOLID | {"law": "linear"},
+        "gravity": {"acceleration": [0, 0, -G]},
+    } | tables
     return write(folder, name, body=bodies, obstacle=[GROUND], **tables)
 
 
@@ -114,22 +125,33 @@ def crossings(model: Model, frames: list[Frame]) -> int:
     return sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames)
 
 
-@pytest.mark.parametrize("turned", [np.eye(3), np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]])
+@pytest.mark.parametrize(
+    "turned", [np.eye(3), np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]]
+)
 @pytest.mark.parametrize("bent", [0.0, 0.01])
-def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(turned: np.ndarray, bent: float):
+def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(
+    turned: np.ndarray, bent: float
+):
     """Boxes around ways are those without what is linear in them, and yet hold what comes near by that alone."""
     rng = np.random.default_rng(0)
     plates = [trimesh.creation.box([SIDE, SIDE, 0.01]).subdivide().subdivide() for _ in range(2)]
     plates[1].apply_translation([0.003, 0.005, 0.01 + 1.15 * 0.02])
     points, triangles = np.concatenate([p.vertices for p in plates]), plates[0].faces
     triangles = np.concatenate([triangles, len(plates[0].vertices) + triangles])
-    moved = points @ np.diag([0.05, 0.02, -0.18]) + bent * rng.uniform(-1, 1, points.shape) + [0.3, 0.1, -0.2]
+    moved = (
+        points @ np.diag([0.05, 0.02, -0.18])
+        + bent * rng.uniform(-1, 1, points.shape)
+        + [0.3, 0.1, -0.2]
+    )
     points, moved = points @ turned.T, moved @ turned.T
     barrier = Barrier(Surface(points, triangles), BarrierLaw(0.02, 1.0, 0.0, 0.0), len(points))
     on_way, reach = barrier.candidates(points, 1e-3, moved), 1e-3
     for share in np.linspace(0, 1, 6):
         at = points + share * moved + reach / 2 * rng.uniform(-1, 1, points.shape)
-        pushes = [barrier.gradient(barrier.contacts(pairs, at), at) for pairs in (on_way, barrier.candidates(at, 0.0))]
+        pushes = [
+            barrier.gradient(barrier.contacts(pairs, at), at)
+            for pairs in (on_way, barrier.candidates(at, 0.0))
+        ]
         np.testing.assert_allclose(*pushes, atol=1e-12 * np.abs(pushes[1]).max())
     assert np.abs(pushes[1]).max() > 0
 
@@ -145,7 +167,9 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     contacts.find(start, with_points=True)
     contacts.find(end, with_points=True)
     free = 0.02 / (0.02 + 2.5 * SIDE)
-    assert 0.75 * free < contacts.free_share(start, end) < free  # a tenth of what collision detection finds is spared
+    assert (
+        0.75 * free < contacts.free_share(start, end) < free
+    )  # a tenth of what collision detection finds is spared
 
 
 def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
@@ -154,14 +178,20 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
     contacts = np.array([frame.self_contacts for frame in frames])
     first = int(np.argmax(contacts > 0))
     assert 5 <= first <= 7 and (contacts[-20:] > 0).all()  # free fall by 2 cm takes 64 ms
-    assert 0 < min(frame.self_distance for frame in frames[first:] if frame.self_contacts) < DISTANCE
+    assert (
+        0 < min(frame.self_distance for frame in frames[first:] if frame.self_contacts) < DISTANCE
+    )
     assert frames[-1].kinetic < 0.02 * max(frame.kinetic for frame in frames)
     ball, mass = model.lattice.body == 1, model.lattice.mass
     height = np.array([mass[ball] @ frame.position[ball, 2] for frame in frames]) / mass[ball].sum()
-    assert height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2  # it stays above, and is hardly dented
+    assert (
+        height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2
+    )  # it stays above, and is hardly dented
 
 
-def test_the_best_guess_is_taken_though_not_all_are_weighed(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_best_guess_is_taken_though_not_all_are_weighed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
     chosen, least = [], FirstGuess._least
 
     def checked(self: FirstGuess, guesses: list[np.ndarray], without: list[float]) -> int:
@@ -194,14 +224,20 @@ def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[str]]:
 
 
 @pytest.mark.parametrize(("few", "asked"), [(0.0, "all"), (1.0, "known")])
-def test_the_surface_is_asked_about_around_what_touches_alone(folder: Path, solves, monkeypatch, few, asked):
+def test_the_surface_is_asked_about_around_what_touches_alone(
+    folder: Path, solves, monkeypatch, few, asked
+):
     """And once more where a step leads into more, as when each iterate is looked at."""
     monkeypatch.setattr(msmpetsc.contact.surface.pairs, "FEW", few)
     scene = fall(folder, "apart", 0.02, time={"step": 0.01, "duration": 0.15})
     _, frames = play(scene, "solver.error=1e-8")
     touching = [frame.self_contacts > 0 for frame in frames]
-    assert [solves[i][0] for i in range(1, 16)] == [asked if touched else "nothing" for touched in touching[:-1]]
-    assert [solves[i][-1] == "nothing" for i in range(1, 16)] == [not any(both) for both in pairwise(touching)]
+    assert [solves[i][0] for i in range(1, 16)] == [
+        asked if touched else "nothing" for touched in touching[:-1]
+    ]
+    assert [solves[i][-1] == "nothing" for i in range(1, 16)] == [
+        not any(both) for both in pairwise(touching)
+    ]
     assert max(map(len, solves.values())) > 1
     with monkeypatch.context() as patch:
         patch.setattr(Environment, "begin_contacts", begun_with_all)
@@ -220,7 +256,10 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     scene = fall(folder, "light", 0.002, time={"step": 0.01, "duration": 0.01})
     model = build_model(MPI.COMM_SELF, load_scene(scene))
     assert model.collision is not None
-    contacts, start = Contacts(NearPairs(MPI.COMM_SELF, model.collision), 0.0, 0.01), model.lattice.nodes
+    contacts, start = (
+        Contacts(NearPairs(MPI.COMM_SELF, model.collision), 0.0, 0.01),
+        model.lattice.nodes,
+    )
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.002 - 0.5 * DISTANCE], 0.0)
     energy = contacts.touch(end, 0.01).energy
     for left_out, is_right in ((1.01, True), (0.99, False)):
@@ -231,9 +270,14 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     assert contacts.after_way(start, end, 0.0) == (True, True)
 
 
-def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(folder: Path, solves: dict[int, list[str]]):
+def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(
+    folder: Path, solves: dict[int, list[str]]
+):
     """Where it ends nothing touches: the way there tells."""
-    bodies = [body("block", [0, 0, 0]), body("ball", [0.02, 0.01, SIDE + 0.02], start={"velocity": [0, 0, -50.0]})]
+    bodies = [
+        body("block", [0, 0, 0]),
+        body("ball", [0.02, 0.01, SIDE + 0.02], start={"velocity": [0, 0, -50.0]}),
+    ]
     play(write(folder, "past", body=bodies, time={"step": 0.01, "duration": 0.01}))
     assert solves[1] == ["nothing", "all"]
 
@@ -248,18 +292,33 @@ def test_a_step_that_fails_without_the_surface_is_solved_with_it(folder: Path, s
 
     monkeypatch.setattr(Stepper, "step", failing)
     play(fall(folder, "failing", 0.02, time={"step": 0.01, "duration": 0.02}))
-    assert all(each == ["nothing"] + ["all"] * len(each[1:]) for each in solves.values()) and len(solves) == 2
+    assert (
+        all(each == ["nothing"] + ["all"] * len(each[1:]) for each in solves.values())
+        and len(solves) == 2
+    )
 
 
 def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path):
     """A ball flies at a block, and its Newton correction through the block, of which the Hessian knows nothing."""
-    bodies = [body("block", [0, 0, 0]), body("ball", [0, 0, SIDE + 0.002], start={"velocity": [0, 0, -5.0]})]
-    time, gravity = {"step": 0.01, "duration": 0.01}, {"acceleration": [0, 0, -500.0]}  # either moves them 5 cm
+    bodies = [
+        body("block", [0, 0, 0]),
+        body("ball", [0, 0, SIDE + 0.002], start={"velocity": [0, 0, -5.0]}),
+    ]
+    time, gravity = (
+        {"step": 0.01, "duration": 0.01},
+        {"acceleration": [0, 0, -500.0]},
+    )  # either moves them 5 cm
     scene = load_scene(write(folder, "through", body=bodies, time=time, gravity=gravity))
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-        environment, stepper, state = simulation.environment, simulation.integrator.stepper, simulation.state
+        environment, stepper, state = (
+            simulation.environment,
+            simulation.integrator.stepper,
+            simulation.state,
+        )
         functional, minimum, q = stepper.functional, stepper.minimum, state.q
-        faces = ContactFaces(environment, q, 2 * q - state.q_previous, 0.01, 0.01, None, stepper.lattice.pinned)
+        faces = ContactFaces(
+            environment, q, 2 * q - state.q_previous, 0.01, 0.01, None, stepper.lattice.pinned
+        )
         environment.contacts.widen()
         functional.begin(faces.problem())
         now = functional.at(q)
@@ -274,7 +333,13 @@ def test_blocks_that_collide_in_space_keep_their_momentum(folder: Path, friction
     bodies = [body("block", [0, 0, 0], start={"velocity": [0, 0, 1.0]})]
     bodies += [body("block", [0.05, 0.08, SIDE + 0.012], start={"velocity": [0.2, 0, -0.5]})]
     contact = {"distance": DISTANCE, "friction": friction}
-    path = write(folder, f"space{friction}", body=bodies, self_contact=contact, time={"step": 0.005, "duration": 0.1})
+    path = write(
+        folder,
+        f"space{friction}",
+        body=bodies,
+        self_contact=contact,
+        time={"step": 0.005, "duration": 0.1},
+    )
     model, frames = play(path, "solver.error=1e-9")
     assert max(frame.self_contacts for frame in frames) > 10 and crossings(model, frames) == 0
     momentum = np.array([frame.momentum for frame in frames])

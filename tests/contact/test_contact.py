@@ -47,7 +47,9 @@ BALLS = {
         Penalty(OBLIQUE, 50.0, 0.8, 2.0),
     ],
 }
-cases = pytest.mark.parametrize("penalties", [*CASES.values(), *BALLS.values()], ids=[*CASES, *BALLS])
+cases = pytest.mark.parametrize(
+    "penalties", [*CASES.values(), *BALLS.values()], ids=[*CASES, *BALLS]
+)
 flat_cases = pytest.mark.parametrize("penalties", CASES.values(), ids=CASES)
 
 
@@ -65,7 +67,9 @@ def gradient(contact: Contact, q: np.ndarray) -> np.ndarray:
     return total
 
 
-def hessian(contact: Contact, q: np.ndarray, duals: list | None = None) -> tuple[np.ndarray, np.ndarray]:
+def hessian(
+    contact: Contact, q: np.ndarray, duals: list | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Nodes that any part of it is of, ascending, and the sums of their blocks."""
     total = np.zeros((len(q), 3, 3))
     parts = list(contact.hessian(q, duals))
@@ -93,7 +97,9 @@ def test_a_small_change_keeps_its_digits(penalties: list[Penalty]):
     moved = q + 1e-11 * v
     v = moved - q  # q + v is rounded
     second = 0.5 * np.einsum("ai,aij,aj", v[nodes], blocks, v[nodes])
-    assert contact.change(moved, q) == pytest.approx((gradient(contact, q) * v).sum() + second, rel=1e-8, abs=0)
+    assert contact.change(moved, q) == pytest.approx(
+        (gradient(contact, q) * v).sum() + second, rel=1e-8, abs=0
+    )
 
 
 @flat_cases
@@ -118,12 +124,16 @@ def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
     r = np.linalg.norm(out, axis=1)
     across = np.eye(3) - np.einsum("ai,aj->aij", out, out) / r[:, None, None] ** 2
     blocks = blocks - (300.0 * (BALL.solid.radius - r) / r)[:, None, None] * across
-    np.testing.assert_allclose(np.einsum("aij,aj->ai", blocks, v[nodes]), slope[nodes], atol=1e-5 * np.abs(slope).max())
+    np.testing.assert_allclose(
+        np.einsum("aij,aj->ai", blocks, v[nodes]), slope[nodes], atol=1e-5 * np.abs(slope).max()
+    )
     assert len(nodes) > 5 and (r < BALL.solid.radius).all()
 
 
 @cases
-def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than_both(penalties: list[Penalty]):
+def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than_both(
+    penalties: list[Penalty],
+):
     contact, q, _ = pressed(penalties)
     nodes, true = hessian(contact, q)
     same, above = hessian(contact, q, contact.no_duals())
@@ -147,7 +157,9 @@ def test_the_parabola_of_frictions_secant_nowhere_lies_below_its_potential(name:
     for moved in [reach * way for reach in (1e-4, 1e-2, 0.5, 1, 2, 10) for way in (v, back)]:
         d, change = moved[friction.nodes], friction.change(q + moved, q)
         for duals in (friction.no_duals(), None):
-            parabola = (force * moved).sum() + 0.5 * np.einsum("ai,aij,aj", d, friction.blocks(q, duals), d)
+            parabola = (force * moved).sum() + 0.5 * np.einsum(
+                "ai,aij,aj", d, friction.blocks(q, duals), d
+            )
             below.append(parabola < change - 1e-9 * abs(change) - 1e-12)
     assert not any(below[::2])
     assert any(below[1::2]) or "sticking" in name
@@ -190,11 +202,17 @@ def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)  # 0.5 and 0.2 m/s
     start = np.array([[0.0, 0, -0.2]])
     carried = start + np.array([0.05, 0.02, 0])
-    for stick, share in {2.0: 2 * 0.25 - 0.25**2, 0.5: 1.0, 0.01: 1.0}.items():  # e = 0.2, 0.05, 0.001
+    for stick, share in {
+        2.0: 2 * 0.25 - 0.25**2,
+        0.5: 1.0,
+        0.01: 1.0,
+    }.items():  # e = 0.2, 0.05, 0.001
         contact = Contact([Penalty(moving, 100.0, 0.3, stick).during(start, 0.3, T)], 1)
         np.testing.assert_allclose(gradient(contact, carried), [[0, 0, -20]], atol=1e-12)
         slipped = carried - [0.05, 0, 0.1]  # deeper, but N is that of the start
-        np.testing.assert_allclose(gradient(contact, slipped), [[-0.3 * 20 * share, 0, -30]], atol=1e-12)
+        np.testing.assert_allclose(
+            gradient(contact, slipped), [[-0.3 * 20 * share, 0, -30]], atol=1e-12
+        )
 
 
 def test_friction_of_a_step_of_bdf2_goes_by_the_velocity_and_the_depth_that_it_ends_with():
@@ -219,9 +237,13 @@ GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response":
 MASS = DENSITY * SIDES.prod()
 
 
-def grounded(folder: Path, gravity: list[float], steps: int, t: float, ground: dict = GROUND, **tables) -> Path:
+def grounded(
+    folder: Path, gravity: list[float], steps: int, t: float, ground: dict = GROUND, **tables
+) -> Path:
     time = {"step": t, "duration": steps * t}
-    return block_scene(folder, time=time, gravity={"acceleration": gravity}, obstacle=[ground], **tables)
+    return block_scene(
+        folder, time=time, gravity={"acceleration": gravity}, obstacle=[ground], **tables
+    )
 
 
 @pytest.mark.parametrize("stiffness", [None, 2e4])
@@ -236,22 +258,41 @@ def test_a_block_at_rest_sinks_until_the_ground_carries_it(tmp_path: Path, stiff
     np.testing.assert_allclose(pushes, 0.5 * k * (depth**2).sum(axis=1), rtol=1e-12)
 
 
-def test_a_stiff_die_comes_to_rest_though_contact_is_stiffer_than_the_corners_that_touch(tmp_path: Path):
+def test_a_stiff_die_comes_to_rest_though_contact_is_stiffer_than_the_corners_that_touch(
+    tmp_path: Path,
+):
     """What F has of rounding is that of contact: the lightest corners weigh less than a millionth of a cell."""
     die = trimesh.creation.box([0.2] * 3)
-    die.apply_transform(trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3)))
+    die.apply_transform(
+        trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3))
+    )
     die.apply_translation([0, 0, 0.02 - die.bounds[0, 2]])
     die.export(tmp_path / "die.ply")
-    material = {"young_modulus": 1e10, "density": DENSITY, "poisson_ratio": 0.3, "law": "neo-hookean"}
+    material = {
+        "young_modulus": 1e10,
+        "density": DENSITY,
+        "poisson_ratio": 0.3,
+        "law": "neo-hookean",
+    }
     tables = {"cages": {"count": 64}, "material": material, "solver": {"error": 1e-3}}
     scene = grounded(tmp_path, [0, 0, -G], 45, 0.01, GROUND, mesh={"source": "die.ply"}, **tables)
     _, frames = play(scene)
     assert frames[-1].kinetic < 1e-3
 
 
-def slide(folder: Path, slope: float, steps: int = 60, t: float = 0.01, speed: dict | None = None, **tables):
+def slide(
+    folder: Path,
+    slope: float,
+    steps: int = 60,
+    t: float = 0.01,
+    speed: dict | None = None,
+    **tables,
+):
     """Velocities (steps + 1, 3) [m/s] of the mass centre, the weight tilted towards x by an angle of this tangent."""
-    down, ground = np.array([slope, 0, -1]) / np.hypot(slope, 1), GROUND | {"friction": 0.5} | (speed or {})
+    down, ground = (
+        np.array([slope, 0, -1]) / np.hypot(slope, 1),
+        GROUND | {"friction": 0.5} | (speed or {}),
+    )
     model, frames = play(grounded(folder, list(G * down), steps, t, ground, **tables))
     return np.array([frame.momentum for frame in frames]) / model.lattice.mass.sum()
 
@@ -292,8 +333,14 @@ def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_i
     scene |= {"obstacle": [GROUND | {"friction": 0.5}], "time": {"step": 0.01, "duration": 1.0}}
     gravity = {"acceleration": [G * np.sin(angle), 0, -G * np.cos(angle)]}
     sides = np.array([0.1, 0.1, 0.1])
-    model, frames = play(block_scene(tmp_path, sides, gravity=gravity, solver={"error": 1e-6}, **scene))
-    x = model.lattice.mass @ np.array([frame.position[:, 0] for frame in frames]).T / model.lattice.mass.sum()
+    model, frames = play(
+        block_scene(tmp_path, sides, gravity=gravity, solver={"error": 1e-6}, **scene)
+    )
+    x = (
+        model.lattice.mass
+        @ np.array([frame.position[:, 0] for frame in frames]).T
+        / model.lattice.mass.sum()
+    )
     if beyond < 0:
         assert x[-1] - x[0] < 3e-4 and x[-1] - x[40] < 0.6 * 1e-4
     else:
@@ -304,7 +351,9 @@ def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_i
 
 def test_a_block_slides_down_a_steep_slope_as_coulomb_says(tmp_path: Path):
     v = slide(tmp_path, 1.0)[:, 0]
-    assert (v[-1] - v[20]) / (0.01 * (len(v) - 1 - 20)) == pytest.approx(G * (1 - 0.5) / np.sqrt(2), rel=0.01)
+    assert (v[-1] - v[20]) / (0.01 * (len(v) - 1 - 20)) == pytest.approx(
+        G * (1 - 0.5) / np.sqrt(2), rel=0.01
+    )
 
 
 PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}  # [s], [N]
@@ -318,8 +367,12 @@ def error_of_a_slide(folder: Path, t: float) -> float:
     """
     mu, time = 0.2, {"step": t, "duration": 0.2, "integrator": "bdf2"}
     ground = GROUND | {"friction": mu, "stiffness": 2e3}
-    force = [{"region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}, "total": PRESSING}]
-    scene = block_scene(folder, time=time, force=force, obstacle=[ground], start={"velocity": [2.0, 0.0, 0.0]})
+    force = [
+        {"region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}, "total": PRESSING}
+    ]
+    scene = block_scene(
+        folder, time=time, force=force, obstacle=[ground], start={"velocity": [2.0, 0.0, 0.0]}
+    )
     model, frames = play(scene)
     assert min(frame.momentum[0] for frame in frames) > MASS, "it never comes to rest"
     X, _, Z = model.lattice.mass @ (frames[-1].position - model.lattice.nodes) / MASS
@@ -416,7 +469,9 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
 
     result, exact = one_step(preset, 1e-3), one_step("newton", 1e-11).position
     norm = lambda v: np.sqrt((v**2).sum(axis=1) @ lattice.mass)  # noqa: E731
-    assert norm(result.position - exact) <= 1.5 * result.cost.step_error * norm(exact - (2 * q - before))
+    assert norm(result.position - exact) <= 1.5 * result.cost.step_error * norm(
+        exact - (2 * q - before)
+    )
     assert result.cost.step_error <= 1e-3 and contact.energy(result.position) > 0
 
 
@@ -426,9 +481,13 @@ def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its
     floor = plane([0, 0, 0], [0, 0, 1], path)
     q, before = np.array([[0.3, 0, 0.2], [0.3, 0, 0.4]]), np.array([[0.2, 0, 0.23], [0.3, 0, 0.4]])
     for e in (1.0, 0.5, 0.0):
-        after, after_before = Exchange(floor, e).exchanged(q, before, StepTaken(0.5, T))  # the plane is at 0.25
+        after, after_before = Exchange(floor, e).exchanged(
+            q, before, StepTaken(0.5, T)
+        )  # the plane is at 0.25
         v, v_plane = -0.3, 0.5
-        np.testing.assert_allclose((after - after_before)[0] / T, [1.0, 0, v_plane + e * (v_plane - v)])
+        np.testing.assert_allclose(
+            (after - after_before)[0] / T, [1.0, 0, v_plane + e * (v_plane - v)]
+        )
         np.testing.assert_array_equal((after[1], after_before[1]), (q[1], before[1]))
     leaving = q + np.array([0, 0, 0.06])  # 0.9 m/s up, faster than the plane: is not held back
     np.testing.assert_array_equal(
@@ -443,14 +502,17 @@ def test_a_particle_bounces_off_the_side_of_a_box_that_it_went_into():
     step = StepTaken(1.0, T, cube.sides(before, q, 1.0, T))
     after, after_before = Exchange(cube, 1.0).exchanged(q, before, step)
     v = q - before
-    np.testing.assert_allclose(after - after_before, v * [[-1, 1, 1], [1, -1, 1], [1, 1, 1]], atol=1e-15)
+    np.testing.assert_allclose(
+        after - after_before, v * [[-1, 1, 1], [1, -1, 1], [1, 1, 1]], atol=1e-15
+    )
 
 
 def test_an_obstacle_acts_from_start_to_before_stop():
     floor = plane([0, 0, 0], [0, 0, 1], start=1.0, stop=2.0)
     q, before = np.array([[0.0, 0, -0.1]]), np.array([[0.0, 0, 0.1]])
     moved = [
-        (Exchange(floor, 1.0).exchanged(q, before, StepTaken(time, T))[0] != q).any() for time in (0.9, 1.0, 1.9, 2.0)
+        (Exchange(floor, 1.0).exchanged(q, before, StepTaken(time, T))[0] != q).any()
+        for time in (0.9, 1.0, 1.9, 2.0)
     ]
     assert moved == [False, True, True, False]
 
@@ -460,9 +522,16 @@ def test_held_nodes_are_not_moved_by_what_strikes_them(tmp_path: Path, hold: str
     """A plane comes up through the bottom of a block that is held there: struck, it would take the plane's speed."""
     bottom = {"region": {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}}
     prescribed = bottom | {"path": [{"time": 9.0, "by": [0, 0, 0]}]}
-    rising = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1], "path": [{"time": 1.0, "by": [0, 0, 1]}]}
+    rising = {
+        "shape": "plane",
+        "point": [0, 0, -0.01],
+        "normal": [0, 0, 1],
+        "path": [{"time": 1.0, "by": [0, 0, 1]}],
+    }
     time = {"step": 0.01, "duration": 0.04}
-    scene = block_scene(tmp_path, time=time, obstacle=[rising], **{hold: [bottom if hold == "pin" else prescribed]})
+    scene = block_scene(
+        tmp_path, time=time, obstacle=[rising], **{hold: [bottom if hold == "pin" else prescribed]}
+    )
     model, frames = play(scene)
     low = model.lattice.nodes[:, 2] == 0
     for frame in frames:

@@ -17,7 +17,13 @@ from msmpetsc.build import Model
 from msmpetsc.fields import Frame
 
 G, SIDE = 9.81, 0.1
-GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
+GROUND = {
+    "shape": "plane",
+    "point": [0, 0, 0],
+    "normal": [0, 0, 1],
+    "response": "penalty",
+    "friction": 0.5,
+}
 
 
 def write(folder: Path, **tables: Any) -> Path:
@@ -52,13 +58,18 @@ def crossings(model: Model, frames: list[Frame], *solids: trimesh.Trimesh) -> in
         triangles.append(solid.faces + first)
         first += len(solid.vertices)
     still, of_all = [solid.vertices for solid in solids], np.concatenate(triangles)
-    return sum(count_crossings(np.concatenate([frame.surface, *still]), of_all) for frame in frames[1:])
+    return sum(
+        count_crossings(np.concatenate([frame.surface, *still]), of_all) for frame in frames[1:]
+    )
 
 
 def middles(model: Model, frames: list[Frame], bodies: np.ndarray) -> np.ndarray:
     """Return the mass centres (frames, b, 3) [m] of bodies, by the number of that of each node (n,)."""
     mass = model.lattice.mass
-    each = [mass * (bodies == number) / mass[bodies == number].sum() for number in range(bodies.max() + 1)]
+    each = [
+        mass * (bodies == number) / mass[bodies == number].sum()
+        for number in range(bodies.max() + 1)
+    ]
     return np.array([[own @ frame.position for own in each] for frame in frames])
 
 
@@ -68,7 +79,10 @@ def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_p
     trimesh.creation.icosphere(subdivisions=2, radius=0.11).export(tmp_path / "ball.ply")
     meshes, places = [block, {"source": "ball.ply"}, block], [0.0, 0.05, -0.04]
     bodies = [
-        {"mesh": mesh | {"base": [x, 0.3 * x, 0.03 + 0.25 * i]}, "start": {"velocity": [0, 0, -2.0 - i]}}
+        {
+            "mesh": mesh | {"base": [x, 0.3 * x, 0.03 + 0.25 * i]},
+            "start": {"velocity": [0, 0, -2.0 - i]},
+        }
         for i, (mesh, x) in enumerate(zip(meshes, places, strict=True))
     ]
     floor = {"shape": "box", "box": [[-1, -1, -0.2], [1, 1, 0]], "response": "barrier"}
@@ -76,7 +90,12 @@ def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_p
         tmp_path,
         body=bodies,
         cages={"cell_size": 0.08},
-        material={"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3},
+        material={
+            "young_modulus": 1e5,
+            "density": 1000.0,
+            "law": "neo-hookean",
+            "poisson_ratio": 0.3,
+        },
         time={"step": 0.01, "duration": 0.08},
         self_contact={"friction": 0.3},
         obstacle=[floor],
@@ -105,7 +124,9 @@ def test_bodies_side_by_side_are_not_thrown_apart_without_a_distance_given(tmp_p
 
 
 @pytest.mark.parametrize("beyond", [-1.0, 1.0])
-def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides_above_it(tmp_path, beyond: float):
+def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides_above_it(
+    tmp_path, beyond: float
+):
     """On one of 1.2 m it crept at 6 to 9 mm/s, and had slid 2.3 mm before that."""
     angle = np.arctan(0.5) + np.radians(beyond)
     slab = box(tmp_path, "slab", [0.4, 0.2, 0.04]) | {"base": [0.1, 0, -0.04]}
@@ -123,7 +144,9 @@ def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides
     x = middles(model, frames, 1 * (model.lattice.nodes[:, 2] > -1e-9))[:, 1, 0]
     assert crossings(model, frames) == 0
     if beyond < 0:
-        assert x[-1] - x[0] < 0.6e-3 and (x[40] - x[20]) / 0.2 < 1e-4  # [m/s], in which friction is forgotten once
+        assert (
+            x[-1] - x[0] < 0.6e-3 and (x[40] - x[20]) / 0.2 < 1e-4
+        )  # [m/s], in which friction is forgotten once
     else:
         mean = (x[40] - 2 * x[30] + x[20]) / 0.01
         assert mean == pytest.approx(G * (np.sin(angle) - 0.5 * np.cos(angle)), abs=0.02 * 0.5 * G)
@@ -133,7 +156,9 @@ def stack(folder: Path, duration: float) -> tuple[Model, list[Frame], np.ndarray
     """Frames of five cubes on each other, and where their middles are (frames, 5, 3) [m]."""
     source = box(folder, "cube", [SIDE] * 3)
     aside = [[0, 0], [0.004, -0.003], [-0.003, 0.004], [0.005, 0], [0, 0.003]]
-    bodies = [{"mesh": source | {"base": [*at, 0.0005 + 1.012 * n * SIDE]}} for n, at in enumerate(aside)]
+    bodies = [
+        {"mesh": source | {"base": [*at, 0.0005 + 1.012 * n * SIDE]}} for n, at in enumerate(aside)
+    ]
     scene = write(
         folder,
         body=bodies,
@@ -149,7 +174,9 @@ def stack(folder: Path, duration: float) -> tuple[Model, list[Frame], np.ndarray
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("duration", "farthest"), [(0.12, 2e-3), pytest.param(10.0, 1e-4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("duration", "farthest"), [(0.12, 2e-3), pytest.param(10.0, 1e-4, marks=pytest.mark.slow)]
+)
 def test_a_stack_of_five_cubes_stands(tmp_path, duration: float, farthest: float):
     """It settles, and sways for two seconds. One of 0.2 MPa is as high as buckles under its own weight."""
     model, frames, places = stack(tmp_path, duration)
@@ -162,8 +189,13 @@ def test_a_stack_of_five_cubes_stands(tmp_path, duration: float, farthest: float
 def test_links_of_a_chain_hang_in_each_other(tmp_path):
     for name, axis in {"a": [1, 0, 0], "b": [0, 1, 0]}.items():
         link = trimesh.creation.torus(0.0503, 0.0117, major_sections=28, minor_sections=18)
-        link.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, axis)).export(tmp_path / f"{name}.ply")
-    bodies = [{"mesh": {"source": f"{name}.ply", "base": [0, 0, -0.07 * n]}} for n, name in enumerate("aba")]
+        link.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, axis)).export(
+            tmp_path / f"{name}.ply"
+        )
+    bodies = [
+        {"mesh": {"source": f"{name}.ply", "base": [0, 0, -0.07 * n]}}
+        for n, name in enumerate("aba")
+    ]
     bodies[0]["pin"] = [{"region": {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}}]
     scene = write(
         tmp_path,
@@ -182,7 +214,9 @@ def test_links_of_a_chain_hang_in_each_other(tmp_path):
 @pytest.mark.parametrize("turns", [0.5, pytest.param(2.5, marks=pytest.mark.slow)])
 def test_a_bar_that_an_anchor_twists_does_not_cross_itself(tmp_path, turns: float):
     trimesh.creation.box([0.5, SIDE, SIDE]).subdivide_to_size(0.036).export(tmp_path / "bar.ply")
-    ends = [{"half_space": {"point": [0.249 * side, 0, 0], "normal": [side, 0, 0]}} for side in (-1, 1)]
+    ends = [
+        {"half_space": {"point": [0.249 * side, 0, 0], "normal": [side, 0, 0]}} for side in (-1, 1)
+    ]
     path = [{"time": turns, "by": [-0.024 * turns, 0, 0], "turn": [360.0 * turns, 0, 0]}]
     scene = write(
         tmp_path,
@@ -197,7 +231,9 @@ def test_a_bar_that_an_anchor_twists_does_not_cross_itself(tmp_path, turns: floa
     )
     model, frames = play(scene)
     assert crossings(model, frames) == 0
-    assert np.isfinite(frames[-1].self_distance) or turns < 1  # from 1.5 turns on the bar's sides meet
+    assert (
+        np.isfinite(frames[-1].self_distance) or turns < 1
+    )  # from 1.5 turns on the bar's sides meet
     matrix = trimesh.transformations.rotation_matrix(2 * np.pi * turns, [1, 0, 0])
     matrix[0, 3] = -0.024 * turns
     held = model.surface.points[:, 0] > 0.2499
@@ -212,7 +248,11 @@ def test_a_ball_pressed_hard_into_a_hole_stays_out_of_its_rim(tmp_path):
     ring.apply_translation([0, 0, -0.03]).export(tmp_path / "ring.ply")
     trimesh.creation.icosphere(3, 0.06).export(tmp_path / "ball.ply")
     everywhere = {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}
-    washer = {"shape": "mesh", "mesh": {"source": "ring.ply", "base": [0, 0, -0.06]}, "response": "barrier"}
+    washer = {
+        "shape": "mesh",
+        "mesh": {"source": "ring.ply", "base": [0, 0, -0.06]},
+        "response": "barrier",
+    }
     scene = write(
         tmp_path,
         mesh={"source": "ball.ply", "base": [0, 0, -0.0185]},

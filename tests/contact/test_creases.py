@@ -12,7 +12,12 @@ from crossings import count_crossings
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
 from msmpetsc.geometry.surface import Surface
 
-LONG, HIGH, BOTTOM, HALF = 0.5, 0.25, 0.0625, 0.07  # [m]: of a block, of the groove's bottom, and its half width
+LONG, HIGH, BOTTOM, HALF = (
+    0.5,
+    0.25,
+    0.0625,
+    0.07,
+)  # [m]: of a block, of the groove's bottom, and its half width
 DISTANCE = 0.15  # [m]: more than the groove is wide
 LAW = BarrierLaw(DISTANCE, 100.0, 0.5, 0.01)
 
@@ -20,12 +25,22 @@ LAW = BarrierLaw(DISTANCE, 100.0, 0.5, 0.01)
 def grooved(half: float = HALF) -> trimesh.Trimesh:
     """A block with a groove across its upper side; all its points are within three rings of each other."""
     low, high = LONG / 2 - half, LONG / 2 + half
-    profile = [[LONG / 2, BOTTOM], [low, HIGH], [0, HIGH], [0, 0], [LONG, 0], [LONG, HIGH], [high, HIGH]]
+    profile = [
+        [LONG / 2, BOTTOM],
+        [low, HIGH],
+        [0, HIGH],
+        [0, 0],
+        [LONG, 0],
+        [LONG, HIGH],
+        [high, HIGH],
+    ]
     near, far = (np.insert(profile, 1, y, axis=1) for y in (0.0, 0.25))
     fan = np.array([[0, i, i + 1] for i in range(1, 6)])
     i, j = np.arange(7), np.roll(np.arange(7), -1)
     sides = np.concatenate([np.stack([i, i + 7, j], 1), np.stack([j, i + 7, j + 7], 1)])
-    mesh = trimesh.Trimesh(np.concatenate([near, far]), np.concatenate([fan, 7 + fan[:, ::-1], sides]), process=False)
+    mesh = trimesh.Trimesh(
+        np.concatenate([near, far]), np.concatenate([fan, 7 + fan[:, ::-1], sides]), process=False
+    )
     mesh.fix_normals()
     return mesh
 
@@ -51,9 +66,13 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     assert folded > 0 and dropped == 0
     candidates = barrier.candidates(points, 0.0)
     assert all(pairs.empty() for pairs in barrier.contacts(candidates, points))
-    tight = DISTANCE / 4  # the upper edges are 0.14 m apart: no more than half of that, of 0.15 m over powers of 4
+    tight = (
+        DISTANCE / 4
+    )  # the upper edges are 0.14 m apart: no more than half of that, of 0.15 m over powers of 4
     level = barrier.distances.index(tight)
-    assert barrier.contacts(barrier.creases, closed(points, 1.1 * tight))[level].empty()  # to walls it is less
+    assert barrier.contacts(barrier.creases, closed(points, 1.1 * tight))[
+        level
+    ].empty()  # to walls it is less
     assert not barrier.contacts(barrier.creases, closed(points, 0.99 * tight))[level].empty()
     through = closed(points, -2 * HALF) - points
     assert 0.3 < barrier.free_share(points, through, candidates) < 0.5  # they meet halfway
@@ -75,10 +94,15 @@ def test_the_derivatives_in_a_crease_are_those_of_its_energy():
 
     slope = (barrier.energy(*at(1)) - barrier.energy(*at(-1))) / (2 * step)
     gradient = barrier.gradient(*at(0))
-    assert slope == pytest.approx(np.vdot(gradient, direction), rel=1e-5) and np.abs(gradient).max() > 0
+    assert (
+        slope == pytest.approx(np.vdot(gradient, direction), rel=1e-5)
+        and np.abs(gradient).max() > 0
+    )
     bend = (barrier.gradient(*at(1)) - barrier.gradient(*at(-1))) / (2 * step)
     around = barrier.around(gradient.any(axis=1), points, 0.01)
-    np.testing.assert_allclose(barrier.gradient(barrier.contacts(around, points), points), gradient, rtol=1e-12)
+    np.testing.assert_allclose(
+        barrier.gradient(barrier.contacts(around, points), points), gradient, rtol=1e-12
+    )
     product = sum(barrier.hessian(*at(0), False)) @ direction.ravel()
     np.testing.assert_allclose(product, bend.ravel(), atol=1e-5 * np.abs(product).max())
     assert 0 < barrier.least(barrier.contacts(candidates, points), points) < DISTANCE / 4
@@ -124,7 +148,13 @@ def scene(folder: Path, **tables) -> Path:
 def test_a_groove_that_is_pressed_shut_does_not_cross(tmp_path):
     model, frames = play(scene(tmp_path, self_contact={"distance": DISTANCE, "friction": 0.3}))
     triangles = model.collision.surface.triangles
-    assert sum(count_crossings(model.collision.points(frame.position, 0.0), triangles) for frame in frames) == 0
+    assert (
+        sum(
+            count_crossings(model.collision.points(frame.position, 0.0), triangles)
+            for frame in frames
+        )
+        == 0
+    )
     assert frames[0].self_contacts == 0 and max(frame.self_contacts for frame in frames) > 0
     assert 0 < min(frame.self_distance for frame in frames if frame.self_contacts) < DISTANCE / 4
     _, without = play(scene(tmp_path))

@@ -17,7 +17,12 @@ def holds(region: dict, *points: list[float]) -> list[bool]:
 
 def test_box_absolute_and_relative():
     box = {"box": [[0, 0, 0], [1, 1, 0.5]]}
-    assert holds(box, [0, 0, 0], [1, 1, 0.5], [0.5, 0.5, 0.51], [-0.01, 0.5, 0.2]) == [True, True, False, False]
+    assert holds(box, [0, 0, 0], [1, 1, 0.5], [0.5, 0.5, 0.51], [-0.01, 0.5, 0.2]) == [
+        True,
+        True,
+        False,
+        False,
+    ]
     # relative: x from -1 to 3, y from 0 to 2, z from 2 to 2.5
     points = [[-1, 0, 2], [3, 2, 2.5], [3.01, 1, 2.2], [0, 1, 2.51], [0.5, 0.5, 0.2]]
     # at the body's own bounds in x, in y and below it is open outwards: cells stick out there
@@ -34,7 +39,12 @@ def test_sphere_absolute_and_relative():
 
 def test_half_space_absolute_and_relative():
     half = {"half_space": {"point": [0, 0, 0.5], "normal": [0, 3, 4]}}
-    assert holds(half, [9, 0, 0.5], [0, 4, -2.5], [0, 4, -2.51], [0, -0.1, 0.5]) == [True, True, False, False]
+    assert holds(half, [9, 0, 0.5], [0, 4, -2.5], [0, 4, -2.51], [0, -0.1, 0.5]) == [
+        True,
+        True,
+        False,
+        False,
+    ]
     # relative: the point is (-1, 0, 2.5), the normal is not scaled
     assert holds(half | {"relative": True}, [0, 4, -0.5], [0, 4, -0.51]) == [True, False]
 
@@ -43,7 +53,9 @@ def test_force_is_shared_out_by_mass():
     mass = np.array([1.0, 2.0, 5.0, 4.0])
     where = np.array([True, True, False, True])
     load = Load(shares_by_mass(MPI.COMM_SELF, where, mass), total_of((7.0, 0.0, -14.0)))
-    assert load.force_at(1.0) == pytest.approx(np.array([[1, 0, -2], [2, 0, -4], [0, 0, 0], [4, 0, -8]]))
+    assert load.force_at(1.0) == pytest.approx(
+        np.array([[1, 0, -2], [2, 0, -4], [0, 0, 0], [4, 0, -8]])
+    )
 
 
 def test_a_time_that_is_rounded_beside_start_or_stop_counts_as_it():

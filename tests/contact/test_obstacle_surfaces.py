@@ -18,7 +18,13 @@ from msmpetsc.results.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 
-SOLID = {"young_modulus": 1e5, "density": DENSITY, "law": "neo-hookean", "poisson_ratio": 0.3, "damping": 5.0}
+SOLID = {
+    "young_modulus": 1e5,
+    "density": DENSITY,
+    "law": "neo-hookean",
+    "poisson_ratio": 0.3,
+    "damping": 5.0,
+}
 FLOOR = {"shape": "box", "box": [[-1.03, -1.1, -0.2], [1.5, 1.6, -0.002]], "response": "barrier"}
 PLATE = {"shape": "box", "box": [[-0.2, -0.2, 0.26], [0.7, 0.7, 0.3]], "response": "barrier"}
 PLATE["path"] = [{"time": 0.5, "by": [0, 0, -0.06]}]
@@ -48,12 +54,18 @@ def crossed(model: Model, frame: Frame) -> int:
     """
     obstacles, body = surfaces(model), model.surface
     assert body is not None and frame.surface is not None
-    points, triangles, first = [frame.surface, obstacles.points_at(frame.time)], [body.triangles], len(body.points)
+    points, triangles, first = (
+        [frame.surface, obstacles.points_at(frame.time)],
+        [body.triangles],
+        len(body.points),
+    )
     for solid in obstacles.solids:
         triangles.append(solid.triangles + first)
         first += len(solid.points)
     of_obstacles = np.concatenate(triangles[1:]) - len(body.points)
-    return count_crossings(np.concatenate(points), np.concatenate(triangles)) - count_crossings(points[1], of_obstacles)
+    return count_crossings(np.concatenate(points), np.concatenate(triangles)) - count_crossings(
+        points[1], of_obstacles
+    )
 
 
 def test_a_block_comes_to_rest_on_a_floor_that_carries_its_weight(tmp_path: Path):
@@ -81,7 +93,9 @@ def test_a_plate_presses_a_block_that_is_held_at_its_foot(tmp_path: Path):
     assert last.reaction[0, 2] == pytest.approx(-last.push[0, 2], rel=0.01)
 
 
-def test_a_plate_turns_as_its_path_says_and_pushes_a_block_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_plate_turns_as_its_path_says_and_pushes_a_block_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     prepare, free_but_pressed = LatticePreconditioner.prepare, []
 
     def noting(self: LatticePreconditioner, q: np.ndarray, contact: Contact) -> bool:
@@ -96,11 +110,15 @@ def test_a_plate_turns_as_its_path_says_and_pushes_a_block_aside(tmp_path: Path,
     time = {"step": 0.02, "duration": 0.3}
     model, frames = play(fine_block(tmp_path, time=time, obstacle=[plate]))
     matrix = trimesh.transformations.rotation_matrix(-0.3 * np.pi / 2, [0, 0, 1], center)
-    expected = trimesh.transform_points(surfaces(model).solids[0].points, matrix) + np.array([0, 0.03, 0])
+    expected = trimesh.transform_points(surfaces(model).solids[0].points, matrix) + np.array(
+        [0, 0.03, 0]
+    )
     np.testing.assert_allclose(surfaces(model).points_at(0.3), expected, atol=1e-14)
     assert not any(crossed(model, frame) for frame in frames)
     assert frames[-1].momentum[0] < -1.0
-    assert free_but_pressed and not any(free_but_pressed), "a body that an obstacle presses is not free to move away"
+    assert free_but_pressed and not any(free_but_pressed), (
+        "a body that an obstacle presses is not free to move away"
+    )
     assert max(frame.energy_gained for frame in frames) < 0.01 * frames[-1].kinetic
 
 
@@ -108,7 +126,9 @@ def test_a_plate_turns_as_its_path_says_and_pushes_a_block_aside(tmp_path: Path,
 def test_a_ball_and_a_mesh_stop_what_falls_on_them(tmp_path: Path, shape: str):
     ball = {"shape": "sphere", "center": [0.25, 0.25, -0.31], "radius": 0.3, "response": "barrier"}
     if shape == "mesh":
-        trimesh.creation.icosphere(radius=0.3).apply_translation(ball.pop("center")).export(tmp_path / "ball.ply")
+        trimesh.creation.icosphere(radius=0.3).apply_translation(ball.pop("center")).export(
+            tmp_path / "ball.ply"
+        )
         ball = {"shape": "mesh", "mesh": {"source": "ball.ply"}, "response": "barrier"}
     time = {"step": 0.02, "duration": 0.4}
     scene = fine_block(tmp_path, time=time, obstacle=[ball], gravity=GRAVITY)
@@ -121,17 +141,26 @@ def test_a_ball_and_a_mesh_stop_what_falls_on_them(tmp_path: Path, shape: str):
 def test_a_ball_pressed_into_a_hole_stays_on_its_rim(tmp_path: Path, response: str):
     """Which is met by edges: nodes alone let it in."""
     trimesh.creation.annulus(0.045, 0.12, 0.06, sections=24).export(tmp_path / "washer.ply")
-    washer = {"shape": "mesh", "mesh": {"source": "washer.ply", "base": [0, 0, -0.0605]}, "response": response}
+    washer = {
+        "shape": "mesh",
+        "mesh": {"source": "washer.ply", "base": [0, 0, -0.0605]},
+        "response": response,
+    }
     everywhere = {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}
     pressed = {"region": everywhere, "total": [0, 0, -20.0]}
     time = {"step": 0.01, "duration": 0.1}
-    scene = fine_block(tmp_path, time=time, obstacle=[washer], force=[pressed], cages={"count": 150})
+    scene = fine_block(
+        tmp_path, time=time, obstacle=[washer], force=[pressed], cages={"count": 150}
+    )
     ball = trimesh.creation.icosphere(3, 0.06)
     ball.apply_translation([0, 0, 0.042]).export(tmp_path / "scene.ply")
     model, frames = play(scene)
     ring = trimesh.load(tmp_path / "washer.ply").apply_translation([0, 0, -0.0305])
     triangles = np.concatenate([model.surface.triangles, ring.faces + len(model.surface.points)])
-    crossing = [count_crossings(np.concatenate([frame.surface, ring.vertices]), triangles) for frame in frames]
+    crossing = [
+        count_crossings(np.concatenate([frame.surface, ring.vertices]), triangles)
+        for frame in frames
+    ]
     assert (max(crossing) == 0) == (response == "barrier")
     assert 5 < frames[-1].push[0, 2] < 60
 
@@ -143,7 +172,9 @@ def error_of_a_slide(folder: Path, t: float) -> float:
     """How far [m] X + mu Z is off, as in test_contact: it does not depend on how the push comes and goes."""
     mu, end, mass = 0.2, 0.2, DENSITY * SIDES.prod()
     floor = FLOOR | {"box": [[-0.503, -0.507, -0.2], [1.5, 1.1, -1e-4]]}
-    force = [{"region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}, "total": PRESSING}]
+    force = [
+        {"region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}, "total": PRESSING}
+    ]
     scene = block_scene(
         folder,
         time={"step": t, "duration": end, "integrator": "bdf2"},
@@ -155,7 +186,9 @@ def error_of_a_slide(folder: Path, t: float) -> float:
         self_contact={"distance": 1e-4, "friction": mu},
         solver=ERROR | {"error": 1e-6},
     )
-    trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide().subdivide().export(folder / "scene.ply")
+    trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide().subdivide().export(
+        folder / "scene.ply"
+    )
     model, frames = play(scene)
     X, _, Z = model.lattice.mass @ (frames[-1].position - model.lattice.nodes) / mass
     fine = np.linspace(0, end, 20001)
@@ -180,7 +213,9 @@ def test_ranks_agree(tmp_path: Path):
         "response": "barrier",
         "path": PLATE["path"],
     }
-    scene = fine_block(tmp_path, time={"step": 0.05, "duration": 0.3}, obstacle=[ball], pin=FOOT, **tables)
+    scene = fine_block(
+        tmp_path, time={"step": 0.05, "duration": 0.3}, obstacle=[ball], pin=FOOT, **tables
+    )
     ends = []
     for ranks in (1, 2):
         path = tmp_path / f"{ranks}.h5"
@@ -195,13 +230,19 @@ def test_ranks_agree(tmp_path: Path):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"box": [[-1, -1, -0.2], [1.5, 1.5, 0.01]]}, "obstacle: one of the barrier cuts a body at rest, at ("),
+        (
+            {"box": [[-1, -1, -0.2], [1.5, 1.5, 0.01]]},
+            "obstacle: one of the barrier cuts a body at rest, at (",
+        ),
         ({"box": [[-1, -1, -0.2], [1.5, 1.5, -1e-9]]}, "from a body at rest"),
         (
             {"response": "penalty", "path": [{"time": 1.0, "turn": [0, 0, 90]}]},
             'has a path that turns, which is for response = "barrier" with a center',
         ),
-        ({"path": [{"time": 1.0, "turn": [0, 0, 90]}]}, 'turns, which is for response = "barrier" with a center'),
+        (
+            {"path": [{"time": 1.0, "turn": [0, 0, 90]}]},
+            'turns, which is for response = "barrier" with a center',
+        ),
         ({"start": 0.1}, "that are there from the start"),
         ({"stop": 0.1}, "has stop, which is for"),
     ],

@@ -17,7 +17,11 @@ SOLID = {"young_modulus": 1e5, "density": DENSITY, "law": "neo-hookean", "poisso
 STEP = 0.01
 HEIGHT = SIDES[2]
 FLOOR = {"shape": "box", "box": [[-0.3, -0.3, -0.1], [0.8, 0.8, -0.004]], "response": "barrier"}
-PLATE = {"shape": "box", "box": [[-0.3, -0.3, HEIGHT + 0.002], [0.8, 0.8, HEIGHT + 0.1]], "response": "barrier"}
+PLATE = {
+    "shape": "box",
+    "box": [[-0.3, -0.3, HEIGHT + 0.002], [0.8, 0.8, HEIGHT + 0.1]],
+    "response": "barrier",
+}
 CENTER = [*SIDES[:2] / 2, HEIGHT + 0.002]
 WAYS = {
     "straight": {"by": [0, 0, -0.25 * HEIGHT]},
@@ -27,18 +31,28 @@ WAYS = {
 }
 
 
-def pressed(folder: Path, plate: dict, steps: int, edge: float = 0.1, **tables) -> tuple[Model, list[Frame]]:
+def pressed(
+    folder: Path, plate: dict, steps: int, edge: float = 0.1, **tables
+) -> tuple[Model, list[Frame]]:
     """Return the frames of a block on a floor; ``edge`` is the longest of its surface [m]."""
     time = {"step": STEP, "duration": STEP * steps}
     solver = {"preset": "newton", "error": 1e-4}
-    tables = {"material": SOLID, "solver": solver, "output": {}, "obstacle": [FLOOR, plate]} | tables
+    tables = {
+        "material": SOLID,
+        "solver": solver,
+        "output": {},
+        "obstacle": [FLOOR, plate],
+    } | tables
     scene = block_scene(folder, time=time, gravity={"acceleration": [0, 0, -G]}, **tables)
-    trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide_to_size(edge).export(folder / "scene.ply")
+    trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide_to_size(edge).export(
+        folder / "scene.ply"
+    )
     return play(scene)
 
 
 @pytest.mark.parametrize(
-    "way", ["sheared", *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS if way != "sheared")]
+    "way",
+    ["sheared", *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS if way != "sheared")],
 )
 def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
     """Each of its steps is a hundred times the barrier's distance long; momentum is that of all forces."""
@@ -58,7 +72,9 @@ def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
 @pytest.mark.slow
 def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
     """The cone widens it; the plate that pushes goes on by eighty times the barrier's distance in a step."""
-    ring = trimesh.creation.annulus(r_min=0.1, r_max=0.16, height=0.06, sections=24).subdivide_to_size(0.06)
+    ring = trimesh.creation.annulus(
+        r_min=0.1, r_max=0.16, height=0.06, sections=24
+    ).subdivide_to_size(0.06)
     cone = trimesh.creation.cone(radius=0.2, height=0.4, sections=32)
     cone.apply_translation([0, 0, -0.25])
     cone.export(tmp_path / "cone.ply")
@@ -91,7 +107,10 @@ def test_a_paddle_that_goes_by_half_a_ball_a_step_hits_it(tmp_path: Path):
     ball.apply_translation([0.2, 0.14, 0])
     paddle = {"shape": "box", "box": [[-0.3, -0.01, -0.2], [0.3, 0.01, 0.2]], "center": [0, 0, 0]}
     steps, step = 3, 0.002
-    paddle |= {"response": "barrier", "path": [{"time": steps * step, "turn": [0, 0, 14.4 * steps]}]}
+    paddle |= {
+        "response": "barrier",
+        "path": [{"time": steps * step, "turn": [0, 0, 14.4 * steps]}],
+    }
     scene = block_scene(
         tmp_path,
         material=SOLID,
@@ -111,5 +130,7 @@ def test_a_paddle_that_goes_by_half_a_ball_a_step_hits_it(tmp_path: Path):
 
 def test_a_step_that_cannot_end_names_the_two_parts_that_meet(tmp_path: Path):
     plate = PLATE | {"path": [{"time": STEP, "by": [0, 0, -1.5 * HEIGHT]}]}
-    with pytest.raises(StepFailed, match=r"the body and obstacle\.\d meet at|obstacle\.\d and the body meet at"):
+    with pytest.raises(
+        StepFailed, match=r"the body and obstacle\.\d meet at|obstacle\.\d and the body meet at"
+    ):
         pressed(tmp_path, plate, 1, edge=1.0)

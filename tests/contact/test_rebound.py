@@ -23,7 +23,9 @@ def rise(frames) -> float:
 def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: float):
     """Verlet's energy swings, at the limit of its substeps by 0.7% here, and comes back."""
     time = {"step": 0.004, "duration": 0.2, "integrator": integrator}
-    _, frames = play(ball(tmp_path, time=time, obstacle=[PLANE | {"restitution": restitution}], **FALL))
+    _, frames = play(
+        ball(tmp_path, time=time, obstacle=[PLANE | {"restitution": restitution}], **FALL)
+    )
     share = 1e-2 if integrator == "verlet" else 1e-3
     assert rise(frames) < share
     if integrator != "verlet":  # whose swings the budget counts up and down
@@ -33,11 +35,18 @@ def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: floa
 
 @pytest.mark.parametrize("step", [0.005, 0.0025])
 def test_bdf2_does_not_give_back_what_the_impact_of_a_soft_plate_took(tmp_path: Path, step: float):
-    fall = FALL | {"start": {"velocity": [0, 0, -2.5]}, "time": {"step": step, "duration": 0.08, "integrator": "bdf2"}}
+    fall = FALL | {
+        "start": {"velocity": [0, 0, -2.5]},
+        "time": {"step": step, "duration": 0.08, "integrator": "bdf2"},
+    }
     material = {"young_modulus": 5e4, "density": 1000.0, "poisson_ratio": 0.1, "law": "neo-hookean"}
     ground = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": "penalty"}
     size = np.array([0.25, 0.125, 0.0125])
-    _, frames = play(block_scene(tmp_path, size, cages={"count": 50}, material=material, obstacle=[ground], **fall))
+    _, frames = play(
+        block_scene(
+            tmp_path, size, cages={"count": 50}, material=material, obstacle=[ground], **fall
+        )
+    )
     assert rise(frames) < 1e-2
     assert frames[-1].momentum[2] > 0
 

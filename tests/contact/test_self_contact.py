@@ -52,13 +52,18 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     return SurfaceContact(Contacts(NearPairs(COMM, model.collision), 0.0, T), q, T), end
 
 
-@pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])  # without friction, below the kink of friction, beyond it
+@pytest.mark.parametrize(
+    "slid", [0.0, 1e-7, 1e-4]
+)  # without friction, below the kink of friction, beyond it
 def test_gradient_is_that_of_the_energy(model, slid: float):
     term, q = contact(model, slid)
     gradient = np.zeros_like(q)
     term.add_gradient(q, gradient)
     direction = np.random.default_rng(0).normal(size=q.shape)
-    for step in (1e-6, 1e-7):  # which move points by more than a change of energy is told from the forces for
+    for step in (
+        1e-6,
+        1e-7,
+    ):  # which move points by more than a change of energy is told from the forces for
         difference = term.change(q + step * direction, q - step * direction) / (2 * step)
         assert difference == pytest.approx(np.vdot(gradient, direction), rel=1e-3)
     assert np.abs(gradient).max() > 0
@@ -73,11 +78,18 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
     product, hessian, step = np.zeros_like(q), term.hessian(q, False), 1e-13
     assert hessian is not None
     hessian.add_product(forward, product)
-    bend = term.change(q + step * forward, q) + term.change(q - step * forward, q)  # the linear parts cancel
+    bend = term.change(q + step * forward, q) + term.change(
+        q - step * forward, q
+    )  # the linear parts cancel
     assert bend / (step**2 * np.vdot(product, forward)) == pytest.approx(1, rel=1e-3)
     longest = np.abs(model.collision.points.moved(forward)).max()
-    below, above = (term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share for share in (0.999, 1.001))
-    assert below / above == pytest.approx(1, rel=0.01)  # where one formula takes over from the other
+    below, above = (
+        term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share
+        for share in (0.999, 1.001)
+    )
+    assert below / above == pytest.approx(
+        1, rel=0.01
+    )  # where one formula takes over from the other
 
 
 @pytest.mark.parametrize("slid", [0.0, 1e-7])
@@ -102,7 +114,9 @@ def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: flo
 
 def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_ends_with(model):
     q = closed(model)
-    came = np.where(q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0)  # the left arm, nearer to the right one and along it
+    came = np.where(
+        q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0
+    )  # the left arm, nearer to the right one and along it
     contacts = Contacts(NearPairs(COMM, model.collision), 0.0, T)
     now, before = (SurfaceContact(contacts, at, T).friction for at in (q, q - came))
     friction = SurfaceContact(contacts, q, T, q - came).friction
@@ -110,7 +124,9 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
     np.testing.assert_allclose(friction.limit, expected, atol=1e-6 * expected.max())
     assert 1.05 < friction.limit.sum() / now.limit.sum() < 2
     points = model.collision.points
-    np.testing.assert_allclose(friction.slip(points(q + came, T))[0], 2 / 3 * now.along(points.moved(came)), atol=1e-15)
+    np.testing.assert_allclose(
+        friction.slip(points(q + came, T))[0], 2 / 3 * now.along(points.moved(came)), atol=1e-15
+    )
     assert friction.stick == pytest.approx(2 / 3 * now.stick)
 
 
@@ -122,7 +138,9 @@ def test_friction_goes_on_from_the_slip_that_pairs_held(model):
     end[q[:, 0] < 0, 1] += 0.4 * stick
     then = SurfaceContact(contacts, end, T, None, None, first).friction
     held = first.friction.values_of(then.pairs, then.begin)
-    np.testing.assert_allclose(held, first.friction.along(model.collision.points.moved(end - q)), atol=1e-12 * stick)
+    np.testing.assert_allclose(
+        held, first.friction.along(model.collision.points.moved(end - q)), atol=1e-12 * stick
+    )
     assert np.linalg.norm(held, axis=1).max() > 0.2 * stick
     assert then.released(model.collision.points(end, T)) == pytest.approx(0, abs=1e-15)
 
@@ -138,7 +156,9 @@ def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
         unit[node, c] = 1.0
         hessian.add_product(unit, product)
         columns[:, c] = product[node]
-    np.testing.assert_allclose(hessian.blocks[node].reshape(3, 3), columns, rtol=1e-10, atol=1e-12 * columns.max())
+    np.testing.assert_allclose(
+        hessian.blocks[node].reshape(3, 3), columns, rtol=1e-10, atol=1e-12 * columns.max()
+    )
     bound = term.bound(q)
     assert bound[node] >= np.linalg.eigvalsh(columns)[-1]
     assert set(np.log2(bound[bound > 0]) % 2) == {0.0}
@@ -156,7 +176,11 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     assert 0 < term.contacts.free_share(q, far) < 1 / 500
 
 
-SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}  # or the arms' ends turn inside out
+SOLID = {
+    "young_modulus": 1e5,
+    "density": 1000,
+    "law": "neo-hookean",
+}  # or the arms' ends turn inside out
 
 
 def test_arms_that_close_do_not_cross(tmp_path):
@@ -168,7 +192,9 @@ def test_arms_that_close_do_not_cross(tmp_path):
     text = path.read_text()
     path.write_text(text[: text.index("[self_contact]")])
     without = play(path)[1]
-    assert count_crossings(without[-1].surface, triangles) > 0 and np.isnan(without[-1].self_distance)
+    assert count_crossings(without[-1].surface, triangles) > 0 and np.isnan(
+        without[-1].self_distance
+    )
 
 
 def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path):
@@ -207,13 +233,17 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
         build_model(COMM, load_scene(path))
 
 
-def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_from_there(tmp_path, caplog):
+def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_from_there(
+    tmp_path, caplog
+):
     model = build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact={"surface": 400})))
     surface, whole = model.collision.surface, model.surface.points
     assert 300 < len(surface.triangles) <= 400
     squares = igl.point_mesh_squared_distance(surface.points, whole, model.surface.triangles)[0]
     assert squares.max() < 1e-18
-    np.testing.assert_allclose(model.collision.points(model.lattice.nodes, 0.0), surface.points, atol=1e-12)
+    np.testing.assert_allclose(
+        model.collision.points(model.lattice.nodes, 0.0), surface.points, atol=1e-12
+    )
     off = np.sqrt(igl.point_mesh_squared_distance(whole, surface.points, surface.triangles)[0])
     assert f"up to {off.max():.2g} m, half of it by more than {np.median(off):.2g} m" in caplog.text
     diagonal = np.linalg.norm(np.ptp(whole, axis=0))
@@ -222,7 +252,12 @@ def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_fr
     assert np.median(off) > 3e-4 * diagonal
     caplog.clear()
     far = {"surface": 400, "distance": 1.01 * off.max()}
-    assert build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact=far))).collision.law.distance > off.max()
+    assert (
+        build_model(
+            COMM, load_scene(pinch_scene(tmp_path, self_contact=far))
+        ).collision.law.distance
+        > off.max()
+    )
     assert "the surface drawn" not in caplog.text
 
 
@@ -231,7 +266,10 @@ def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_fr
     [
         ('time.integrator="verlet"', "is for time.integrator"),
         ('time.integrator="static"', "is for time.integrator"),
-        ('obstacle=[{shape="plane", point=[0,0,-1], normal=[0,0,1], response="exchange"}]', "past each other"),
+        (
+            'obstacle=[{shape="plane", point=[0,0,-1], normal=[0,0,1], response="exchange"}]',
+            "past each other",
+        ),
         ("self_contact.distance=0", "self_contact.distance"),
         ("self_contact.friction=-1", "self_contact.friction"),
     ],
@@ -251,7 +289,12 @@ def test_presets_of_a_are_refused(tmp_path):
 def sliding(folder: Path, angle: float, **given: float) -> Path:
     """Scene of a block that falls onto a plate of the same mesh, all seen as tilted by an angle [degrees]."""
     cell, g, tilt = 1 / 16, 9.81, np.radians(angle)
-    plate = trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]]).subdivide().subdivide().subdivide()
+    plate = (
+        trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]])
+        .subdivide()
+        .subdivide()
+        .subdivide()
+    )
     block = trimesh.creation.box(bounds=[[0.125, 0.09375, 3 * cell], [0.375, 0.28125, 6 * cell]])
     path = block_scene(
         folder,
@@ -283,7 +326,9 @@ def test_a_block_holds_on_a_tilted_one(tmp_path):
     creep = stick * (1 - np.sqrt(1 - np.tan(np.radians(20.0)) / 0.5))
     assert speed.mean() == pytest.approx(creep / 20, rel=0.3)  # steps 51 to 70 forget once
     assert abs(speed[:9].mean()) < 0.01 * creep
-    assert max(frame.iterations for frame in frames) <= 8  # a step starts where the last one ended, not in mid-air
+    assert (
+        max(frame.iterations for frame in frames) <= 8
+    )  # a step starts where the last one ended, not in mid-air
 
 
 def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
@@ -291,9 +336,15 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
 
     def found(first: int, second: int, at: tuple[float, float]) -> RubbingPairs:
         pair = SimpleNamespace(
-            edge0_id=first, edge1_id=second, closest_point=np.array(at), weight=1.0, normal_force_magnitude=2.0
+            edge0_id=first,
+            edge1_id=second,
+            closest_point=np.array(at),
+            weight=1.0,
+            normal_force_magnitude=2.0,
         )
-        built = SimpleNamespace(vv_collisions=[], ev_collisions=[], ee_collisions=[pair], fv_collisions=[])
+        built = SimpleNamespace(
+            vv_collisions=[], ev_collisions=[], ee_collisions=[pair], fv_collisions=[]
+        )
         return rubbing_pairs([built], mesh)
 
     edges, faces = np.array([[1, 5], [2, 4]]), np.empty((0, 3), int)
@@ -304,7 +355,9 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
     points, moved = np.random.default_rng(1).normal(size=(2, 6, 3))
     along, same = (pairs.slips(points) @ moved.ravel() for pairs in (one, other))
     assert along.any() and np.array_equal(along, same)
-    assert along @ (one.shares @ points[one.numbers[0]])[0] == pytest.approx(0)  # in the plane of contact
+    assert along @ (one.shares @ points[one.numbers[0]])[0] == pytest.approx(
+        0
+    )  # in the plane of contact
 
 
 def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Path, caplog):
@@ -319,7 +372,12 @@ def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Pa
                 {"mesh": {"source": "cube.ply", "prepare": steps, "base": [0, 0, 1.002]}},
             ],
             "cages": {"cell_size": 0.125},
-            "material": {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "damping": 20.0},
+            "material": {
+                "young_modulus": 1e5,
+                "density": 1000.0,
+                "law": "neo-hookean",
+                "damping": 20.0,
+            },
             "time": {"step": 0.05, "duration": 0.5},
             "gravity": {"acceleration": [0, 0, -9.81]},
             "self_contact": {"distance": 1e-3},

@@ -23,7 +23,9 @@ from msmpetsc.scene.reading import load_scene
 
 TORUS = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
 STAR = trimesh.creation.box((1, 2, 3)) + trimesh.creation.icosphere(2).apply_translation([3, 0, 0])
-CUT = trimesh.boolean.difference([trimesh.creation.box((2, 2, 2)), trimesh.creation.box((1, 1, 3))], engine="manifold")
+CUT = trimesh.boolean.difference(
+    [trimesh.creation.box((2, 2, 2)), trimesh.creation.box((1, 1, 3))], engine="manifold"
+)
 CENTER, RADIUS = np.array([0.21, 0.25, -0.3]), 0.3
 BALL = {"shape": "sphere", "center": CENTER.tolist(), "radius": RADIUS}
 OWN = {"shape": "function", "function": "ball"}
@@ -55,7 +57,9 @@ def test_depths_are_igls_signed_distances(mesh: trimesh.Trimesh):
     low, high = mesh.bounds
     x = np.random.default_rng(1).uniform(low - 0.3, high + 0.3, (3000, 3))
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
-    distance = igl.signed_distance(x, np.array(mesh.vertices), np.array(mesh.faces, np.int64), sign_type=kind)[0]
+    distance = igl.signed_distance(
+        x, np.array(mesh.vertices), np.array(mesh.faces, np.int64), sign_type=kind
+    )[0]
     depths, _ = solid_of(mesh).depths(x)
     near = ((x >= low) & (x <= high)).all(axis=1)
     np.testing.assert_allclose(depths[near], -distance[near], atol=1e-12)
@@ -63,19 +67,28 @@ def test_depths_are_igls_signed_distances(mesh: trimesh.Trimesh):
     assert 100 < (depths > 0).sum() < near.sum()
 
 
-@pytest.mark.parametrize("solid", [solid_of(TORUS), FunctionSolid(ball, "obstacle.0")], ids=["mesh", "function"])
+@pytest.mark.parametrize(
+    "solid", [solid_of(TORUS), FunctionSolid(ball, "obstacle.0")], ids=["mesh", "function"]
+)
 def test_normals_are_the_slope_of_depths_and_a_small_change_keeps_its_digits(solid: Solid):
     rng = np.random.default_rng(2)
-    x = rng.uniform(-1.4, 1.4, (4000, 3)) * 0.4 + (0 if isinstance(solid, FunctionSolid) else 0.8 * np.array([1, 0, 0]))
+    x = rng.uniform(-1.4, 1.4, (4000, 3)) * 0.4 + (
+        0 if isinstance(solid, FunctionSolid) else 0.8 * np.array([1, 0, 0])
+    )
     depths, face = solid.depths(x)
     x, face, depths = x[depths > 1e-3], face[depths > 1e-3], depths[depths > 1e-3]
     normals, step = solid.normals(x, face), 1e-6
-    slope = [(solid.depths(x + step * e)[0] - solid.depths(x - step * e)[0]) / (2 * step) for e in np.eye(3)]
+    slope = [
+        (solid.depths(x + step * e)[0] - solid.depths(x - step * e)[0]) / (2 * step)
+        for e in np.eye(3)
+    ]
     off = np.abs(normals + np.array(slope).T).max(axis=1)
     # but where the nearest triangle changes
     assert len(x) > 30 and np.median(off) < 1e-8 and (off < 1e-4).mean() > 0.95
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
-    moved = 1e-9 * rng.normal(size=x.shape)  # of which a difference of depths would keep seven digits
+    moved = 1e-9 * rng.normal(
+        size=x.shape
+    )  # of which a difference of depths would keep seven digits
     np.testing.assert_allclose(
         solid.deeper(x + moved, moved, face), -(moved * normals).sum(axis=1), rtol=1e-5, atol=1e-15
     )
@@ -104,7 +117,9 @@ RESPONSES = [
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
 @pytest.mark.parametrize("response", RESPONSES, ids=lambda response: response["response"])
-def test_a_function_is_the_sphere_that_it_describes(tmp_path: Path, response: dict, integrator: str):
+def test_a_function_is_the_sphere_that_it_describes(
+    tmp_path: Path, response: dict, integrator: str
+):
     """The block meets it off its top and slips to one side."""
     positions = []
     time = {"time": {**FALLING["time"], "integrator": integrator}}
@@ -119,11 +134,16 @@ def test_a_mesh_is_the_box_that_it_describes(tmp_path: Path):
     """The block falls aslant on a plate with friction; the faces by which it came in make no difference here."""
     corners = np.array([[-0.2, -0.2, -0.5], [0.7, 0.7, -0.02]])
     trimesh.creation.box(bounds=corners).export(tmp_path / "plate.ply")
-    shapes = [{"shape": "box", "box": corners.tolist()}, {"shape": "mesh", "mesh": {"source": "plate.ply"}}]
+    shapes = [
+        {"shape": "box", "box": corners.tolist()},
+        {"shape": "mesh", "mesh": {"source": "plate.ply"}},
+    ]
     positions = []
     for shape in shapes:
         obstacle = shape | {"response": "penalty", "friction": 0.4}
-        path = block_scene(tmp_path, obstacle=[obstacle], start={"velocity": [0.5, 0, -1]}, **FALLING)
+        path = block_scene(
+            tmp_path, obstacle=[obstacle], start={"velocity": [0.5, 0, -1]}, **FALLING
+        )
         positions.append(play(path)[1][-1].position)
     assert positions[0][:, 2].min() < -0.02
     np.testing.assert_allclose(positions[1], positions[0], atol=1e-7)
@@ -168,22 +188,33 @@ def test_a_large_sphere_is_a_plane(tmp_path: Path, integrator: str, response: di
     solver = {"preset": "newton", "error": ERROR}
     moved = []
     for obstacle in (PLANE, SPHERE):
-        path = block_scene(tmp_path, time=time, gravity=SLOPED, obstacle=[{**obstacle, **response}], solver=solver)
+        path = block_scene(
+            tmp_path, time=time, gravity=SLOPED, obstacle=[{**obstacle, **response}], solver=solver
+        )
         model, frames = play(path)
         moved.append(frames[-1].position - model.lattice.nodes)
-    assert moved[0][:, 2].mean() > -0.06 and np.abs(moved[0]).max() > 0.01  # it has met the ground, and slid
+    assert (
+        moved[0][:, 2].mean() > -0.06 and np.abs(moved[0]).max() > 0.01
+    )  # it has met the ground, and slid
     np.testing.assert_allclose(moved[1], moved[0], atol=5e-3 * np.abs(moved[0]).max())
 
 
 def test_a_node_is_turned_back_along_the_radius():
     """What of its velocity goes to the centre becomes -e times itself; what goes along the sphere stays."""
-    ball, q = sphere([1.0, 2.0, 3.0], 0.5), np.array([[1.0, 2.3, 3.3], [1.0, 2.5, 3.5], [1.0, 2.2, 3.1]])
-    q_previous = q + np.array([[0.1, 0.2, 0.4], [0.1, 0.2, 0.4], [0, -0.1, -0.05]])  # in, outside, on its way out
+    ball, q = (
+        sphere([1.0, 2.0, 3.0], 0.5),
+        np.array([[1.0, 2.3, 3.3], [1.0, 2.5, 3.5], [1.0, 2.2, 3.1]]),
+    )
+    q_previous = q + np.array(
+        [[0.1, 0.2, 0.4], [0.1, 0.2, 0.4], [0, -0.1, -0.05]]
+    )  # in, outside, on its way out
     after, before = Exchange(ball, 0.5).exchanged(q, q_previous, StepTaken(1.0, 0.1))
     normal = np.array([0, 1, 1]) / np.sqrt(2)
     speed = (q - q_previous)[0] @ normal
     assert speed < 0
-    np.testing.assert_allclose((after - before)[0], (q - q_previous)[0] - 1.5 * speed * normal, atol=1e-14)
+    np.testing.assert_allclose(
+        (after - before)[0], (q - q_previous)[0] - 1.5 * speed * normal, atol=1e-14
+    )
     np.testing.assert_array_equal(after[1:], q[1:])
     np.testing.assert_array_equal(before[1:], q_previous[1:])
 
@@ -198,7 +229,11 @@ MISTAKES = [
     ({**BALL, "function": "ball"}, None, "obstacle.0: has function, which is for 'function' only"),
     ({"shape": "mesh", "mesh": {"source": "gone.ply"}}, None, "gone.ply"),
     ({"shape": "mesh", "mesh": {"source": "open.ply"}}, None, "obstacle.0.mesh: must be closed"),
-    ({"shape": "mesh", "mesh": {"source": "open.ply", "prepare": ["mend"]}}, None, "obstacle.0.mesh.prepare.0: "),
+    (
+        {"shape": "mesh", "mesh": {"source": "open.ply", "prepare": ["mend"]}},
+        None,
+        "obstacle.0.mesh.prepare.0: ",
+    ),
     ({"shape": "function", "function": "bell"}, None, "no obstacle 'bell' is registered"),
     (OWN, wrong(2.0), "obstacle.0.function: no signed distance"),
     (OWN, wrong(value=np.nan), "obstacle.0.function: returned numbers that are not finite"),

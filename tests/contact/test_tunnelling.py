@@ -39,7 +39,9 @@ def test_the_side_is_the_face_that_a_way_first_goes_through(start: np.ndarray, e
         if first == 0:
             assert side == 1 + face[0]
         else:
-            ahead = ((way[first - 1] - CUBE.solid.planes.points) * CUBE.solid.planes.normals).sum(axis=1)
+            ahead = ((way[first - 1] - CUBE.solid.planes.points) * CUBE.solid.planes.normals).sum(
+                axis=1
+            )
             entered = np.flatnonzero(ahead >= 0)
             assert side - 1 in entered and (len(entered) > 1 or side == 1 + entered[0])
 
@@ -92,7 +94,9 @@ BLOCK = np.array([0.25, 0.25, 0.25])
 STIFF = {"young_modulus": 1e6, "density": 1000.0}
 
 
-def against_a_plate(folder: Path, integrator: str, response: str, speed: float, moving: bool, **tables) -> Path:
+def against_a_plate(
+    folder: Path, integrator: str, response: str, speed: float, moving: bool, **tables
+) -> Path:
     """A plate of a hundredth of a cell 0.1 m under a block that falls on it, or that it comes up to; no gravity."""
     steps = 10 + int(np.ceil(0.4 / speed / STEP))
     plate = {"shape": "box", "box": [[-9, -9, -0.10125], [9, 9, -0.1]], "response": response}
@@ -103,7 +107,9 @@ def against_a_plate(folder: Path, integrator: str, response: str, speed: float, 
         start = {"velocity": [0, 0, -speed]}
     time = {"step": STEP, "duration": steps * STEP, "integrator": integrator}
     tables = {"solver": {"preset": "newton", "error": 1e-3}, **tables}
-    return block_scene(folder, BLOCK, time=time, start=start, obstacle=[plate], material=STIFF, **tables)
+    return block_scene(
+        folder, BLOCK, time=time, start=start, obstacle=[plate], material=STIFF, **tables
+    )
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["the body moves", "the plate moves"])
@@ -111,7 +117,12 @@ def against_a_plate(folder: Path, integrator: str, response: str, speed: float, 
 @pytest.mark.parametrize("response", ["penalty", "reflect"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_no_node_gets_past_a_thin_plate(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, integrator: str, response: str, speed: float, moving: bool
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    integrator: str,
+    response: str,
+    speed: float,
+    moving: bool,
 ):
     """At 100 m/s it is folded over within a step; what it then gains is told."""
     model, frames = play(against_a_plate(tmp_path, integrator, response, speed, moving))
@@ -139,9 +150,18 @@ def test_to_and_from_a_moving_frame_nothing_changes(tmp_path: Path, integrator: 
 
 def test_a_body_rests_on_a_plate_thinner_than_its_push_is_deep(tmp_path: Path):
     """Every node at the bottom lies below the far face, for good."""
-    floor = {"shape": "box", "box": [[-9, -9, -1e-6], [9, 9, 0]], "response": "penalty", "friction": 0.5}
+    floor = {
+        "shape": "box",
+        "box": [[-9, -9, -1e-6], [9, 9, 0]],
+        "response": "penalty",
+        "friction": 0.5,
+    }
     time = {"step": 0.05, "duration": 2.0}
-    _, frames = play(block_scene(tmp_path, BLOCK, time=time, gravity={"acceleration": [0, 0, -9.81]}, obstacle=[floor]))
+    _, frames = play(
+        block_scene(
+            tmp_path, BLOCK, time=time, gravity={"acceleration": [0, 0, -9.81]}, obstacle=[floor]
+        )
+    )
     depth = np.maximum(-frames[-1].position[:, 2], 0)
     assert depth.max() > 1e-4
     assert 10 * STIFFEST * depth.sum() == pytest.approx(1000 * BLOCK.prod() * 9.81, rel=1e-4)
@@ -152,12 +172,23 @@ def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path):
     energy that is known of them. A third has nodes inside, which one rank reports, and not again on resuming.
     """
     time = {"step": 0.002, "duration": 0.046, "integrator": "bdf2"}
-    pushing = {"shape": "box", "box": [[-9, -9, -0.02], [9, 9, -0.019]], "response": "penalty", "friction": 0.3}
+    pushing = {
+        "shape": "box",
+        "box": [[-9, -9, -0.02], [9, 9, -0.019]],
+        "response": "penalty",
+        "friction": 0.3,
+    }
     pushing |= {"path": [{"time": 1.0, "by": [0, 0, 3.0]}]}
-    wall = {"shape": "box", "box": [[-0.012, -9, -9], [-0.011, 9, 9]], "path": [{"time": 1.0, "by": [3.0, 0, 0]}]}
+    wall = {
+        "shape": "box",
+        "box": [[-0.012, -9, -9], [-0.011, 9, 9]],
+        "path": [{"time": 1.0, "by": [3.0, 0, 0]}],
+    }
     inside = {"shape": "box", "box": [[0.9, -1, -1], [2, 0.05, 0.05]]}
     obstacles = [pushing, wall, inside]
-    path = block_scene(tmp_path, np.array([1.0, 0.25, 0.25]), time=time, obstacle=obstacles, material=STIFF)
+    path = block_scene(
+        tmp_path, np.array([1.0, 0.25, 0.25]), time=time, obstacle=obstacles, material=STIFF
+    )
     _, frames = play(path)
     done = msmpetsc(2, "run", path, "-o", tmp_path / "o.h5", "--set", "time.duration=0.04")
     assert done.returncode == 0 and done.stderr.count("1 node inside obstacle.2") == 1, done.stderr
@@ -165,9 +196,13 @@ def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path):
     done = msmpetsc(2, "run", "--resume", tmp_path / "o.h5", *more)
     assert done.returncode == 0 and "inside obstacle" not in done.stderr, done.stderr
     with h5py.File(tmp_path / "o.h5") as file:
-        np.testing.assert_allclose(file["frames/position"][:], [frame.position for frame in frames], atol=1e-7)
+        np.testing.assert_allclose(
+            file["frames/position"][:], [frame.position for frame in frames], atol=1e-7
+        )
         gained = [frame.energy_gained for frame in frames]
-        np.testing.assert_allclose(file["frames/energy_gained"][:], gained, atol=1e-5 * totals(frames).max())
+        np.testing.assert_allclose(
+            file["frames/energy_gained"][:], gained, atol=1e-5 * totals(frames).max()
+        )
 
 
 def test_a_step_whose_nodes_cannot_be_settled_fails_in_words(tmp_path: Path, monkeypatch):
@@ -178,13 +213,27 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words(tmp_path: Path, mon
 
 def test_nodes_that_come_in_by_another_face_each_time_a_step_is_solved_settle(tmp_path: Path):
     """A plate that comes edge first meets a fast body by its corner, out of a larger run of random boxes."""
-    plate = {"shape": "box", "box": [[-1.481, 2.832, 0.2023], [1.519, 5.832, 0.2523]], "response": "penalty"}
+    plate = {
+        "shape": "box",
+        "box": [[-1.481, 2.832, 0.2023], [1.519, 5.832, 0.2523]],
+        "response": "penalty",
+    }
     plate["path"] = [{"time": 0.05, "by": [0.89, -7.54, 0.155]}]
-    around = {"shape": "box", "box": [[-1.75, -1.46, 0.1771], [1.249, 1.54, 0.4771]], "start": 0.01, "stop": 0.03}
+    around = {
+        "shape": "box",
+        "box": [[-1.75, -1.46, 0.1771], [1.249, 1.54, 0.4771]],
+        "start": 0.01,
+        "stop": 0.03,
+    }
     time = {"step": 0.005, "duration": 0.05, "integrator": "bdf2"}
-    tables = {"material": STIFF | {"young_modulus": 3.5e6}, "solver": {"preset": "newton", "error": 1e-3}}
+    tables = {
+        "material": STIFF | {"young_modulus": 3.5e6},
+        "solver": {"preset": "newton", "error": 1e-3},
+    }
     start = {"velocity": [21.37, -5.853, 2.545]}
-    _, frames = play(block_scene(tmp_path, BLOCK, time=time, start=start, obstacle=[plate, around], **tables))
+    _, frames = play(
+        block_scene(tmp_path, BLOCK, time=time, start=start, obstacle=[plate, around], **tables)
+    )
     assert len(frames) == 11 and max(frame.contact for frame in frames) > 0
 
 
@@ -201,13 +250,19 @@ def ball(folder: Path, **tables) -> Path:
 
 def totals(frames) -> np.ndarray:
     """[J] of each frame."""
-    return np.array([frame.kinetic + frame.elastic + frame.potential + frame.contact for frame in frames])
+    return np.array(
+        [frame.kinetic + frame.elastic + frame.potential + frame.contact for frame in frames]
+    )
 
 
 def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
     floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "restitution": 0}
     time = {"step": 0.005, "duration": 1.0, "integrator": "bdf2"}
-    _, frames = play(block_scene(tmp_path, BLOCK, time=time, gravity={"acceleration": [0, 0, -9.81]}, obstacle=[floor]))
+    _, frames = play(
+        block_scene(
+            tmp_path, BLOCK, time=time, gravity={"acceleration": [0, 0, -9.81]}, obstacle=[floor]
+        )
+    )
     lowest = [frame.position[:, 2].min() for frame in frames]
     assert min(lowest) > -0.005 and abs(lowest[-1] - lowest[100]) < 1e-3
 
@@ -230,14 +285,22 @@ def told(caplog: pytest.LogCaptureFixture, what: str) -> list[str]:
     return [record.getMessage() for record in caplog.records if what in record.getMessage()]
 
 
-def test_energy_from_nowhere_is_told_once_with_its_frame(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_energy_from_nowhere_is_told_once_with_its_frame(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     """The paper's exchange sets nodes back against their springs: 4% of a ball's energy at steps of 1 ms. What is told
     is a share of what the body had, not of what the exchange put in."""
     floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1], "response": "exchange"}
-    scene = {"start": {"velocity": [0, 0, -10.0]}, "obstacle": [floor], "cages": {"count": 100, "boundary": "whole"}}
+    scene = {
+        "start": {"velocity": [0, 0, -10.0]},
+        "obstacle": [floor],
+        "cages": {"count": 100, "boundary": "whole"},
+    }
     _, frames = play(ball(tmp_path, time={"step": 0.001, "duration": 0.03}, **scene))
     first, last = told(caplog, "nowhere")
-    assert float(re.search(r"of ([\d.e+]+) J", first)[1]) == pytest.approx(frames[0].kinetic, rel=0.05)
+    assert float(re.search(r"of ([\d.e+]+) J", first)[1]) == pytest.approx(
+        frames[0].kinetic, rel=0.05
+    )
     assert first.startswith("frame 2") and 'try response = "reflect"' in first and "frames" in last
     caplog.clear()
     reflecting = scene | {"obstacle": [floor | {"response": "reflect"}]}
@@ -248,7 +311,9 @@ def test_energy_from_nowhere_is_told_once_with_its_frame(tmp_path: Path, caplog:
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_swings_and_loose_steps_are_no_gain(tmp_path: Path, caplog: pytest.LogCaptureFixture, integrator: str):
+def test_swings_and_loose_steps_are_no_gain(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, integrator: str
+):
     """A body let go stretched by a tenth, at verlet's limit and at a step error of 0.1."""
     time = {"step": 0.01, "duration": 0.3, "integrator": integrator}
     solver = {"preset": "newton", "error": 0.1}
@@ -256,17 +321,26 @@ def test_swings_and_loose_steps_are_no_gain(tmp_path: Path, caplog: pytest.LogCa
     assert not told(caplog, "nowhere")
 
 
-def test_nodes_that_begin_inside_are_told_with_number_depth_and_place(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_nodes_that_begin_inside_are_told_with_number_depth_and_place(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     """A block 0.25 m high, of 3 x 3 x 3 nodes, half under the ground; the tops of two pins do not count."""
     ground = {"shape": "plane", "point": [0, 0, 0.2], "normal": [0, 0, 1], "response": "exchange"}
     high = {"shape": "box", "box": [[-1, -1, 9], [1, 1, 10]], "response": "penalty"}
-    late = {"shape": "box", "box": [[-1, -1, -1], [0.1, 1, 1]], "response": "penalty", "start": 0.02}
+    late = {
+        "shape": "box",
+        "box": [[-1, -1, -1], [0.1, 1, 1]],
+        "response": "penalty",
+        "start": 0.02,
+    }
     pin = [{"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}]
     time = {"step": 0.01, "duration": 0.04}
     path = block_scene(tmp_path, BLOCK, time=time, obstacle=[high, ground, late], pin=pin)
     play(path)
     now, later = told(caplog, "inside obstacle")
-    assert now.startswith("frame 0 (t = 0 s): 17 nodes inside obstacle.1, up to 0.2 m (1.6 cells) deep: node ")
+    assert now.startswith(
+        "frame 0 (t = 0 s): 17 nodes inside obstacle.1, up to 0.2 m (1.6 cells) deep: node "
+    )
     assert later.startswith("frame 2 (t = 0.02 s): 8 nodes inside obstacle.2, up to 0.1 m")
     caplog.clear()
     play(path, "obstacle.1.point=[0, 0, 0]", "obstacle.2.start=9")

@@ -16,7 +16,9 @@ H = 0.1
 
 
 def lattice_of(*sides: int, law: str = "neo-hookean") -> Lattice:
-    return build_lattice(cages_of(block(*sides), H), Material(density=DENSITY, young_modulus=YOUNG, law=law))
+    return build_lattice(
+        cages_of(block(*sides), H), Material(density=DENSITY, young_modulus=YOUNG, law=law)
+    )
 
 
 def test_volumes_at_rest_and_mirrored():
@@ -25,10 +27,14 @@ def test_volumes_at_rest_and_mirrored():
     assert len(cells) == 4
     np.testing.assert_allclose(least_volumes(rest, cells), H**3, rtol=1e-12)
     for axis in range(3):
-        np.testing.assert_allclose(least_volumes(rest * (1 - 2 * (np.arange(3) == axis)), cells), -(H**3), rtol=1e-12)
+        np.testing.assert_allclose(
+            least_volumes(rest * (1 - 2 * (np.arange(3) == axis)), cells), -(H**3), rtol=1e-12
+        )
     # The corners of a stretched cell have the same volume: the determinant.
     stretch = np.array([[1.2, 0.3, 0], [0, 0.9, -0.2], [0.1, 0, 0.8]])
-    np.testing.assert_allclose(least_volumes(rest @ stretch.T, cells), np.linalg.det(stretch) * H**3, rtol=1e-12)
+    np.testing.assert_allclose(
+        least_volumes(rest @ stretch.T, cells), np.linalg.det(stretch) * H**3, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("corner", range(8))
@@ -61,21 +67,32 @@ def test_a_cell_folded_into_its_neighbour_comes_back_as_a_solid_and_stays_as_spr
     start = bar.nodes + 0.02 * H * np.random.default_rng(7).normal(size=bar.nodes.shape)
     start[np.isclose(bar.nodes[:, 0], bar.nodes[:, 0].min()), 0] += 1.5 * H
     assert least_volumes(start, bar.local_cells).min() < 0
-    back, stuck = after_many_steps(bar, start), after_many_steps(lattice_of(3, 1, 1, law="linear"), start)
+    back, stuck = (
+        after_many_steps(bar, start),
+        after_many_steps(lattice_of(3, 1, 1, law="linear"), start),
+    )
     np.testing.assert_allclose(least_volumes(back, bar.local_cells), H**3, rtol=1e-3)
-    np.testing.assert_allclose(np.sort(least_volumes(stuck, bar.local_cells)), [-(H**3), H**3, H**3], rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sort(least_volumes(stuck, bar.local_cells)), [-(H**3), H**3, H**3], rtol=1e-3
+    )
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_mirrored_cell_unfolds_without_a_step_that_fails(seed: int):
     """Its Hessian is indefinite: newton must leave the projected Hessian."""
     one = lattice_of(1, 1, 1)
-    start = one.nodes * [1, 1, -1] + 0.05 * H * np.random.default_rng(seed).normal(size=one.nodes.shape)
+    start = one.nodes * [1, 1, -1] + 0.05 * H * np.random.default_rng(seed).normal(
+        size=one.nodes.shape
+    )
     end = after_many_steps(one, start)
-    assert least_volumes(start, one.local_cells).max() < 0 < least_volumes(end, one.local_cells).min()
+    assert (
+        least_volumes(start, one.local_cells).max() < 0 < least_volumes(end, one.local_cells).min()
+    )
 
 
-def squeezed_step(preset: str, height: float, error: float) -> tuple[np.ndarray, float, Lattice, np.ndarray]:
+def squeezed_step(
+    preset: str, height: float, error: float
+) -> tuple[np.ndarray, float, Lattice, np.ndarray]:
     """A step of a block from rest at a share of its height: x, the error declared, the block, q_n."""
     lattice = lattice_of(3, 3, 3)
     shake = 0.02 * H * np.random.default_rng(9).normal(size=lattice.nodes.shape)
@@ -89,7 +106,8 @@ def squeezed_step(preset: str, height: float, error: float) -> tuple[np.ndarray,
 
 
 @pytest.mark.parametrize(
-    ("preset", "height"), [("newton", 0.45), ("anderson", 0.45), *((preset, 0.85) for preset in PRESETS)]
+    ("preset", "height"),
+    [("newton", 0.45), ("anderson", 0.45), *((preset, 0.85) for preset in PRESETS)],
 )
 def test_every_preset_steps_a_squeezed_solid_to_the_error_it_declares(preset: str, height: float):
     x, error, lattice, q = squeezed_step(preset, height, 1e-3)

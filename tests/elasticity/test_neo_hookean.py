@@ -29,7 +29,9 @@ def points_inside(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Shares (8,) of the corners and squares (3,) of a part of a cell, that are sums over points of it."""
-    return 8 * (0.5 + SIGNS * points[:, None]).prod(axis=2).sum(axis=0) / n, (points**2).sum(axis=0) / n
+    return 8 * (0.5 + SIGNS * points[:, None]).prod(axis=2).sum(axis=0) / n, (points**2).sum(
+        axis=0
+    ) / n
 
 
 def solid(*sides: int, poisson: float, cut: bool = False) -> Lattice:
@@ -39,7 +41,8 @@ def solid(*sides: int, poisson: float, cut: bool = False) -> Lattice:
     if not cut:
         return lattice
     share, squares = map(
-        np.array, zip(*(moments(points_inside(RNG, 400), 400) for _ in lattice.local_cells), strict=True)
+        np.array,
+        zip(*(moments(points_inside(RNG, 400), 400) for _ in lattice.local_cells), strict=True),
     )
     cells = lattice.solid._replace(forms=forms_of(share, squares), volume=H**3 * share.mean(axis=1))
     return Lattice(**(vars(lattice) | {"solid": cells}))
@@ -51,7 +54,9 @@ def gradient(elastic: Elasticity, q: np.ndarray) -> np.ndarray:
     return g
 
 
-cases = pytest.mark.parametrize(("poisson", "cut"), [(0.25, False), (0.0, True), (0.45, True), (0.49, False)])
+cases = pytest.mark.parametrize(
+    ("poisson", "cut"), [(0.25, False), (0.0, True), (0.45, True), (0.49, False)]
+)
 
 
 @cases
@@ -74,14 +79,22 @@ def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
     """Of 96 cells the first and every seventh are cut; two materials."""
     lattice = solid(6, 4, 4, poisson=0.3)
     assert lattice.solid is not None
-    cut, hard = np.arange(96) % 7 == 0, lattice.nodes[lattice.local_cells].mean(axis=1)[:, 0] > 3 * H
+    cut, hard = (
+        np.arange(96) % 7 == 0,
+        lattice.nodes[lattice.local_cells].mean(axis=1)[:, 0] > 3 * H,
+    )
     forms, shear = lattice.solid.forms.copy(), np.where(hard, 9.0, 1.0) * lattice.solid.shear
     forms[cut] *= RNG.uniform(0.5, 1.0, size=(cut.sum(), 1))
     of_cells = lattice.solid._replace(forms=forms, shear=shear)
     blocks = NeoHookean.of_lattice(Lattice(**(vars(lattice) | {"solid": of_cells}))).blocks
-    assert len(blocks.nodes) == 12 and len(blocks.constants) <= 2 + 2 + 2  # two whole, two in part, two of cut cells
+    assert (
+        len(blocks.nodes) == 12 and len(blocks.constants) <= 2 + 2 + 2
+    )  # two whole, two in part, two of cut cells
     kept = blocks.constants[blocks.which].reshape(12, 15, 8).transpose(0, 2, 1).reshape(96, 15)
-    order = [np.flatnonzero(lattice.local_cells[:, 0] == first)[0] for first in blocks.nodes[:, :, 0].ravel()]
+    order = [
+        np.flatnonzero(lattice.local_cells[:, 0] == first)[0]
+        for first in blocks.nodes[:, :, 0].ravel()
+    ]
     m = (shear * of_cells.volume / (4 * H) ** 2)[order]
     assert np.array_equal(kept[:, :6], forms[order, :6]) and np.allclose(kept[:, 13], m, rtol=1e-14)
     assert np.allclose(kept[:, 6:13], m[:, None] * forms[order, 6:], rtol=1e-14)
@@ -94,7 +107,9 @@ def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
     lattice = solid(2, 2, 1, poisson=0.49, cut=cut)
     assert lattice.solid is not None
     elastic = Elasticity(lattice)
-    softer = Elasticity(Lattice(**(vars(lattice) | {"solid": lattice.solid._replace(lame=lattice.solid.shear)})))
+    softer = Elasticity(
+        Lattice(**(vars(lattice) | {"solid": lattice.solid._replace(lame=lattice.solid.shear)}))
+    )
     q = lattice.nodes + 0.2 * H * RNG.standard_normal(lattice.nodes.shape)
     before, law = gradient(elastic, q), elastic.solid
     assert law is not None and law.stiffest == pytest.approx(49)
@@ -111,17 +126,23 @@ def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
         hessian(unit.reshape(q.shape), columns[-1])
     added = np.reshape(columns, (q.size, q.size)) - dense_hessian(softer, q)
     values = np.linalg.eigvalsh(added)
-    assert values[0] > -1e-9 * values[-1] and (values > 1e-9 * values[-1]).sum() <= len(lattice.local_cells)
+    assert values[0] > -1e-9 * values[-1] and (values > 1e-9 * values[-1]).sum() <= len(
+        lattice.local_cells
+    )
 
 
 @cases
-def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(poisson: float, cut: bool):
+def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(
+    poisson: float, cut: bool
+):
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
     elastic = Elasticity(lattice)
     q, v = (lattice.nodes + 0.3 * H * RNG.standard_normal(lattice.nodes.shape) for _ in range(2))
     assert elastic.change(q, v) == pytest.approx(elastic.energy(q) - elastic.energy(v), rel=1e-12)
     moved = q + 1e-12 * H * RNG.standard_normal(q.shape)
-    assert elastic.change(moved, q) == pytest.approx(np.vdot(gradient(elastic, q), moved - q), rel=1e-8)
+    assert elastic.change(moved, q) == pytest.approx(
+        np.vdot(gradient(elastic, q), moved - q), rel=1e-8
+    )
 
 
 @cases
@@ -135,38 +156,55 @@ def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: b
 
 
 @cases
-def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_concavity(poisson: float, cut: bool):
+def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_concavity(
+    poisson: float, cut: bool
+):
     lattice = solid(2, 2, 1, poisson=poisson, cut=cut)
     elastic, worst = Elasticity(lattice), 0.0
-    shapes = [np.diag([0.6, 1.2, 1.2]), np.diag([1.4, 1.4, 0.9]), np.diag([0.1, 0.1, -0.02]), np.diag([0.9, 0.9, -0.5])]
+    shapes = [
+        np.diag([0.6, 1.2, 1.2]),
+        np.diag([1.4, 1.4, 0.9]),
+        np.diag([0.1, 0.1, -0.02]),
+        np.diag([0.9, 0.9, -0.5]),
+    ]
     for f in (np.eye(3), *shapes, *RNG.normal(size=(8, 3, 3))):
         for noise in (0.0, 0.3):
             q = lattice.nodes @ f.T + noise * H * RNG.standard_normal(lattice.nodes.shape)
             size = np.abs(dense_hessian(elastic, q)).max()
-            assert np.linalg.eigvalsh(dense_hessian(elastic, q, projected=True)).min() > -1e-12 * size
+            assert (
+                np.linalg.eigvalsh(dense_hessian(elastic, q, projected=True)).min() > -1e-12 * size
+            )
             concavity = np.repeat(elastic.concavity(q), 3)
             lowest = np.linalg.eigvalsh(dense_hessian(elastic, q) + np.diag(concavity)).min()
             assert lowest > -1e-12 * size
             worst = max(worst, -np.linalg.eigvalsh(dense_hessian(elastic, q)).min())
-    assert worst > 0.1 * YOUNG * H * lattice.solid.volume.mean() / H**3  # there was something to bound
+    assert (
+        worst > 0.1 * YOUNG * H * lattice.solid.volume.mean() / H**3
+    )  # there was something to bound
     assert elastic.concavity(lattice.nodes).max() < 1e-9 * YOUNG * H
 
 
 def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
     """mu |grad|^2 and the second variation of one cell each; and what F sees of strain is what the integral sees."""
     count, n = 10_000, 60
-    share, squares = map(np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True))
+    share, squares = map(
+        np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True)
+    )
     forms, volume = forms_of(share, squares), share.mean(axis=1)
     slopes, _ = slopes_and_modes(forms)
     k = laplacians(forms, volume)
     lowest = np.linalg.eigvalsh(k)[:, 0] / np.trace(k, axis1=1, axis2=2)
     assert lowest.min() > -1e-14
-    jensen = np.linalg.eigvalsh(k - (volume / 16)[:, None, None] * slopes.transpose(0, 2, 1) @ slopes)[:, 0]
+    jensen = np.linalg.eigvalsh(
+        k - (volume / 16)[:, None, None] * slopes.transpose(0, 2, 1) @ slopes
+    )[:, 0]
     assert (jensen / np.trace(k, axis1=1, axis2=2)).min() > -1e-14
     for shear, lame in ((1.0, 0.0), (1.0, 49.0)):
         lattice = solid(1, 1, 1, poisson=0.25)
         for i in range(0, count, 250):
-            cells = SolidCells(forms[i : i + 1], volume[i : i + 1] * H**3, np.array([shear]), np.array([lame]))
+            cells = SolidCells(
+                forms[i : i + 1], volume[i : i + 1] * H**3, np.array([shear]), np.array([lame])
+            )
             one = Elasticity(Lattice(**(vars(lattice) | {"solid": cells})))
             h = dense_hessian(one, lattice.nodes)
             assert np.linalg.eigvalsh(h).min() > -1e-13 * np.abs(h).max()
@@ -174,7 +212,9 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
 
 def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
     """As K of a trilinear cell has them, times 2 mu + 3 lambda, which bounds the Hessian: both are 1."""
-    lattice = build_lattice(cages_of(block(1, 1, 1), H), Material(density=1000, young_modulus=2.5, law="neo-hookean"))
+    lattice = build_lattice(
+        cages_of(block(1, 1, 1), H), Material(density=1000, young_modulus=2.5, law="neo-hookean")
+    )
     kind = np.rint((lattice.rest_length / H) ** 2).astype(int)
     np.testing.assert_allclose(lattice.stiffness, np.array([0, 0, 5, 5])[kind] * H / 12, atol=1e-17)
 
@@ -195,8 +235,12 @@ def test_below_the_onset_the_volume_energy_goes_on_smoothly():
     lattice = solid(1, 1, 1, poisson=0.3)
     elastic = Elasticity(lattice)
     above, below = (lattice.nodes * [1, 1, ONSET + e] for e in (1e-9, -1e-9))
-    np.testing.assert_allclose(gradient(elastic, above), gradient(elastic, below), rtol=1e-6, atol=1e-6 * YOUNG * H**2)
-    np.testing.assert_allclose(dense_hessian(elastic, above), dense_hessian(elastic, below), atol=1e-6 * YOUNG * H)
+    np.testing.assert_allclose(
+        gradient(elastic, above), gradient(elastic, below), rtol=1e-6, atol=1e-6 * YOUNG * H**2
+    )
+    np.testing.assert_allclose(
+        dense_hessian(elastic, above), dense_hessian(elastic, below), atol=1e-6 * YOUNG * H
+    )
 
 
 def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
@@ -204,9 +248,14 @@ def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
     lattice = solid(1, 1, 1, poisson=0.45)
     points = 0.02 * RNG.random((100, 3)) - 0.5
     share, squares = moments(points, 10**8)
-    cells = lattice.solid._replace(forms=forms_of(share[None], squares[None]), volume=H**3 * share.mean(keepdims=True))
+    cells = lattice.solid._replace(
+        forms=forms_of(share[None], squares[None]), volume=H**3 * share.mean(keepdims=True)
+    )
     sliver = Lattice(**(vars(lattice) | {"solid": cells}))
-    folded, turn = lattice.nodes.copy(), 1.3 * np.array([[0.9, 0.2, 0], [0.1, 1, 0.3], [0, -0.4, 0.8]])
+    folded, turn = (
+        lattice.nodes.copy(),
+        1.3 * np.array([[0.9, 0.2, 0], [0.1, 1, 0.3], [0, -0.4, 0.8]]),
+    )
     folded[np.argmax(folded.sum(axis=1))] -= 1.2 * H
     assert least_volumes(folded, lattice.local_cells)[0] < 0
     assert worst_inverted(COMM, sliver, folded) == (0, "")

@@ -44,7 +44,9 @@ def test_one_spring_has_hookes_energy_and_force():
     q = np.array([[0.0, 0, 0], [0, 3, 4]])
     one = Springs(np.array([[0, 1]]), np.array([2.0]), np.array([10.0]))
     assert energy(q, one) == pytest.approx(0.5 * 10 * (5 - 2) ** 2)  # Eq. 13
-    np.testing.assert_allclose(gradient(q, one), [[0, -18, -24], [0, 18, 24]])  # k (l - r) along the spring
+    np.testing.assert_allclose(
+        gradient(q, one), [[0, -18, -24], [0, 18, 24]]
+    )  # k (l - r) along the spring
 
 
 def test_gradient_is_the_slope_of_the_energy():
@@ -58,11 +60,15 @@ def test_hessian_is_the_slope_of_the_gradient():
     v = RNG.normal(size=Q.shape)
     step = 1e-5
     slope = (gradient(Q + step * v) - gradient(Q - step * v)) / (2 * step)
-    np.testing.assert_allclose(hessian_times(Q, v), slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+    np.testing.assert_allclose(
+        hessian_times(Q, v), slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max()
+    )
 
 
 def dense_hessian(q: np.ndarray, projected: bool) -> np.ndarray:
-    return np.array([hessian_times(q, unit.reshape(N, 3), projected).ravel() for unit in np.eye(3 * N)])
+    return np.array(
+        [hessian_times(q, unit.reshape(N, 3), projected).ravel() for unit in np.eye(3 * N)]
+    )
 
 
 def test_projected_hessian_is_positive_where_the_true_one_is_not():

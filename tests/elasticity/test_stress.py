@@ -20,7 +20,12 @@ STATIC = {"time": {"integrator": "static"}, "output": {"surface": False, "stress
 
 
 def of_law(poisson: float, young: float = 1e5) -> dict:
-    return {"young_modulus": young, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": poisson}
+    return {
+        "young_modulus": young,
+        "density": 1000.0,
+        "law": "neo-hookean",
+        "poisson_ratio": poisson,
+    }
 
 
 def at_rest(path: Path, *overrides: str) -> tuple[Model, Frame]:
@@ -41,24 +46,34 @@ def test_uniform_strain_has_the_textbooks_stress_in_cells_and_at_nodes(poisson: 
     mu, lame = YOUNG / 2 / (1 + poisson), YOUNG * poisson / (1 + poisson) / (1 - 2 * poisson)
     elastic = Elasticity(lattice)
     field = StressField(lattice, elastic.solid)
-    for f in (np.eye(3), np.diag([1.3, 0.9, 0.9]), np.array([[1, 0.4, 0.1], [0, 1.1, 0], [0.2, 0, 0.8]])):
+    for f in (
+        np.eye(3),
+        np.diag([1.3, 0.9, 0.9]),
+        np.array([[1, 0.4, 0.1], [0, 1.1, 0], [0.2, 0, 0.8]]),
+    ):
         j, q = np.linalg.det(f), lattice.nodes @ f.T
         sigma = (mu * (f @ f.T - np.eye(3)) + lame * (j - 1) * j * np.eye(3)) / j
         found, (a, b, c) = field(q), np.linalg.eigvalsh(sigma)
         near = {"rtol": 1e-9, "atol": 1e-9 * YOUNG}
         for whose in ("", "cell_"):
-            np.testing.assert_allclose(found[f"{whose}stress"] - sigma.ravel()[[0, 4, 8, 1, 5, 2]], 0, **near)
+            np.testing.assert_allclose(
+                found[f"{whose}stress"] - sigma.ravel()[[0, 4, 8, 1, 5, 2]], 0, **near
+            )
             np.testing.assert_allclose(found[f"{whose}pressure"], -np.trace(sigma) / 3, **near)
             von_mises = np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2)
             np.testing.assert_allclose(found[f"{whose}von_mises"], von_mises, **near)
-        assert found["cell_strain_energy"] @ lattice.solid.volume == pytest.approx(elastic.energy(q), abs=1e-9)
+        assert found["cell_strain_energy"] @ lattice.solid.volume == pytest.approx(
+            elastic.energy(q), abs=1e-9
+        )
         assert set(found) == set(STRESS)
 
 
 def test_the_mean_at_a_node_is_by_volume():
     lattice = solid(3, 2, 2, poisson=0.25, cut=True)
     elastic = Elasticity(lattice)
-    found = StressField(lattice, elastic.solid)(lattice.nodes + 0.1 * H * RNG.standard_normal(lattice.nodes.shape))
+    found = StressField(lattice, elastic.solid)(
+        lattice.nodes + 0.1 * H * RNG.standard_normal(lattice.nodes.shape)
+    )
     volume, cells = lattice.solid.volume, lattice.local_cells
     for node in (0, 17, len(lattice.nodes) - 1):
         around = (cells == node).any(axis=1)
@@ -100,7 +115,10 @@ def test_a_beam_in_bending_has_the_moment_times_the_height_over_i(tmp_path):
     x, _, z = model.lattice.nodes[model.lattice.local_cells].mean(axis=1).T
     inside = np.abs(x - length / 2) < length / 6
     expected = pull * (length - x) * -(z - depth / 2) / (width * depth**3 / 12)
-    assert np.abs(frame.cell_stress[inside, 0] - expected[inside]).max() < 0.03 * np.abs(expected[inside]).max()
+    assert (
+        np.abs(frame.cell_stress[inside, 0] - expected[inside]).max()
+        < 0.03 * np.abs(expected[inside]).max()
+    )
 
 
 def plate_with_a_hole(half: float, radius: float, thick: float) -> trimesh.Trimesh:
@@ -108,11 +126,15 @@ def plate_with_a_hole(half: float, radius: float, thick: float) -> trimesh.Trime
     angles = np.linspace(0, 2 * np.pi, 96, endpoint=False)
     circle = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     square = half / np.abs(circle).max(axis=1, keepdims=True) * circle
-    points = np.concatenate([np.column_stack([ring, np.full(96, z)]) for z in (0, thick) for ring in (circle, square)])
+    points = np.concatenate(
+        [np.column_stack([ring, np.full(96, z)]) for z in (0, thick) for ring in (circle, square)]
+    )
     i = np.arange(96)
     k = (i + 1) % 96
     quads = [(0, 96), (96, 288), (288, 192), (192, 0)]  # below, outside, above, inside
-    faces = [np.stack(t, 1) for a, b in quads for t in ((a + i, a + k, b + k), (a + i, b + k, b + i))]
+    faces = [
+        np.stack(t, 1) for a, b in quads for t in ((a + i, a + k, b + k), (a + i, b + k, b + i))
+    ]
     mesh = trimesh.Trimesh(points, np.concatenate(faces))
     mesh.fix_normals()
     return mesh
@@ -136,7 +158,9 @@ def test_a_plate_with_a_hole_has_thrice_the_stress_at_its_edge(tmp_path):
     (tmp_path / "plate.toml").write_text(tomli_w.dumps(scene))
     model, frame = at_rest(tmp_path / "plate.toml")
     x, y, _ = model.lattice.nodes[model.lattice.local_cells].mean(axis=1).T
-    beside = (np.abs(x) < 0.51 * cell) & (np.abs(y) < 3 * radius) & (model.lattice.cell_share > 0.99)
+    beside = (
+        (np.abs(x) < 0.51 * cell) & (np.abs(y) < 3 * radius) & (model.lattice.cell_share > 0.99)
+    )
     a_r = radius / np.hypot(x, y)[beside]
     kirsch = 1.03 * sigma * (2 + a_r**2 + 3 * a_r**4) / 2
     assert np.abs(frame.cell_stress[beside, 0] / kirsch - 1).max() < 0.06

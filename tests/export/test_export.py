@@ -74,7 +74,9 @@ def test_gltf_moves_in_vtk_and_stands_in_trimesh(result: Path, tmp_path: Path):
     for index in (0, 1, 3, 2.5):  # between frames it goes straight
         reader.UpdateTimeStep(DT * index)
         (block,) = pyvista.wrap(reader.GetOutput()).recursive_iterator()
-        assert np.allclose(block.points, surface(index)[:, [0, 2, 1]] * [1, 1, -1], atol=1e-6), index
+        assert np.allclose(block.points, surface(index)[:, [0, 2, 1]] * [1, 1, -1], atol=1e-6), (
+            index
+        )
     assert heard == []
 
 
@@ -86,12 +88,16 @@ def test_gltf_keeps_to_its_rules(result: Path, tmp_path: Path):
     assert document["buffers"][0]["byteLength"] == len(data) - 28 - length
     for accessor in document["accessors"]:
         view = document["bufferViews"][accessor["bufferView"]]
-        values = np.frombuffer(data, "<f4", view["byteLength"] // 4, 28 + length + view["byteOffset"])
+        values = np.frombuffer(
+            data, "<f4", view["byteLength"] // 4, 28 + length + view["byteOffset"]
+        )
         if "min" in accessor:
             rows = values.reshape(accessor["count"], -1)
             assert np.array_equal(rows.min(axis=0), np.float32(accessor["min"]))
             assert np.array_equal(rows.max(axis=0), np.float32(accessor["max"]))
-    one = json.loads(export(result, tmp_path / "one.glb", frames=[2]).read_bytes()[20:].split(b"BIN\0")[0][:-4])
+    one = json.loads(
+        export(result, tmp_path / "one.glb", frames=[2]).read_bytes()[20:].split(b"BIN\0")[0][:-4]
+    )
     assert "animations" not in one and "targets" not in one["meshes"][0]["primitives"][0]
 
 
@@ -99,7 +105,9 @@ def test_normals_are_those_of_a_ball():
     ball = trimesh.creation.icosphere(subdivisions=2)
     assert np.allclose(normals(ball.vertices, ball.faces), ball.vertices, atol=0.03)
     alone = normals(np.zeros((4, 3)), np.array([[0, 1, 2]]))
-    assert np.allclose(np.linalg.norm(alone, axis=1), 1)  # of a collapsed body any direction, of length 1
+    assert np.allclose(
+        np.linalg.norm(alone, axis=1), 1
+    )  # of a collapsed body any direction, of length 1
 
 
 @pytest.mark.parametrize("ending", [".obj", ".ply", ".stl"])
@@ -168,7 +176,11 @@ def test_slices_choose_frames_as_for_render(result: Path, tmp_path: Path):
     for name, frames in (("slice.glb", "0:5:2"), ("list.glb", "0,2,-1")):
         assert main(["export", str(result), "-o", str(tmp_path / name), "--frames", frames]) == 0
     whole = export(result, tmp_path / "whole.glb", frames=[0, 2, 4])
-    assert (tmp_path / "slice.glb").read_bytes() == whole.read_bytes() == (tmp_path / "list.glb").read_bytes()
+    assert (
+        (tmp_path / "slice.glb").read_bytes()
+        == whole.read_bytes()
+        == (tmp_path / "list.glb").read_bytes()
+    )
 
 
 def test_the_xdmf_file_is_read_by_vtk_without_a_complaint(result: Path):
@@ -179,17 +191,25 @@ def test_the_xdmf_file_is_read_by_vtk_without_a_complaint(result: Path):
         reader.UpdateTimeStep(DT * index)
         blocks = reader.GetOutputDataObject(0)
         named = {
-            blocks.GetMetaData(k).Get(blocks.NAME()): blocks.GetBlock(k) for k in range(blocks.GetNumberOfBlocks())
+            blocks.GetMetaData(k).Get(blocks.NAME()): blocks.GetBlock(k)
+            for k in range(blocks.GetNumberOfBlocks())
         }
         for name, expected in {"surface": surface(index), "lattice": position(index)}.items():
             assert np.allclose(vtk_to_numpy(named[name].GetPoints().GetData()), expected, atol=1e-6)
         body, skin = pyvista.wrap(named["lattice"]), pyvista.wrap(named["surface"])
         assert np.allclose(body["displacement"], position(index) - NODES)
         assert np.allclose(skin["displacement"], surface(index) - POINTS, atol=1e-6)
-        for grid, velocity in ((body, 0.1 / DT * NODES[:, [2]] * X), (skin, np.tile(0.01 / DT * X, (len(POINTS), 1)))):
+        for grid, velocity in (
+            (body, 0.1 / DT * NODES[:, [2]] * X),
+            (skin, np.tile(0.01 / DT * X, (len(POINTS), 1))),
+        ):
             assert np.allclose(grid["velocity"], velocity, atol=1e-4)
             assert np.allclose(grid["speed"], np.linalg.norm(velocity, axis=1), atol=1e-4)
-        assert body.n_cells == 2 and body["cell_kind"].tolist() == [1, 1] and body.volume == pytest.approx(2 * H**3)
+        assert (
+            body.n_cells == 2
+            and body["cell_kind"].tolist() == [1, 1]
+            and body.volume == pytest.approx(2 * H**3)
+        )
     assert heard == []
 
 
@@ -204,13 +224,19 @@ def test_xdmf_is_exact_far_from_the_origin(tmp_path: Path):
 def stressed(index: int) -> dict[str, np.ndarray]:
     """Stress of the bar's nodes and cells at a frame."""
     rows = {"": len(NODES), "cell_": 2}
-    numbers = {f"{whose}{name}": index + np.arange(rows[whose]) for whose in rows for name in SCALARS}
-    return numbers | {f"{whose}stress": index + np.arange(6.0 * rows[whose]).reshape(-1, 6) for whose in rows}
+    numbers = {
+        f"{whose}{name}": index + np.arange(rows[whose]) for whose in rows for name in SCALARS
+    }
+    return numbers | {
+        f"{whose}stress": index + np.arange(6.0 * rows[whose]).reshape(-1, 6) for whose in rows
+    }
 
 
 def test_stress_comes_with_xdmf(tmp_path: Path):
     """XDMF has a tensor as two vectors."""
-    result = small_result.write(tmp_path / "x.h5", [small_result.frame(k, **stressed(k)) for k in range(3)])
+    result = small_result.write(
+        tmp_path / "x.h5", [small_result.frame(k, **stressed(k)) for k in range(3)]
+    )
     reader = vtk.vtkXdmfReader()
     reader.SetFileName(str(write_xdmf(result)))
     heard = complaints(reader)
@@ -220,5 +246,7 @@ def test_stress_comes_with_xdmf(tmp_path: Path):
         for whose, data in (("", body.point_data), ("cell_", body.cell_data)):
             assert np.array_equal(data[f"{whose}stress_normal"], expected[f"{whose}stress"][:, :3])
             assert np.array_equal(data[f"{whose}stress_shear"], expected[f"{whose}stress"][:, 3:])
-            assert all(np.array_equal(data[whose + name], expected[whose + name]) for name in SCALARS)
+            assert all(
+                np.array_equal(data[whose + name], expected[whose + name]) for name in SCALARS
+            )
     assert heard == []

@@ -41,7 +41,9 @@ from msmpetsc.lattice.lattice import topology_of
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
-with_meshes = pytest.mark.skipif("MSMPETSC_MESH_DIR" not in os.environ, reason="needs $MSMPETSC_MESH_DIR")
+with_meshes = pytest.mark.skipif(
+    "MSMPETSC_MESH_DIR" not in os.environ, reason="needs $MSMPETSC_MESH_DIR"
+)
 SIDE = 6  # cells of the small grid of the boundary tests
 
 
@@ -79,17 +81,27 @@ often_on_planes = st.integers(0, SIDE * 4 - 1).map(lambda x: 16 * x)
 
 
 @settings(max_examples=300, deadline=None)  # the first example compiles
-@given(st.one_of(*(arrays(np.int64, (3, 3), elements=place) for place in (off_planes, often_on_planes))))
+@given(
+    st.one_of(
+        *(arrays(np.int64, (3, 3), elements=place) for place in (off_planes, often_on_planes))
+    )
+)
 def test_touched_cells_are_those_of_a_separating_axis_test(triangle):
     assert boxes_touched(triangle, 1) <= cells_of(triangle / UNIT) <= boxes_touched(triangle, 0)
 
 
 def test_cells_outside_the_limits_are_left_out():
     rng = np.random.default_rng(3)
-    triangles = rng.uniform(0, SIDE, (40, 1, 3)) + rng.uniform(-1, 1, (40, 3, 3)) * rng.choice([0.01, 2], (40, 1, 1))
+    triangles = rng.uniform(0, SIDE, (40, 1, 3)) + rng.uniform(-1, 1, (40, 3, 3)) * rng.choice(
+        [0.01, 2], (40, 1, 1)
+    )
     everywhere = cells_of(triangles, (-9,) * 3, (20,) * 3)
     low, high = (1, 2, 3), (4, 5, 5)
-    within = {cell for cell in everywhere if all(a <= c < b for a, c, b in zip(low, cell, high, strict=True))}
+    within = {
+        cell
+        for cell in everywhere
+        if all(a <= c < b for a, c, b in zip(low, cell, high, strict=True))
+    }
     assert cells_of(triangles, low, high) == within != everywhere
     assert cells_of(triangles, low, low) == set()
 
@@ -104,7 +116,10 @@ def dense(cages: Cages, kind: int) -> np.ndarray:
 
 
 def hollow_ball(turned: bool) -> trimesh.Trimesh:
-    shell, cavity = trimesh.creation.icosphere(3, radius=1.0), trimesh.creation.icosphere(3, radius=0.6)
+    shell, cavity = (
+        trimesh.creation.icosphere(3, radius=1.0),
+        trimesh.creation.icosphere(3, radius=0.6),
+    )
     if turned:
         cavity.invert()
     return trimesh.util.concatenate([shell, cavity])
@@ -134,7 +149,9 @@ def test_interior_is_what_a_dense_flood_fill_finds(name):
 
 @pytest.mark.parametrize("turned", [True, False])
 @pytest.mark.parametrize("boundary", ["whole", "fill"])
-def test_a_cavity_is_filled_but_where_cells_count_by_what_is_inside_and_it_is_wound_as_one(turned, boundary):
+def test_a_cavity_is_filled_but_where_cells_count_by_what_is_inside_and_it_is_wound_as_one(
+    turned, boundary
+):
     # the flood comes from outside and cannot reach it: the paper's interior is what is enclosed
     cages = fill([body_of(hollow_ball(turned))], 0.1, boundary=boundary)
     middle = np.floor((0 - cages.grids.grids[0].origin) / 0.1).astype(int)
@@ -151,7 +168,9 @@ def test_time_and_memory_follow_the_cells_not_the_bounding_box():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert cages.grids.grids[0].shape.min() >= 20_000 and (cages.kind == INTERIOR).sum() > 10_000
-    assert peak < 800 * len(cages.kind)  # bytes: most while triangles are cut, whose pieces have 17 sums each
+    assert peak < 800 * len(
+        cages.kind
+    )  # bytes: most while triangles are cut, whose pieces have 17 sums each
 
 
 # --- cages ---
@@ -167,7 +186,10 @@ def aligned_box(lid: bool = True) -> BodySurface:
 
 def test_an_aligned_box_is_filled_with_its_own_cells():
     cages = fill([aligned_box()], 0.1)
-    assert cages.grids.grids[0].shape.tolist() == [10, 5, 3] and len(cages.kind) == cages.table.total == 150
+    assert (
+        cages.grids.grids[0].shape.tolist() == [10, 5, 3]
+        and len(cages.kind) == cages.table.total == 150
+    )
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 1
     assert np.array_equal(dense(cages, BOUNDARY), ~np.pad(np.ones((8, 3, 1), bool), 1))
 
@@ -182,7 +204,9 @@ def l_shape() -> Surface:
     corners = np.array([[0, 0], [0.3, 0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.3], [0, 0.3]])
     cuts = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     low, high = (np.column_stack([corners, np.full(6, height)]) for height in (0, 0.1))
-    sides = [[a, (a + 1) % 6, 6 + a] for a in range(6)] + [[(a + 1) % 6, 6 + (a + 1) % 6, 6 + a] for a in range(6)]
+    sides = [[a, (a + 1) % 6, 6 + a] for a in range(6)] + [
+        [(a + 1) % 6, 6 + (a + 1) % 6, 6 + a] for a in range(6)
+    ]
     return Surface(np.vstack([low, high]), np.vstack([cuts[:, ::-1], cuts + 6, sides]))
 
 
@@ -190,7 +214,11 @@ def l_shape() -> Surface:
 @pytest.mark.parametrize("shape", ["box", "l"])
 def test_a_size_that_divides_a_body_divides_its_copies_in_single_precision(shape, shift):
     """Scaled, turned and moved, as in double precision."""
-    mesh = surface_of(trimesh.creation.box(bounds=[[0, 0, 0], [0.3, 0.2, 0.1]])) if shape == "box" else l_shape()
+    mesh = (
+        surface_of(trimesh.creation.box(bounds=[[0, 0, 0], [0.3, 0.2, 0.1]]))
+        if shape == "box"
+        else l_shape()
+    )
     moved = single(Surface(mesh.points + shift, mesh.triangles))
     quarter = [{"rotate": {"axis": [0, 1, 0], "degrees": 90}}]
     eighths = [{"rotate": {"axis": [0, 0, 1], "degrees": degrees}} for degrees in (30, -30)]
@@ -206,7 +234,9 @@ def test_a_size_that_divides_a_body_divides_its_copies_in_single_precision(shape
         surface = prepare(moved, steps, size, base)
         cages = fill([body_of(surface)], (size or 0.3) / 3)
         assert np.array_equal(cages.ijk, expected.ijk)
-        assert embed([surface.points], cages, topology_of(cages).table, "affine").shape[0] == len(surface.points)
+        assert embed([surface.points], cages, topology_of(cages).table, "affine").shape[0] == len(
+            surface.points
+        )
 
 
 def test_a_body_that_ends_beyond_a_plane_has_cells_there():
@@ -218,7 +248,9 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     assert not body.report.closed
     cages = fill([body], 0.1)
     assert len(cages.kind) == 150
-    assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
+    assert (
+        cages.kind == INTERIOR
+    ).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
 
 
 @pytest.fixture(scope="module")
@@ -230,19 +262,25 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Ca
         if name == "open":
             mesh.update_faces(np.arange(len(mesh.faces)) > 20)
         body = body_of(mesh)
-        np.savez(folder / f"{name}.npz", points=body.surface.points, triangles=body.surface.triangles)
+        np.savez(
+            folder / f"{name}.npz", points=body.surface.points, triangles=body.surface.triangles
+        )
         cages[name] = fill([body], cell_size)
     return folder, cages
 
 
 @pytest.mark.parametrize("ranks", [3, pytest.param(5, marks=pytest.mark.slow)])
-def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_enclose(filled, ranks):
+def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_enclose(
+    filled, ranks
+):
     folder, serial = filled
     done = run(ranks, "-m", "mpi4py", WORKER, folder, status=0)
     assert done.stdout.count("passed") == ranks
     for name, cages in serial.items():
         with np.load(folder / f"{name}.cells.npz") as cells:
-            assert np.array_equal(cells["ijk"], cages.ijk) and np.array_equal(cells["kind"], cages.kind), name
+            assert np.array_equal(cells["ijk"], cages.ijk) and np.array_equal(
+                cells["kind"], cages.kind
+            ), name
             assert np.array_equal(cells["share"], cages.share), name
     assert len(serial["one cell"].kind) == 1
 
@@ -288,9 +326,13 @@ def test_bodies_thinner_than_a_cell_are_told_by_their_numbers(caplog):
     warn_of_thin_bodies([cube, plate], 0.1)
     (line,) = caplog.messages
     assert line.startswith("body.1 is 0.0192 m thick on average (2 V / A), 0.19 of a cell")
-    cells, size = (float(re.search(f"{name} = ([^ ]*)", line)[1]) for name in ("count", "cell_size"))
+    cells, size = (
+        float(re.search(f"{name} = ([^ ]*)", line)[1]) for name in ("count", "cell_size")
+    )
     warn_of_thin_bodies([cube, plate], size)
-    assert len(caplog.messages) == 1 and estimated_cells([cube, plate], size) == pytest.approx(cells, rel=0.05)
+    assert len(caplog.messages) == 1 and estimated_cells([cube, plate], size) == pytest.approx(
+        cells, rel=0.05
+    )
     warn_of_thin_bodies([cube], 0.3)
     warn_of_thin_bodies([aligned_box(lid=False)], 0.5)
     assert len(caplog.messages) == 1

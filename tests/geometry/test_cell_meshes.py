@@ -20,7 +20,11 @@ PARTS = {  # of a cube, by its corners in VTK's order; 8 is its middle
     "tetra": [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
     "pyramid": [[*map(int, face), 8] for face in KINDS["hexahedron"].faces],
 }
-INVERTED = {"hexahedron": [4, 5, 6, 7, 0, 1, 2, 3], "wedge": [3, 4, 5, 0, 1, 2], "tetra": [1, 0, 2, 3]}
+INVERTED = {
+    "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3],
+    "wedge": [3, 4, 5, 0, 1, 2],
+    "tetra": [1, 0, 2, 3],
+}
 INVERTED["pyramid"] = [3, 2, 1, 0, 4]
 
 
@@ -39,10 +43,14 @@ def cells_of(kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 def quadratic(kind: str, points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mesh with a node in the middle of every edge."""
-    pairs = np.sort(cells[:, np.array([[*map(int, edge)] for edge in KINDS[kind].edges])].reshape(-1, 2), axis=1)
+    pairs = np.sort(
+        cells[:, np.array([[*map(int, edge)] for edge in KINDS[kind].edges])].reshape(-1, 2), axis=1
+    )
     edges, number = np.unique(pairs, axis=0, return_inverse=True)
     middles = points[edges].mean(axis=1)
-    return np.vstack([points, middles]), np.hstack([cells, len(points) + number.reshape(len(cells), -1)])
+    return np.vstack([points, middles]), np.hstack(
+        [cells, len(points) + number.reshape(len(cells), -1)]
+    )
 
 
 def write(path: Path, mesh: meshio.Mesh) -> None:
@@ -59,7 +67,9 @@ CASES = [
 
 
 @pytest.mark.parametrize(("end", "kind", "order"), CASES)
-def test_the_boundary_of_cells_encloses_their_volume(end: str, kind: str, order: int, tmp_path: Path):
+def test_the_boundary_of_cells_encloses_their_volume(
+    end: str, kind: str, order: int, tmp_path: Path
+):
     points, cells = cells_of(kind)
     if order == 2:
         points, cells = quadratic(kind, points, cells)
@@ -100,13 +110,20 @@ def test_sets_of_cells_and_points_are_groups(tmp_path: Path):
         report = examine(groups[name])
         assert report.closed and report.volume == pytest.approx(0.5)
     assert np.array_equal(groups["tip"].points[groups["tip"].triangles[0]], points[[2, 1, 3]])
-    meshio.Mesh(points, blocks, cell_data={"region": physical, "other": [0 * each for each in physical]}).write(
-        tmp_path / "x.vtu"
-    )
-    assert read_surface(tmp_path / "x.vtu").groups.keys() == {"region:1", "region:2", "region:7", "other:0"}
+    meshio.Mesh(
+        points, blocks, cell_data={"region": physical, "other": [0 * each for each in physical]}
+    ).write(tmp_path / "x.vtu")
+    assert read_surface(tmp_path / "x.vtu").groups.keys() == {
+        "region:1",
+        "region:2",
+        "region:7",
+        "other:0",
+    }
     rows = [np.flatnonzero(left), np.array([], int)]
     top = np.flatnonzero(points[:, 2] == 1)
-    meshio.Mesh(points, blocks, cell_sets={"left": rows}, point_sets={"top": top}).write(tmp_path / "x.inp")
+    meshio.Mesh(points, blocks, cell_sets={"left": rows}, point_sets={"top": top}).write(
+        tmp_path / "x.inp"
+    )
     groups = read_surface(tmp_path / "x.inp").groups
     assert groups.keys() == {"left", "top"} and examine(groups["top"]).area == pytest.approx(1)
 

@@ -12,7 +12,10 @@ from msmpetsc.geometry.embedding import stencil_weights
 KINDS = ("mvc", "cages", "affine")
 BAR, RADIUS = np.array([4, 1, 1]), 3.0  # sides of a bar, and what its middle is bent to [m]
 SIZES = np.array([1 / 2, 1 / 4, 1 / 8, 1 / 16])  # cell size [m]
-MOVED, STEP = 0.1, 1e-4  # standard deviation of random node displacements, step of one-sided differences [cells]
+MOVED, STEP = (
+    0.1,
+    1e-4,
+)  # standard deviation of random node displacements, step of one-sided differences [cells]
 BLOCK = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(27, 3)
 NODES = np.stack(np.meshgrid(*[range(-1, 3)] * 3, indexing="ij"), -1).reshape(64, 3)
 ALL_KINDS = pytest.mark.parametrize("kind", KINDS)
@@ -22,7 +25,9 @@ near_face = st.sampled_from([0.0, 1e-300, 1e-16, 3e-14, 1e-13, 1e-12, 1e-9, 1e-5
 coordinate = st.one_of(near_face, near_face.map(lambda x: 1 - x), st.just(0.5), st.floats(0, 1))
 local_points = st.tuples(coordinate, coordinate, coordinate)
 # every cell of the block touches the middle one: any set of them is connected
-neighbour_masks = st.lists(st.booleans(), min_size=27, max_size=27).map(lambda m: [*m[:13], True, *m[14:]])
+neighbour_masks = st.lists(st.booleans(), min_size=27, max_size=27).map(
+    lambda m: [*m[:13], True, *m[14:]]
+)
 
 
 def weights(kind, u, mask, smoothing=1.0):
@@ -86,19 +91,27 @@ def plain_cages(p, mask, h):
     blends = [step(1 - abs(p - v)).prod() if len(around[tuple(v)]) > 1 else 0 for v in corners]
     if not any(blends):
         return own
-    joined = sum(W * plain_mvc(p, around[tuple(v)]) for v, W in zip(corners, blends, strict=True) if W)
+    joined = sum(
+        W * plain_mvc(p, around[tuple(v)]) for v, W in zip(corners, blends, strict=True) if W
+    )
     return b * own + (1 - b) * joined / sum(blends)
 
 
 def test_mvc_and_cages_agree_with_their_equations_evaluated_plainly():
     rng = np.random.default_rng(0)
-    points = [*rng.uniform(0.05, 0.95, (2, 3)), np.array([0.005, 0.4, 0.7]), np.array([0.3, 0.995, 0.002])]
+    points = [
+        *rng.uniform(0.05, 0.95, (2, 3)),
+        np.array([0.005, 0.4, 0.7]),
+        np.array([0.3, 0.995, 0.002]),
+    ]
     masks = random_masks(rng, len(points))
     masks[0] = np.isin(np.arange(27), [13, 14])  # 4 of the corners are not in B_c
     for u, mask in zip(points, masks, strict=True):
         np.testing.assert_allclose(weights("mvc", u, mask), plain_mvc(u, {(0, 0, 0)}), atol=1e-10)
         for h in (1.0, 0.4):
-            np.testing.assert_allclose(weights("cages", u, mask, h), plain_cages(u, mask, h), atol=1e-10)
+            np.testing.assert_allclose(
+                weights("cages", u, mask, h), plain_cages(u, mask, h), atol=1e-10
+            )
 
 
 def test_affine_agrees_with_least_squares_at_each_corner():
@@ -111,7 +124,9 @@ def test_affine_agrees_with_least_squares_at_each_corner():
             values = x[(nodes + 1) @ (16, 4, 1)] - x[(v + 1) @ (16, 4, 1)]
             gradient = np.linalg.lstsq(nodes - v, values, rcond=None)[0]
             z = 1 - abs(u - v)
-            expected += (z * z * (3 - 2 * z)).prod() * (x[(v + 1) @ (16, 4, 1)] + gradient @ (u - v))
+            expected += (z * z * (3 - 2 * z)).prod() * (
+                x[(v + 1) @ (16, 4, 1)] + gradient @ (u - v)
+            )
         assert weights("affine", u, mask) @ x == pytest.approx(expected, abs=1e-12)
 
 
@@ -121,7 +136,9 @@ def test_affine_agrees_with_least_squares_at_each_corner():
 @ALL_KINDS
 @settings(max_examples=200, deadline=None)
 @given(u=local_points, mask=neighbour_masks, smoothing=st.sampled_from([1.0, 0.3, 1e-3]))
-def test_rows_sum_to_one_reproduce_linear_fields_and_use_only_nodes_there_are(kind, u, mask, smoothing):
+def test_rows_sum_to_one_reproduce_linear_fields_and_use_only_nodes_there_are(
+    kind, u, mask, smoothing
+):
     found = weights(kind, u, mask, smoothing)
     assert abs(found.sum() - 1) < 1e-12
     np.testing.assert_allclose(found @ NODES, u, atol=1e-12, rtol=0)
@@ -191,7 +208,12 @@ def rms_error(kind, size, points=4000):
 
 def shared(rng, valid, offsets, points):
     """Cells (p,3), their valid neighbours (p,3) at one of the offsets, and u (p,3) in the first, shared by both."""
-    pairs = [(cell, cell + offset) for offset in offsets for cell in np.argwhere(valid) if valid[tuple(cell + offset)]]
+    pairs = [
+        (cell, cell + offset)
+        for offset in offsets
+        for cell in np.argwhere(valid)
+        if valid[tuple(cell + offset)]
+    ]
     first, second = np.array(pairs)[rng.integers(len(pairs), size=points)].swapaxes(0, 1)
     offset = second - first
     u = np.where(offset == 0, rng.uniform(0.05, 0.95, offset.shape), offset > 0)

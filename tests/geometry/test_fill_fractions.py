@@ -16,12 +16,16 @@ BODIES = {
     "tilted box": trimesh.creation.box((1.0, 0.7, 0.4)).apply_transform(TURN),
     "torus": trimesh.creation.torus(1.0, 0.3).apply_transform(TURN),
     "pipe": trimesh.creation.annulus(0.4, 0.5, 1.5).apply_transform(TURN),
-    "hollow": trimesh.util.concatenate([trimesh.creation.icosphere(2), trimesh.creation.icosphere(2, 0.5)]),
+    "hollow": trimesh.util.concatenate(
+        [trimesh.creation.icosphere(2), trimesh.creation.icosphere(2, 0.5)]
+    ),
 }
 BODIES["hollow"].faces[320:] = BODIES["hollow"].faces[320:, ::-1]
 
 
-def columns_of(mesh: trimesh.Trimesh, h: float, offset: float = 0.0) -> tuple[Columns, np.ndarray, np.ndarray]:
+def columns_of(
+    mesh: trimesh.Trimesh, h: float, offset: float = 0.0
+) -> tuple[Columns, np.ndarray, np.ndarray]:
     """Of a mesh in cells of h from ``offset`` cells before it; all cells of its box, and where they begin."""
     origin = mesh.bounds[0] - offset * h
     corners = (mesh.vertices - origin)[mesh.faces] / h
@@ -49,7 +53,9 @@ def test_a_plane_through_a_cell_gives_its_corners_what_lies_near_them():
     box = trimesh.creation.box(bounds=[[0, 0, 0], [3, 2, 1.3]])
     columns, _, _ = columns_of(box, 1.0)
     share, _ = columns.inside(np.array([[1, 1, 1], [1, 1, 0]]))
-    np.testing.assert_allclose(share[0], np.broadcast_to([2 * 0.3 - 0.3**2, 0.3**2], (2, 2, 2)), atol=1e-14)
+    np.testing.assert_allclose(
+        share[0], np.broadcast_to([2 * 0.3 - 0.3**2, 0.3**2], (2, 2, 2)), atol=1e-14
+    )
     np.testing.assert_allclose(share[1], 1, atol=1e-14)
 
 
@@ -61,13 +67,20 @@ def test_corners_of_an_oblique_cell_are_those_of_many_samples():
     assert len(cut) == 5
     points = np.random.default_rng(0).random((40_000, 3))
     functions = np.prod(
-        np.where(np.indices((2, 2, 2)).reshape(3, 8, 1) == 1, points.T[:, None], 1 - points.T[:, None]), 0
+        np.where(
+            np.indices((2, 2, 2)).reshape(3, 8, 1) == 1, points.T[:, None], 1 - points.T[:, None]
+        ),
+        0,
     )
     to_box = np.linalg.inv(TURN[:3, :3])
     for cell in cut:
-        inside = (np.abs((origin + h * (cells[cell] + points)) @ to_box.T) <= [0.5, 0.35, 0.2]).all(axis=1)
+        inside = (np.abs((origin + h * (cells[cell] + points)) @ to_box.T) <= [0.5, 0.35, 0.2]).all(
+            axis=1
+        )
         found = 8 * functions[:, inside].sum(axis=1) / len(points)
-        np.testing.assert_allclose(share[cell].ravel(), found, atol=0.02)  # 4 standard deviations of a sample
+        np.testing.assert_allclose(
+            share[cell].ravel(), found, atol=0.02
+        )  # 4 standard deviations of a sample
 
 
 # ---- cages
@@ -83,7 +96,9 @@ def test_the_longest_side_may_be_any_and_faces_may_be_wound_inwards(axis: int):
     mesh = trimesh.creation.box(bounds=[[0, 0, 0], np.roll([1.0, 0.53, 0.38], axis)])
     expected = fill([body_of(mesh)], 0.1)
     top = expected.ijk[:, (axis + 2) % 3] == 3
-    assert volume(expected) == pytest.approx(mesh.volume, rel=1e-3)  # the least share of corners that are out of it
+    assert volume(expected) == pytest.approx(
+        mesh.volume, rel=1e-3
+    )  # the least share of corners that are out of it
     along = np.moveaxis(expected.share[top], 1 + (axis + 2) % 3, -1)[:, :, :, 1]
     assert along.max() < 0.8**2 + 1e-12
     mesh.invert()
@@ -104,15 +119,22 @@ def test_an_open_surface_is_sampled_to_about_a_hundredth():
     sampled = fill([body_of(ball)], 0.2)
     assert np.array_equal(sampled.ijk, closed.ijk)
     error = (sampled.share - closed.share).mean(axis=(1, 2, 3))
-    assert np.sqrt((error**2).mean()) < 0.02 and volume(sampled) == pytest.approx(volume(closed), rel=0.01)
+    assert np.sqrt((error**2).mean()) < 0.02 and volume(sampled) == pytest.approx(
+        volume(closed), rel=0.01
+    )
 
 
-def test_triangles_wound_against_each_other_are_told_and_cells_count_whole(caplog: pytest.LogCaptureFixture):
+def test_triangles_wound_against_each_other_are_told_and_cells_count_whole(
+    caplog: pytest.LogCaptureFixture,
+):
     ball = trimesh.creation.icosphere(3)
     ball.faces[:7] = ball.faces[:7, ::-1]
     with caplog.at_level(logging.WARNING, "msmpetsc"):
         assert fill([body_of(ball)], 0.2).share is None
-    assert 'wound against each other, so boundary cells count whole: prepare = ["orient"]' in caplog.text
+    assert (
+        'wound against each other, so boundary cells count whole: prepare = ["orient"]'
+        in caplog.text
+    )
 
 
 def test_an_open_surface_far_from_the_origin_weighs_as_near_it():
@@ -134,14 +156,19 @@ PARTS = {
     "apart": ([BALL, moved(BALL, 3)], ""),
     "with a cavity": ([BALL, moved(CORE, 0.1, inwards=True)], ""),
     "all inwards": ([moved(BALL, 0, inwards=True), moved(BALL, 3, inwards=True)], ""),
-    "of two windings": ([BALL, moved(BALL, 3), moved(BALL, 6, inwards=True)], "some parts are wound inwards"),
+    "of two windings": (
+        [BALL, moved(BALL, 3), moved(BALL, 6, inwards=True)],
+        "some parts are wound inwards",
+    ),
     "in each other": ([BALL, moved(CORE, 0.1)], "parts overlap or lie in each other"),
     "over each other": ([BALL, moved(BALL, 1)], "parts overlap or lie in each other"),
 }
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_parts_that_weigh_otherwise_than_the_mesh_are_told(name: str, caplog: pytest.LogCaptureFixture):
+def test_parts_that_weigh_otherwise_than_the_mesh_are_told(
+    name: str, caplog: pytest.LogCaptureFixture
+):
     parts, words = PARTS[name]
     with caplog.at_level(logging.WARNING, "msmpetsc"):
         fill([body_of(trimesh.util.concatenate(parts))], 0.1)

@@ -61,7 +61,9 @@ def mz3() -> bytes:
 IN_GLTF = BOX.vertices.astype("<f4").tobytes() + BOX.faces.astype("<u4").tobytes()
 
 
-def gltf(uri: str = "data:application/octet-stream;base64," + base64.b64encode(IN_GLTF).decode()) -> bytes:
+def gltf(
+    uri: str = "data:application/octet-stream;base64," + base64.b64encode(IN_GLTF).decode(),
+) -> bytes:
     """With its buffers as text in it, or in another file."""
     tree = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}],
@@ -121,7 +123,9 @@ def read(folder: Path, kind: str, content: bytes, *changes: str) -> str:
 
 @settings(TRIALS, max_examples=400)
 @given(
-    seed=st.sampled_from(SEEDS), changes=damage, step=st.sampled_from(["[]", "['merge']", "['orient']", "['union']"])
+    seed=st.sampled_from(SEEDS),
+    changes=damage,
+    step=st.sampled_from(["[]", "['merge']", "['orient']", "['union']"]),
 )
 def test_a_damaged_mesh_is_a_body_or_one_line(tmp_path, seed, changes, step):
     kind, content = seed
@@ -133,8 +137,12 @@ def test_a_whole_mesh_is_read_and_a_truncated_one_refused(tmp_path, kind, conten
     path = tmp_path / f"x.{kind}"
     path.write_bytes(content)
     report = examine(read_surface(path))
-    assert report.closed and report.volume == pytest.approx({QUADS: 1.0, gltf(): 12.0}.get(content, 6.0))
-    if not content.startswith((b"v ", b"#", b"mtllib")):  # the lines of an OBJ that are left may be a mesh
+    assert report.closed and report.volume == pytest.approx(
+        {QUADS: 1.0, gltf(): 12.0}.get(content, 6.0)
+    )
+    if not content.startswith(
+        (b"v ", b"#", b"mtllib")
+    ):  # the lines of an OBJ that are left may be a mesh
         assert read(tmp_path, kind, content[: len(content) * 3 // 4])
     assert capfd.readouterr() == ("", "")
 
@@ -170,7 +178,9 @@ def test_polygons_are_cut_into_triangles(tmp_path):
     packed = b"".join(struct.pack(f"<B{len(f)}i", len(f), *f) for f in faces)
     contents = {
         "ascii.ply": ply(6, 5, "\n".join(text_points + rows)),
-        "binary.ply": ply(6, 5, kind="binary_little_endian") + struct.pack("<18f", *sum(points, ())) + packed,
+        "binary.ply": ply(6, 5, kind="binary_little_endian")
+        + struct.pack("<18f", *sum(points, ()))
+        + packed,
         "prism.obj": "\n".join(obj).encode(),
         "prism.off": "\n".join(["OFF", "6 5 0", *text_points, *rows]).encode(),
     }
@@ -188,15 +198,19 @@ def box_in_obj(line: str = "{}\n", face: str = "f {} {} {}", first: int = 1) -> 
 
 
 WRITTEN = {
-    "relative texture numbers": "vt 0 0\n" * 8 + box_in_obj(face="f {0}/{0} {1}/{1} {2}/{2}", first=-8),
-    "relative normal numbers": "vn 0 0 1\n" * 8 + box_in_obj(face="f {0}//{0} {1}//{1} {2}//{2}", first=-8),
+    "relative texture numbers": "vt 0 0\n" * 8
+    + box_in_obj(face="f {0}/{0} {1}/{1} {2}/{2}", first=-8),
+    "relative normal numbers": "vn 0 0 1\n" * 8
+    + box_in_obj(face="f {0}//{0} {1}//{1} {2}//{2}", first=-8),
     "comments at line ends": box_in_obj("{} # f 1 2 3\n"),
     "tabs": box_in_obj("{}\n").replace(" ", "\t"),
     "spaces before and behind": box_in_obj(" {} \n"),
     "lines of a Mac": box_in_obj("{}\r"),
     "lines of Windows": "\ufeff" + box_in_obj("{}\r\n"),
     "lines that go on": box_in_obj().replace(" ", " \\\n"),
-    "a colour a point": box_in_obj(face="f {} {} {}").replace("\nv", " 1 0 0\nv").replace("\nf", " 1 0 0\nf", 1),
+    "a colour a point": box_in_obj(face="f {} {} {}")
+    .replace("\nv", " 1 0 0\nv")
+    .replace("\nf", " 1 0 0\nf", 1),
     "colours of some points": box_in_obj().replace("\nv", " 1 0 0\nv", 3),
 }
 
@@ -212,7 +226,9 @@ def test_an_obj_is_read_as_programs_write_it(tmp_path, name):
 def test_relative_numbers_of_an_obj_count_from_where_they_stand(tmp_path):
     box = box_in_obj(first=-8)
     (tmp_path / "boxes.obj").write_text(2 * box)
-    assert np.array_equal(read_surface(tmp_path / "boxes.obj").triangles, np.vstack([BOX.faces, BOX.faces + 8]))
+    assert np.array_equal(
+        read_surface(tmp_path / "boxes.obj").triangles, np.vstack([BOX.faces, BOX.faces + 8])
+    )
     (tmp_path / "early.obj").write_text(box.replace("f -8", "f -9"))
     assert "outside 0..7: -1" in refusal(lambda: read_surface(tmp_path / "early.obj"))
 
@@ -222,7 +238,9 @@ def test_tetrahedra_give_their_outer_surface(tmp_path, kind):
     """A box filled with tetrahedra around its middle, every other one wound the wrong way."""
     tetrahedra = np.column_stack([BOX.faces, np.full(12, 8)])
     tetrahedra[::2] = tetrahedra[::2][:, [1, 0, 2, 3]]
-    meshio.Mesh(np.vstack([BOX.vertices, [[0, 0, 0]]]), [("tetra", tetrahedra)]).write(tmp_path / f"box.{kind}")
+    meshio.Mesh(np.vstack([BOX.vertices, [[0, 0, 0]]]), [("tetra", tetrahedra)]).write(
+        tmp_path / f"box.{kind}"
+    )
     outer = read_surface(tmp_path / f"box.{kind}")
     report = examine(outer)
     assert len(outer.points) == 8 and len(outer.triangles) == 12
@@ -263,7 +281,11 @@ def test_it_is_refused_in_one_line_that_names_the_file(tmp_path, name, capfd):
 def test_what_is_no_file_is_refused(tmp_path):
     (tmp_path / "folder.ply").mkdir()
     os.mkfifo(tmp_path / "pipe.ply")
-    for name, words in {"none": "No such file", "folder": "is a folder", "pipe": "a pipe or a device"}.items():
+    for name, words in {
+        "none": "No such file",
+        "folder": "is a folder",
+        "pipe": "a pipe or a device",
+    }.items():
         assert words in refusal(lambda name=name: read_surface(tmp_path / f"{name}.ply"))
 
 
@@ -337,7 +359,11 @@ def glb(instances: int, faces: int, parts: int = 1) -> bytes:
     text += b" " * (-len(text) % 4)
     header = struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(binary))
     return (
-        header + struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x4E4942) + binary
+        header
+        + struct.pack("<II", len(text), 0x4E4F534A)
+        + text
+        + struct.pack("<II", len(binary), 0x4E4942)
+        + binary
     )
 
 

@@ -88,7 +88,9 @@ def test_repair_that_loses_the_body_is_refused():
 
 def pipe(hole: float) -> Surface:
     """A pipe with walls of 5 cm, whose inner one lacks what lies beyond x = ``hole`` [m]."""
-    surface = surface_of(trimesh.creation.annulus(0.45, 0.5, 1.0, sections=64).subdivide().subdivide())
+    surface = surface_of(
+        trimesh.creation.annulus(0.45, 0.5, 1.0, sections=64).subdivide().subdivide()
+    )
     middles = surface.points[surface.triangles].mean(axis=1)
     lacks = (np.linalg.norm(middles[:, :2], axis=1) < 0.46) & (middles[:, 0] > hole)
     return Surface(surface.points, surface.triangles[~lacks])
@@ -108,14 +110,24 @@ def test_repair_tells_how_much_of_the_surface_it_changed(caplog, folder):
     ):
         caplog.clear()
         prepare(surface, ["repair"])
-        said = [f"took {gone}% of the surface's area away, and {new}% of the area is new"] if gone + new else []
-        assert [line for line in said if line in caplog.text] == said and len(caplog.messages) == len(said)
+        said = (
+            [f"took {gone}% of the surface's area away, and {new}% of the area is new"]
+            if gone + new
+            else []
+        )
+        assert [line for line in said if line in caplog.text] == said and len(
+            caplog.messages
+        ) == len(said)
     large = Surface(BODY.points, BODY.triangles[450:])
     caplog.clear()
     # the second time from the cache
     for _ in range(2):
         prepare(large, ["repair"])
-    assert len(set(caplog.messages)) == 1 and len(caplog.messages) == 2 and len(list(folder.iterdir())) == 2
+    assert (
+        len(set(caplog.messages)) == 1
+        and len(caplog.messages) == 2
+        and len(list(folder.iterdir())) == 2
+    )
 
 
 def test_simplify_reduces_and_stays_closed():
@@ -168,7 +180,10 @@ def test_orient_winds_cavities_inwards_and_their_cores_outwards(inwards, shift):
     mesh = joined(turned)
     mended = prepare(Surface(mesh.points + shift, mesh.triangles), ["orient"])
     ends = np.cumsum([len(part.triangles) for part in parts])[:-1]
-    volumes = [examine(Surface(mended.points, triangles)).volume for triangles in np.split(mended.triangles, ends)]
+    volumes = [
+        examine(Surface(mended.points, triangles)).volume
+        for triangles in np.split(mended.triangles, ends)
+    ]
     assert volumes == pytest.approx(outwards, rel=1e-6)
 
 
@@ -202,8 +217,12 @@ def test_steps_are_as_exact_far_from_the_origin(step):
     ball = surface_of(trimesh.creation.icosphere(3, radius=0.15))
     ball = Surface(ball.points, ball.triangles[3 * (step == "repair") :])
     far = np.array([441871.6, 6329700.7, 120.3])
-    near, moved = (examine(prepare(Surface(ball.points + shift, ball.triangles), [step])) for shift in (0, far))
-    assert moved.volume == pytest.approx(near.volume, rel=1e-6) and moved.area == pytest.approx(near.area, rel=1e-6)
+    near, moved = (
+        examine(prepare(Surface(ball.points + shift, ball.triangles), [step])) for shift in (0, far)
+    )
+    assert moved.volume == pytest.approx(near.volume, rel=1e-6) and moved.area == pytest.approx(
+        near.area, rel=1e-6
+    )
 
 
 def test_steps_run_in_the_order_given_and_leave_the_input_alone():
@@ -243,17 +262,27 @@ class Step:
         return Surface(surface.points * factor, surface.triangles)
 
 
-def test_a_step_is_computed_once_for_the_same_mesh_and_value_and_again_where_its_file_is_damaged(folder):
+def test_a_step_is_computed_once_for_the_same_mesh_and_value_and_again_where_its_file_is_damaged(
+    folder,
+):
     step = Step()
     first, again = cached(step, BODY, 3.0), cached(step, BODY, 3.0)
-    assert step.calls == 1 and np.array_equal(first.points, again.points) and again.triangles.dtype == np.int64
+    assert (
+        step.calls == 1
+        and np.array_equal(first.points, again.points)
+        and again.triangles.dtype == np.int64
+    )
     (path,) = folder.iterdir()
     whole = path.read_bytes()
     for damage in (b"", whole[:1000], whole[:5000] + b"x" + whole[5001:]):
         path.write_bytes(damage)
         assert np.array_equal(cached(step, BODY, 3.0).points, 3.0 * BODY.points)
     moved = Surface(BODY.points + 1e-15, BODY.triangles)
-    for surface, value in ((BODY, 4.0), (moved, 3.0), (Surface(BODY.points, BODY.triangles[::-1]), 3.0)):
+    for surface, value in (
+        (BODY, 4.0),
+        (moved, 3.0),
+        (Surface(BODY.points, BODY.triangles[::-1]), 3.0),
+    ):
         assert np.array_equal(cached(step, surface, value).points, value * surface.points)
     assert step.calls == 7
 

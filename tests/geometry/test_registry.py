@@ -67,7 +67,9 @@ def toy(site, tmp_path, monkeypatch):
         steps=("merge",),
     )
     monkeypatch.setitem(MODELS, "toybox", model)
-    monkeypatch.setitem(MODELS, "toyscan", replace(model, downloads={}, packaged="toypackage/data/box.ply"))
+    monkeypatch.setitem(
+        MODELS, "toyscan", replace(model, downloads={}, packaged="toypackage/data/box.ply")
+    )
     return tmp_path
 
 
@@ -83,7 +85,9 @@ def install(folder: Path, content: bytes) -> Path:
 def test_the_copy_goes_before_what_was_fetched_or_lies_in_a_package(toy):
     with pytest.raises(InputError, match=r"^mesh 'toybox' is not here: msmpetsc fetch toybox$"):
         locate("toybox", toy)
-    with pytest.raises(InputError, match=r"'toyscan' is not here: it comes with a package, pip .* toypackage$"):
+    with pytest.raises(
+        InputError, match=r"'toyscan' is not here: it comes with a package, pip .* toypackage$"
+    ):
         fetch("toyscan")
     packaged = install(toy, COPY)
     assert locate("toyscan", toy) == packaged and "toypackage" not in sys.modules
@@ -168,6 +172,9 @@ def test_the_command_fetches_and_lists(toy, capsys):
     assert command.run(parsed(["fetch", "--list"])) == 0
     rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
     assert "fetched" in rows["toybox"] and "another file" in rows["bunny"]
-    for words, told in ((["fetch"], "fetch which mesh"), (["fetch", "armadilo"], "did you mean 'armadillo'")):
+    for words, told in (
+        (["fetch"], "fetch which mesh"),
+        (["fetch", "armadilo"], "did you mean 'armadillo'"),
+    ):
         with pytest.raises(InputError, match=told):
             command.run(parsed(words))

@@ -56,7 +56,9 @@ def test_volume_does_not_depend_on_place_or_numbering(shift, seed, sides):
     rng = np.random.default_rng(seed)
     surface = box(sides)
     order = rng.permutation(8)
-    moved = Surface((surface.points + shift)[order], np.argsort(order)[surface.triangles][rng.permutation(12)])
+    moved = Surface(
+        (surface.points + shift)[order], np.argsort(order)[surface.triangles][rng.permutation(12)]
+    )
     assert examine(moved).volume == pytest.approx(np.prod(sides), rel=1e-6)
     inwards = Surface(moved.points, moved.triangles[:, ::-1])
     assert examine(inwards).volume == pytest.approx(-np.prod(sides), rel=1e-6)

@@ -14,7 +14,10 @@ from msmpetsc.errors import InputError
 
 # The same trials every time: what is found here once is found again.
 TRIALS = settings(
-    derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 NUMBERS = [*b"nan inf 1e400 -1 0 1000000000000 18446744073709551616 1e12 x 1/2/3".split(), b""]
 NUMBER = re.compile(rb"[-+]?\d[\d.eE+-]*")
@@ -25,7 +28,11 @@ damage = st.lists(
     st.one_of(
         st.tuples(st.just("byte"), place, st.binary(min_size=1, max_size=1)),
         st.tuples(st.just("number"), place, st.sampled_from(NUMBERS)),
-        st.tuples(st.just("bytes"), place, st.sampled_from([b"\xff" * 4, b"\xff" * 8, b"\0" * 8, b"\0\xca\x9a\x3b"])),
+        st.tuples(
+            st.just("bytes"),
+            place,
+            st.sampled_from([b"\xff" * 4, b"\xff" * 8, b"\0" * 8, b"\0\xca\x9a\x3b"]),
+        ),
         st.tuples(st.just("put in"), place, st.binary(max_size=8)),
         st.tuples(st.just("cut"), place, st.just(b"")),
     ),

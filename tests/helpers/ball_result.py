@@ -47,7 +47,11 @@ def write_ball(path: Path, scene: str = SCENE) -> Path:
         file.write("lattice/nodes", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         if EAST_HELD in scene:
             file.write("lattice/pinned", np.flatnonzero(ball.vertices[:, 0] >= 0.02))
-        for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
+        for name, part in (
+            ("weights", embedding.data),
+            ("indices", embedding.indices),
+            ("indptr", embedding.indptr),
+        ):
             file.write(f"embedding/{name}", part)
         file.start_frames(len(HEIGHTS), rows, {"surface": rows})
         for index, height in enumerate(HEIGHTS):

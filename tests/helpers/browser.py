@@ -19,7 +19,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE = 30.0  # [s] for an answer, or until something holds
@@ -33,7 +35,13 @@ class Browser:
         ours, theirs = os.pipe(), os.pipe()  # from it, to it
         read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 20) for fd in (theirs[0], ours[1]))
         profile = page.with_suffix(".profile")
-        words = [str(CHROMIUM), *FLAGS, "--remote-debugging-pipe", f"--user-data-dir={profile}", "--hide-scrollbars"]
+        words = [
+            str(CHROMIUM),
+            *FLAGS,
+            "--remote-debugging-pipe",
+            f"--user-data-dir={profile}",
+            "--hide-scrollbars",
+        ]
         shell = ["bash", "-c", f'exec "$@" 3<&{read} 4>&{write}', "bash"]  # it reads 3 and writes 4
         self._process = subprocess.Popen(
             [*shell, *words, f"--window-size={size[0]},{size[1]}"], pass_fds=(read, write),
@@ -41,11 +49,19 @@ class Browser:
         )  # fmt: skip
         for fd in (theirs[0], ours[1], read, write):
             os.close(fd)
-        self._from, self._to, self._rest, self._number, self._session = ours[0], theirs[1], b"", 0, ""
+        self._from, self._to, self._rest, self._number, self._session = (
+            ours[0],
+            theirs[1],
+            b"",
+            0,
+            "",
+        )
         window: dict[str, Any] = {"newWindow": True, "width": size[0], "height": size[1]}
         try:
             target = self._ask("Target.createTarget", url=f"{page.as_uri()}#{address}", **window)
-            self._session = self._ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
+            self._session = self._ask(
+                "Target.attachToTarget", targetId=target["targetId"], flatten=True
+            )["sessionId"]
             self.until("document.documentElement?.dataset.ready === '1'")
         except BaseException:
             self.__exit__()
@@ -75,14 +91,18 @@ class Browser:
                     assert "error" not in answer, answer
                     return answer["result"]
                 continue
-            assert select.select([self._from], [], [], max(0.0, end - time.monotonic()))[0], f"no answer to {method}"
+            assert select.select([self._from], [], [], max(0.0, end - time.monotonic()))[0], (
+                f"no answer to {method}"
+            )
             more = os.read(self._from, 2**20)
             assert more, "the browser ended"
             self._rest += more
 
     def value(self, expression: str) -> Any:
         """Return what an expression of JavaScript is in the page."""
-        answer = self._ask("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        answer = self._ask(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
@@ -96,18 +116,24 @@ class Browser:
     def middle(self, selector: str) -> tuple[float, float]:
         """Return where the middle of an element is [px]."""
         box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
-        x, y = self.value(f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({box})")
+        x, y = self.value(
+            f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({box})"
+        )
         return x, y
 
     def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
-    def drag(self, start: tuple[float, float], by: tuple[float, float], shift: bool = False) -> None:
+    def drag(
+        self, start: tuple[float, float], by: tuple[float, float], shift: bool = False
+    ) -> None:
         """Press the left button, move by so many pixels in ten steps, and let go; with the shift key, or without."""
         held: dict[str, Any] = {"button": "left", "modifiers": 8 if shift else 0}
         self._mouse("mousePressed", *start, buttons=1, clickCount=1, **held)
         for share in np.linspace(0.1, 1, 10):
-            self._mouse("mouseMoved", start[0] + share * by[0], start[1] + share * by[1], buttons=1, **held)
+            self._mouse(
+                "mouseMoved", start[0] + share * by[0], start[1] + share * by[1], buttons=1, **held
+            )
         self._mouse("mouseReleased", start[0] + by[0], start[1] + by[1], clickCount=1, **held)
 
     def click(self, at: str | tuple[float, float]) -> None:
@@ -125,8 +151,12 @@ class Browser:
 
     def picture(self, selector: str = "#view") -> np.ndarray:
         """Return what is seen of an element, (h, w, 3), after the page has drawn."""
-        self.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.value(
+            "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        )
         box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
-        clip = self.value(f"(({{ x, y, width, height }}) => ({{ x, y, width, height, scale: 1 }}))({box})")
+        clip = self.value(
+            f"(({{ x, y, width, height }}) => ({{ x, y, width, height, scale: 1 }}))({box})"
+        )
         data = self._ask("Page.captureScreenshot", clip=clip)["data"]
         return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)

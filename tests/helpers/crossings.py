@@ -13,7 +13,11 @@ def unique_edges(triangles: np.ndarray) -> np.ndarray:
 
 def count_crossings(points: np.ndarray, triangles: np.ndarray) -> int:
     """Return how many pairs of an edge and a triangle that share no corner cross; points (v, 3)."""
-    return _count(np.ascontiguousarray(points, float), unique_edges(triangles), np.ascontiguousarray(triangles))
+    return _count(
+        np.ascontiguousarray(points, float),
+        unique_edges(triangles),
+        np.ascontiguousarray(triangles),
+    )
 
 
 @numba.njit(cache=True)
@@ -28,7 +32,11 @@ def _count(points, edges, triangles):
     count, low, high = 0, np.empty((len(triangles), 3)), np.empty((len(triangles), 3))
     for f in range(len(triangles)):
         for c in range(3):
-            x, y, z = points[triangles[f, 0], c], points[triangles[f, 1], c], points[triangles[f, 2], c]
+            x, y, z = (
+                points[triangles[f, 0], c],
+                points[triangles[f, 1], c],
+                points[triangles[f, 2], c],
+            )
             low[f, c], high[f, c] = min(x, y, z), max(x, y, z)
     order = np.argsort(low[:, 0])
     begins, widest = low[order, 0], (high[:, 0] - low[:, 0]).max()

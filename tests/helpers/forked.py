@@ -21,7 +21,9 @@ STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new; mv $OMPI_COMM_WORLD_RA
 read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
 
 
-def run_forked(arguments: Sequence[str], environment: Mapping[str, str], timeout: float) -> subprocess.CompletedProcess:
+def run_forked(
+    arguments: Sequence[str], environment: Mapping[str, str], timeout: float
+) -> subprocess.CompletedProcess:
     """``msmpetsc`` with these arguments, as subprocess.run gives it. Raises subprocess.TimeoutExpired."""
     with tempfile.TemporaryDirectory() as folder:
         out, error = Path(folder, "out"), Path(folder, "error")
@@ -33,7 +35,9 @@ def run_forked(arguments: Sequence[str], environment: Mapping[str, str], timeout
             os.killpg(child.pid, signal.SIGKILL)  # its session: what it started, too
             raise
         child.close()
-        return subprocess.CompletedProcess(list(arguments), status, out.read_text(), error.read_text())
+        return subprocess.CompletedProcess(
+            list(arguments), status, out.read_text(), error.read_text()
+        )
 
 
 def run_ranks(
@@ -47,11 +51,19 @@ def run_ranks(
             os.mkfifo(Path(folder, f"{rank}.status"))
         command = ["mpiexec", "--oversubscribe", "-n", str(ranks), "bash", "-c", STAND_IN, folder]
         out, error = (path.open("a") for path in streams)
-        with out, error, subprocess.Popen(command, env=environment, stdout=out, stderr=error) as mpiexec:
+        with (
+            out,
+            error,
+            subprocess.Popen(command, env=environment, stdout=out, stderr=error) as mpiexec,
+        ):
             children = []
             try:
                 for rank in range(ranks):
-                    given = (list(arguments), streams, _environment_of(Path(folder, f"{rank}.env"), mpiexec, end))
+                    given = (
+                        list(arguments),
+                        streams,
+                        _environment_of(Path(folder, f"{rank}.env"), mpiexec, end),
+                    )
                     children.append(SERVER.Process(target=_rank, args=given, daemon=True))
                     children[-1].start()
                 _hand_on(children, mpiexec, folder, end)
@@ -61,7 +73,9 @@ def run_ranks(
                 for child in children:
                     if child.is_alive():  # another rank has ended all
                         os.killpg(child.pid, signal.SIGKILL)
-        return subprocess.CompletedProcess(command, mpiexec.returncode, *(path.read_text() for path in streams))
+        return subprocess.CompletedProcess(
+            command, mpiexec.returncode, *(path.read_text() for path in streams)
+        )
 
 
 def _environment_of(path: Path, mpiexec: subprocess.Popen, end: float) -> dict[str, str]:

@@ -45,7 +45,11 @@ def tilted_beam(length: int = 9) -> np.ndarray:
 
 def limbs(reach: int = 7) -> np.ndarray:
     """A cube with an arm along each axis that is a cell thick; none of them begins at an even index."""
-    arms = [at(block(reach, 1, 1), 4, 2, 1), at(block(1, reach, 1), 1, 4, 2), at(block(1, 1, reach), 2, 1, 4)]
+    arms = [
+        at(block(reach, 1, 1), 4, 2, 1),
+        at(block(1, reach, 1), 1, 4, 2),
+        at(block(1, 1, reach), 2, 1, 4),
+    ]
     return np.concatenate([block(4, 4, 4), *arms])
 
 
@@ -74,7 +78,9 @@ LATTICES: dict[str, np.ndarray] = {
     "rod": at(block(14, 1, 1), 1, 1, 1),
     "a cell": block(1, 1, 1),
     "a cell at odd indices": block(1, 1, 1) + 1,
-    "many bodies": np.concatenate([at(block(1, 1, 1), 2 * i, 2 * j, 0) for i in range(3) for j in range(3)]),
+    "many bodies": np.concatenate(
+        [at(block(1, 1, 1), 2 * i, 2 * j, 0) for i in range(3) for j in range(3)]
+    ),
 }
 
 
@@ -91,12 +97,16 @@ def build(
     middle = cells[:, 0].mean()
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:
-        uniform = CellMaterial(*(np.full(len(ijk), value) for value in (density, YOUNG, poisson or 0.25)))
+        uniform = CellMaterial(
+            *(np.full(len(ijk), value) for value in (density, YOUNG, poisson or 0.25))
+        )
         return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * YOUNG)
 
     law = {"law": "neo-hookean", "poisson_ratio": poisson} if poisson else {"law": "linear"}
     material = Material(density=density, young_modulus=YOUNG, **law)
-    lattice = build_lattice(cages_of(cells, CELL, comm), material, of_cells if contrast != 1 else None)
+    lattice = build_lattice(
+        cages_of(cells, CELL, comm), material, of_cells if contrast != 1 else None
+    )
     low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
     return lattice.pin(lattice.nodes[:, 0] < low + 0.01 * CELL) if pins else lattice
 
@@ -160,7 +170,14 @@ class Applied:
 class Case:
     """A lattice, and the cycle that is built for the Hessian at positions q."""
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, q: np.ndarray, time_step: float, contact: bool = False):
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        lattice: Lattice,
+        q: np.ndarray,
+        time_step: float,
+        contact: bool = False,
+    ):
         self.comm, self.lattice, self.q, self.time_step = comm, lattice, q, time_step
         self.unknowns = Unknowns(comm, lattice)
         self.elasticity = Elasticity(lattice)
@@ -192,7 +209,11 @@ class Case:
         hessian, t2 = TrueHessian(self.unknowns, self.elasticity, self.time_step), self.time_step**2
         hessian.elastic = self.elasticity.hessian_at(self.q, projected=True)
         matrix = self.dense(lambda x, y: hessian.mult(None, x, y))
-        own = self.blocks[self.unknowns.free] if len(self.blocks) else np.zeros((self.unknowns.size, 9))
+        own = (
+            self.blocks[self.unknowns.free]
+            if len(self.blocks)
+            else np.zeros((self.unknowns.size, 9))
+        )
         for node, added in enumerate(np.concatenate(self.comm.allgather(own))):
             matrix[3 * node : 3 * node + 3, 3 * node : 3 * node + 3] += t2 * added.reshape(3, 3)
         return matrix
@@ -216,7 +237,9 @@ class Case:
     def gathered(self, matrix: PETSc.Mat) -> np.ndarray:
         """A matrix with entries, on every rank."""
         indptr, indices, data = matrix.getValuesCSR()
-        own = csr_array((data, indices, indptr), shape=(len(indptr) - 1, matrix.getSize()[1])).toarray()
+        own = csr_array(
+            (data, indices, indptr), shape=(len(indptr) - 1, matrix.getSize()[1])
+        ).toarray()
         return np.concatenate(self.comm.allgather(own))
 
     def iterations(self, rtol: float, rough: bool) -> int:
@@ -233,7 +256,11 @@ class Case:
         ksp.getPC().setPythonContext(Applied(self.multigrid.pc))
         ksp.setTolerances(rtol=rtol, max_it=100)
         owned = self.lattice.nodes[: self.lattice.owned]
-        push = np.sin(1000 * (owned - ORIGIN) ** 2) if rough else self.lattice.mass[:, None] * [0.3, -0.2, -9.81]
+        push = (
+            np.sin(1000 * (owned - ORIGIN) ** 2)
+            if rough
+            else self.lattice.mass[:, None] * [0.3, -0.2, -9.81]
+        )
         self.unknowns.from_nodes(push, self.x)
         ksp.solve(self.x, self.y)
         assert ksp.reason > 0, ksp.reason

@@ -35,7 +35,9 @@ def block(*sides: int) -> np.ndarray:
 
 def beam() -> Lattice:
     """8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
-    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear"))
+    lattice = build_lattice(
+        cages_of(block(8, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
+    )
     return lattice.pin(lattice.nodes[:, 0] < 1.01)
 
 

@@ -9,7 +9,9 @@ from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Planes
 STILL = Motion.through(())
 
 
-def plane(point: list[float], normal: list[float], path: Motion = STILL, **times: float) -> Obstacle:
+def plane(
+    point: list[float], normal: list[float], path: Motion = STILL, **times: float
+) -> Obstacle:
     normal = np.array(normal) / np.linalg.norm(normal)
     return Obstacle(Faces(Planes(np.array([point], float), normal[None])), path, **times)
 

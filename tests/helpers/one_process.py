@@ -73,7 +73,11 @@ def command_error(*arguments: object) -> str:
     stream = io.StringIO()
     with contextlib.redirect_stderr(stream):
         status = main([*map(str, arguments)])
-    (line,) = (line for line in stream.getvalue().splitlines() if "note:" not in line and not line.startswith("frame "))
+    (line,) = (
+        line
+        for line in stream.getvalue().splitlines()
+        if "note:" not in line and not line.startswith("frame ")
+    )
     assert status == 2 and errors(line) == [line], stream.getvalue()
     return line
 

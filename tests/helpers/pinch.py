@@ -6,7 +6,11 @@ import numpy as np
 import tomli_w
 import trimesh
 
-RADIUS, ARM, HALF = 0.02, 0.12, 0.05  # [m]: of the tube, of its straight arms, from their middles to the U's axis
+RADIUS, ARM, HALF = (
+    0.02,
+    0.12,
+    0.05,
+)  # [m]: of the tube, of its straight arms, from their middles to the U's axis
 
 
 def u_tube(around: int = 16, along: int = 60) -> trimesh.Trimesh:
@@ -15,14 +19,22 @@ def u_tube(around: int = 16, along: int = 60) -> trimesh.Trimesh:
     s = np.linspace(0, lengths.sum(), along)
     angle = np.clip((s - ARM) / HALF, 0, np.pi)
     beyond = np.clip(s - ARM - lengths[1], 0, None)
-    middle = np.stack([-HALF * np.cos(angle), 0 * s, np.clip(ARM - s, 0, None) + beyond - HALF * np.sin(angle)], axis=1)
+    middle = np.stack(
+        [-HALF * np.cos(angle), 0 * s, np.clip(ARM - s, 0, None) + beyond - HALF * np.sin(angle)],
+        axis=1,
+    )
     normal = np.stack([-np.cos(angle), 0 * s, -np.sin(angle)], axis=1)
     turn = 2 * np.pi * np.arange(around) / around
-    ring = normal[:, None] * np.cos(turn)[None, :, None] + np.array([0, 1, 0]) * np.sin(turn)[None, :, None]
+    ring = (
+        normal[:, None] * np.cos(turn)[None, :, None]
+        + np.array([0, 1, 0]) * np.sin(turn)[None, :, None]
+    )
     points = np.concatenate([(middle[:, None] + RADIUS * ring).reshape(-1, 3), middle[[0, -1]]])
     row, column = np.meshgrid(np.arange(along - 1), np.arange(around), indexing="ij")
     a, b = row * around + column, row * around + (column + 1) % around
-    sides = np.concatenate([np.stack([a, b, a + around], -1), np.stack([b, b + around, a + around], -1)]).reshape(-1, 3)
+    sides = np.concatenate(
+        [np.stack([a, b, a + around], -1), np.stack([b, b + around, a + around], -1)]
+    ).reshape(-1, 3)
     first, second = np.arange(around), np.roll(np.arange(around), -1)
     last, end = (along - 1) * around, around * along
     caps = [np.stack([second, first, np.full(around, end)], 1)]

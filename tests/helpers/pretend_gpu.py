@@ -28,7 +28,11 @@ counted = Counter()
 
 def name_of(function) -> str:
     module = function.__module__.partition("numpy.")[2]
-    return f"{module}.{function.__name__}" if module and not module.startswith("core") else function.__name__
+    return (
+        f"{module}.{function.__name__}"
+        if module and not module.startswith("core")
+        else function.__name__
+    )
 
 
 class Array(NDArrayOperatorsMixin):
@@ -44,7 +48,9 @@ class Array(NDArrayOperatorsMixin):
 
     def __array_ufunc__(self, ufunc, method, *inputs, out=(), **keywords):
         assert method == "__call__", f"CuPy has no {ufunc.__name__}.{method}"
-        found = ufunc(*map(bare, inputs), **({"out": tuple(map(bare, out))} if out else {}), **keywords)
+        found = ufunc(
+            *map(bare, inputs), **({"out": tuple(map(bare, out))} if out else {}), **keywords
+        )
         return out[0] if out else dressed(found)
 
     def __array_function__(self, function, _, arguments, keywords):
@@ -106,7 +112,19 @@ def _method(name: str):
     return call
 
 
-for _name in ("all", "any", "argmin", "astype", "copy", "max", "mean", "min", "ravel", "reshape", "sum"):
+for _name in (
+    "all",
+    "any",
+    "argmin",
+    "astype",
+    "copy",
+    "max",
+    "mean",
+    "min",
+    "ravel",
+    "reshape",
+    "sum",
+):
     setattr(Array, _name, _method(_name))
 
 

@@ -42,12 +42,20 @@ def frame(index: int, **other) -> Frame:
     """Frame `index`, with `other` values in place of its own."""
     energies = dict(kinetic=1.0 * index, elastic=2.0 * index, potential=-1.0, contact=0.0)
     numbers = dict(step_error=1e-6, iterations=3, ksp_its=9, wall_time=0.1 * index)
-    arrays = dict(position=position(index), surface=POINTS + 0.01 * index * X, momentum=np.array([1.0, 0, index]))
+    arrays = dict(
+        position=position(index),
+        surface=POINTS + 0.01 * index * X,
+        momentum=np.array([1.0, 0, index]),
+    )
     return Frame(**{"index": index, "time": DT * index, **energies, **numbers, **arrays, **other})
 
 
 def write(
-    path: Path, frames: list[Frame] | None = None, surface: bool = True, points: np.ndarray = POINTS, **lattice
+    path: Path,
+    frames: list[Frame] | None = None,
+    surface: bool = True,
+    points: np.ndarray = POINTS,
+    **lattice,
 ) -> Path:
     """The file, with other frames or other arrays of the lattice where they are given."""
     frames = [frame(index) for index in range(FRAMES)] if frames is None else frames
@@ -55,7 +63,9 @@ def write(
     arrays = dict(nodes=NODES, cells=cells(), springs=springs(), mass=np.full(len(NODES), 0.25))
     arrays |= dict(rest_length=np.full(s, H), stiffness=np.full(s, 100.0))
     arrays |= dict(pinned=np.array([0, 3]), cell_kind=np.ones(2, "u1"))
-    with ResultFile(path, MPI.COMM_SELF, {"scene": SCENE, "ranks": 1, "command": "msmpetsc run bar.toml"}) as file:
+    with ResultFile(
+        path, MPI.COMM_SELF, {"scene": SCENE, "ranks": 1, "command": "msmpetsc run bar.toml"}
+    ) as file:
         for name, rows in (arrays | lattice).items():
             file.write(f"lattice/{name}", rows)
         if surface:
@@ -65,9 +75,13 @@ def write(
             file.write("embedding/indices", cells()[[0, 1, 1, 0]].ravel())
             file.write("embedding/weights", np.full(8 * len(POINTS), 1 / 8))
         also = {"surface": len(POINTS)} if surface else {}
-        also |= {name: len(rows) for name in STRESS if (rows := getattr(frames[0], name)) is not None}
+        also |= {
+            name: len(rows) for name in STRESS if (rows := getattr(frames[0], name)) is not None
+        }
         file.start_frames(len(frames), len((arrays | lattice)["nodes"]), also)
         for one in frames:
             file.append(one)
-            file.write_checkpoint(Checkpoint(one.index, {"q": one.position, "q_previous": one.position - 1}))
+            file.write_checkpoint(
+                Checkpoint(one.index, {"q": one.position, "q_previous": one.position - 1})
+            )
     return path

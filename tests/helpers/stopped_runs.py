@@ -38,7 +38,11 @@ def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:
     output = {"surface": True, "every": EVERY}
     gravity = {"acceleration": [0.0, 1.0, -9.81]}
     scene = dict(
-        gravity=gravity, pin=side, time={"step": 0.01, "duration": 0.01 * steps}, material=material, output=output
+        gravity=gravity,
+        pin=side,
+        time={"step": 0.01, "duration": 0.01 * steps},
+        material=material,
+        output=output,
     )
     return block_scene(folder, **scene | {"solver": {"preset": "newton", "error": 1e-3}} | tables)
 
@@ -53,12 +57,16 @@ def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
             found, expected = one[name][...], other[name][...]
             assert found.shape == expected.shape, name
             if rtol:
-                np.testing.assert_allclose(found, expected, rtol=0, atol=rtol * np.abs(expected).max())
+                np.testing.assert_allclose(
+                    found, expected, rtol=0, atol=rtol * np.abs(expected).max()
+                )
             else:
                 assert np.array_equal(found, expected, equal_nan=True), name
 
 
-def at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], object], is_stored: bool = True) -> None:
+def at_step(
+    monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], object], is_stored: bool = True
+) -> None:
     """Have ``action`` happen when the run has taken that step, its frame stored or not yet."""
     advance = TimeLoop.advance
 
@@ -82,7 +90,9 @@ def assert_equal(found: dict, expected: dict) -> None:
     """Frames or checkpoints, bit by bit, but for how long they took."""
     assert found.keys() == expected.keys()
     for name in expected.keys() - {"wall_time", "Monitors.work.wall_time"}:
-        assert expected[name] is None or np.array_equal(found[name], expected[name], equal_nan=True), name
+        assert expected[name] is None or np.array_equal(
+            found[name], expected[name], equal_nan=True
+        ), name
 
 
 def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
@@ -97,11 +107,19 @@ def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
                 frames.append(frame)
                 saved.append(copy.deepcopy(simulation.saved))
         count = len(saved)
-        begins = {every, 2 * every, 4 * every, count // 2 // every * every, (count - 2) // every * every}
+        begins = {
+            every,
+            2 * every,
+            4 * every,
+            count // 2 // every * every,
+            (count - 2) // every * every,
+        }
         for begin in begins & {*range(1, count - 1)}:
             with TimeLoop(comm, scene, model) as simulation:
                 simulation.restore(saved[begin])
-                for frame, index in zip(simulation.advance(), range(begin + 1, begin + 3), strict=False):
+                for frame, index in zip(
+                    simulation.advance(), range(begin + 1, begin + 3), strict=False
+                ):
                     after = simulation.saved
                     assert after.step == saved[index].step == index // every * every
                     assert_equal(after.rows, saved[index].rows)
@@ -115,4 +133,6 @@ def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
 def ranks_of(mpiexec: subprocess.Popen) -> list[int]:
     """Process numbers of its ranks."""
     children = Path(f"/proc/{mpiexec.pid}/task/{mpiexec.pid}/children").read_text().split()
-    return sorted(int(child) for child in children if b"python" in Path(f"/proc/{child}/cmdline").read_bytes())
+    return sorted(
+        int(child) for child in children if b"python" in Path(f"/proc/{child}/cmdline").read_bytes()
+    )

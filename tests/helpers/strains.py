@@ -22,7 +22,11 @@ def uniform_strains() -> Iterator[tuple[str, np.ndarray, np.ndarray, float]]:
     yield "C11: stretch along an edge", np.outer(x, x), np.outer(x, x), C11
     yield "C12: stretch along one edge against another", np.outer(x, x), np.outer(y, y), C12
     yield "C44: shear", np.outer(x, y), np.outer(x, y), C44
-    turned = {"(1,1,0)": (x + y, z), "(1,1,1)": (x + y + z, x - y), "(3,2,6)": (3 * x + 2 * y + 6 * z, 2 * x - 3 * y)}
+    turned = {
+        "(1,1,0)": (x + y, z),
+        "(1,1,1)": (x + y + z, x - y),
+        "(3,2,6)": (3 * x + 2 * y + 6 * z, 2 * x - 3 * y),
+    }
     for name, pair in turned.items():
         d, across = (direction / np.linalg.norm(direction) for direction in pair)
         yield f"C11 along {name}", np.outer(d, d), np.outer(d, d), C11

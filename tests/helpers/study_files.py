@@ -85,11 +85,20 @@ VOID = {"meta", "br"}  # elements of HTML that need no end
 
 def row_of(label: str, **given) -> dict[str, str]:
     """A row of the table as text; frames a second and seconds a simulated second follow from the time a frame."""
-    row = {"label": label, "preset": label, "scene": "block", "integrator": "implicit-euler", "status": "ok"}
+    row = {
+        "label": label,
+        "preset": label,
+        "scene": "block",
+        "integrator": "implicit-euler",
+        "status": "ok",
+    }
     row |= {"study": "try", "time_step": 0.01, "cells": 1000, "ranks": 1} | given
     if row.get("time_frame"):
         row |= {"fps": 1 / row["time_frame"], "time_second": row["time_frame"] / row["time_step"]}
-    row.setdefault("command", "msmpetsc run " + " ".join(f"--set {name}={value}" for name, value in given.items()))
+    row.setdefault(
+        "command",
+        "msmpetsc run " + " ".join(f"--set {name}={value}" for name, value in given.items()),
+    )
     return {name: str(value) for name, value in row.items()}
 
 
@@ -111,7 +120,9 @@ def svgs(text: str) -> list[ElementTree.Element]:
 
 
 def tooltips(text: str) -> list[str]:
-    return [title.text for svg in svgs(text) for title in svg.iter("{http://www.w3.org/2000/svg}title")]
+    return [
+        title.text for svg in svgs(text) for title in svg.iter("{http://www.w3.org/2000/svg}title")
+    ]
 
 
 class Balance(HTMLParser):

@@ -49,12 +49,22 @@ def main() -> None:
     words = sys.argv[1:]
     out, measure = (Path(words[words.index(name) + 1]) for name in ("-o", "--measure"))
     changes = [words[n + 1].partition("=") for n, word in enumerate(words) if word == "--set"]
-    tables = {key: tomllib.loads(f"v = {value}")["v"] for key, _, value in changes if value.startswith("{")}
+    tables = {
+        key: tomllib.loads(f"v = {value}")["v"]
+        for key, _, value in changes
+        if value.startswith("{")
+    }
     comm = MPI.COMM_WORLD
     count = len((out.parent.parent / CALLS).read_text().splitlines()) if comm.rank == 0 else 0
     if "-ksp_fail" in words:
         sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
-    write(comm, out, tables["time"], int(dict((k, v) for k, _, v in changes).get("output.every", 1)), count)
+    write(
+        comm,
+        out,
+        tables["time"],
+        int(dict((k, v) for k, _, v in changes).get("output.every", 1)),
+        count,
+    )
     if comm.rank == 0:
         kind = words[words.index("-ksp_kind") + 1] if "-ksp_kind" in words else None
         failure = {"failure": kind and {"kind": kind, "frame": 3, "says": "planted"}}
@@ -74,7 +84,12 @@ def write(comm, out: Path, table: dict, every: int, count: int) -> None:
         for index in range(count_of_frames):
             time = index * step * every
             x = NODES + (1 + step) * time * np.array([0, 0, 1.0])
-            solved = dict(step_error=0.01, iterations=3 * every, ksp_its=30 * every, wall_time=every * step * count)
+            solved = dict(
+                step_error=0.01,
+                iterations=3 * every,
+                ksp_its=30 * every,
+                wall_time=every * step * count,
+            )
             file.append(blank_frame(index=index, time=time, position=x[own], **solved))
 
 
@@ -90,7 +105,14 @@ def blank_frame(**given) -> Frame:
 def told(ranks: int, count: int) -> dict:
     times = dict.fromkeys(("setup", "factor", "local", "ksp", "output", "stepping"), float(count))
     machine = {"cpu": "a CPU", "cores": 2, "memory": 2**33, "system": "Linux"}
-    counts = {"cells": 1, "nodes": 8, "unknowns": 8, "springs": 28, "ranks": ranks, "memory": 1000 - count}
+    counts = {
+        "cells": 1,
+        "nodes": 8,
+        "unknowns": 8,
+        "springs": 28,
+        "ranks": ranks,
+        "memory": 1000 - count,
+    }
     return {"machine": machine, "versions": {"msmpetsc": "x"}, "time": times, **counts}
 
 

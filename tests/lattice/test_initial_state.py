@@ -34,7 +34,9 @@ def at_start(folder: Path, start: dict) -> tuple[Model, Frame]:
 @pytest.mark.parametrize("scale", [[1, 1, 0.25], [1, 0, 0], [1, 1, 0], [-1, 1, 1], [-2, 0.5, 3]])
 def test_scale_is_about_the_middle_of_the_box(tmp_path: Path, scale: list[float]):
     model, frame = at_start(tmp_path, {"scale": scale})
-    np.testing.assert_array_equal(frame.position, MIDDLE + np.array(scale) * (model.lattice.nodes - MIDDLE))
+    np.testing.assert_array_equal(
+        frame.position, MIDDLE + np.array(scale) * (model.lattice.nodes - MIDDLE)
+    )
     assert frame.kinetic == 0
 
 
@@ -53,7 +55,9 @@ def test_twist_about_a_slanted_axis_turns_all_in_planes_across_it(tmp_path: Path
     p, q = model.lattice.nodes - MIDDLE, frames[0].position - MIDDLE
     np.testing.assert_allclose(q @ axis, p @ axis, atol=1e-15)
     across, turned = (x - np.outer(x @ axis, axis) for x in (p, q))
-    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), np.linalg.norm(across, axis=1), atol=1e-15)
+    np.testing.assert_allclose(
+        np.linalg.norm(turned, axis=1), np.linalg.norm(across, axis=1), atol=1e-15
+    )
     sine = np.einsum("ij,ij->i", np.cross(across, turned), np.broadcast_to(axis, p.shape))
     angle = -np.radians(30) * (p @ axis / (SIDES.sum() / np.sqrt(3)) + 0.5)
     np.testing.assert_allclose(sine, (across**2).sum(axis=1) * np.sin(angle), atol=1e-15)
@@ -61,10 +65,17 @@ def test_twist_about_a_slanted_axis_turns_all_in_planes_across_it(tmp_path: Path
 
 def test_scale_comes_before_twist_and_scatter_after_it(tmp_path: Path):
     """Collapsed to its axis, a twist changes nothing; and where all goes to its random place, nothing else is left."""
-    line = begin(tmp_path, {"scale": [1, 0, 0], "twist": {"axis": [1, 0, 0], "degrees": 90}})[1][0].position
-    np.testing.assert_allclose(line, begin(tmp_path, {"scale": [1, 0, 0]})[1][0].position, atol=1e-16)
+    line = begin(tmp_path, {"scale": [1, 0, 0], "twist": {"axis": [1, 0, 0], "degrees": 90}})[1][
+        0
+    ].position
+    np.testing.assert_allclose(
+        line, begin(tmp_path, {"scale": [1, 0, 0]})[1][0].position, atol=1e-16
+    )
     half, whole, none = (
-        begin(tmp_path, {"scale": [2, 2, 2], "twist": {"axis": [0, 0, 1], "degrees": 50}, "scatter": s})[1][0].position
+        begin(
+            tmp_path,
+            {"scale": [2, 2, 2], "twist": {"axis": [0, 0, 1], "degrees": 50}, "scatter": s},
+        )[1][0].position
         for s in (0.5, 1.0, 0.0)
     )
     np.testing.assert_allclose(half, (whole + none) / 2, atol=1e-15)

@@ -42,7 +42,9 @@ def test_springs_and_masses_follow_the_definition(cells: set):
     kind = np.array([sum((np.array(a) - b) ** 2) for a, b in map(tuple, found)])
     np.testing.assert_allclose(lattice.rest_length, H * np.sqrt(kind), rtol=1e-14)
     sharing = np.array([wanted[pair] for pair in found])
-    np.testing.assert_allclose(lattice.stiffness, calibrated_stiffness(E, H, kind, sharing), rtol=1e-14)
+    np.testing.assert_allclose(
+        lattice.stiffness, calibrated_stiffness(E, H, kind, sharing), rtol=1e-14
+    )
     assert lattice.mass.sum() == pytest.approx(DENSITY * H**3 * len(cells), rel=1e-13)
     corner = {tuple(c) for c in cells + 0}
     for node, mass in zip(place, lattice.mass, strict=True):
@@ -54,12 +56,16 @@ def test_cells_name_their_corners_in_vtk_order():
     cages = cages_of(block(2, 3, 2))
     lattice = build_lattice(cages, Material(density=DENSITY, stiffness=7.0, law="linear"))
     place = np.array(grid_index(lattice, cages))
-    np.testing.assert_array_equal(place[lattice.cells] - place[lattice.cells][:, :1], np.tile(CORNERS, (12, 1, 1)))
+    np.testing.assert_array_equal(
+        place[lattice.cells] - place[lattice.cells][:, :1], np.tile(CORNERS, (12, 1, 1))
+    )
     np.testing.assert_array_equal(lattice.stiffness, 7.0)
 
 
 def test_pins_are_kept_together():
-    lattice = build_lattice(cages_of(block(2, 1, 1)), Material(density=DENSITY, stiffness=1.0, law="linear"))
+    lattice = build_lattice(
+        cages_of(block(2, 1, 1)), Material(density=DENSITY, stiffness=1.0, law="linear")
+    )
     left, right = lattice.nodes[:, 0] < 1.1, lattice.nodes[:, 0] > 1.3
     np.testing.assert_array_equal(lattice.pin(left).pin(right).pinned, left | right)
     assert not lattice.pinned.any()

@@ -51,7 +51,9 @@ def fem_sag(across: int, order: int = 1) -> float:
     """Tip deflection [m] of the same beam of scikit-fem's hexahedra on the same grid: trilinear, or of order 2."""
     sides = [np.linspace(0, side * WIDTH, side * across + 1) for side in (BEAM, 1, 1)]
     element = skfem.ElementVector({1: skfem.ElementHex1, 2: skfem.ElementHex2}[order]())
-    basis = skfem.Basis(skfem.MeshHex.init_tensor(*sides), element, intorder=2 * order + 1)  # exact for cubes
+    basis = skfem.Basis(
+        skfem.MeshHex.init_tensor(*sides), element, intorder=2 * order + 1
+    )  # exact for cubes
     K = linear_elasticity(*lame_parameters(E, NU)).assemble(basis).tocsc()
     f = skfem.LinearForm(lambda v, _: -DENSITY * GRAVITY * v[2]).assemble(basis)
     free = basis.complement_dofs(basis.get_dofs(lambda x: np.isclose(x[0], 0)))
@@ -87,8 +89,12 @@ def test_a_compression_wave_runs_at_the_root_of_E_over_rho(poisson: float | None
     """Its centre to the strain, its peak as dispersion and implicit Euler move it, its height as Euler damps it."""
     centre, peak, height = study.wave_speeds(*study.struck_bar(1 / 4, poisson))
     assert abs(centre) < study.STRAIN
-    assert peak == pytest.approx(late, abs=1e-4)  # of springs by linear theory: bar -0.11%, cells -0.18%, Euler +0.05%
-    near, far = (5**2 + station / 4 for station in study.STATIONS)  # variance of the pulse [cells^2]
+    assert peak == pytest.approx(
+        late, abs=1e-4
+    )  # of springs by linear theory: bar -0.11%, cells -0.18%, Euler +0.05%
+    near, far = (
+        5**2 + station / 4 for station in study.STATIONS
+    )  # variance of the pulse [cells^2]
     assert height == pytest.approx(np.sqrt(near / far), rel=0.01)
 
 
@@ -116,7 +122,9 @@ def free_flight(t: float, shake: float, error: float, poisson: float | None) -> 
 
 @laws
 @pytest.mark.parametrize("error", [1e-2, 1e-10])
-def test_a_shaken_body_keeps_its_momentum_however_loose_its_steps(error: float, poisson: float | None):
+def test_a_shaken_body_keeps_its_momentum_however_loose_its_steps(
+    error: float, poisson: float | None
+):
     """Every cell gives each of its corners the same mass and the same diagonal entry of L: Jacobi's preconditioner
     is a multiple of M, and CG then brings in no net force however early it stops. (A start from q_n does, but this
     one is not taken here.)"""
@@ -138,4 +146,6 @@ def rigid_loss(angle: float, steps: int) -> float:
 @laws
 def test_a_spin_loses_what_implicit_euler_takes_from_a_rigid_body(poisson: float | None):
     """7.15% in a second by steps of 1/50 s."""
-    assert free_flight(1 / 50, 0.0, 1e-10, poisson)[1] == pytest.approx(rigid_loss(2 / 50, 50), abs=1e-4)
+    assert free_flight(1 / 50, 0.0, 1e-10, poisson)[1] == pytest.approx(
+        rigid_loss(2 / 50, 50), abs=1e-4
+    )

@@ -13,14 +13,18 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 
 T = 1 / 64
-FAR = {"half_space": {"point": [0.25, 0, 0], "normal": [1, 0, 0]}}  # cells beyond the middle of the length
+FAR = {
+    "half_space": {"point": [0.25, 0, 0], "normal": [1, 0, 0]}
+}  # cells beyond the middle of the length
 BACK = {"half_space": {"point": [0, 0.25, 0], "normal": [0, 1, 0]}}
 ALL = {"box": [[-1, -1, -1], [1, 1, 1]]}
 ONCE = {"step": T, "duration": T}
 
 
 def of_parts(folder: Path, *parts: dict, **tables) -> Model:
-    return build_model(MPI.COMM_SELF, load_scene(block_scene(folder, time=ONCE, part=list(parts), **tables)))
+    return build_model(
+        MPI.COMM_SELF, load_scene(block_scene(folder, time=ONCE, part=list(parts), **tables))
+    )
 
 
 # ---- what a node and a spring get
@@ -39,7 +43,8 @@ def test_each_cell_gives_its_share_to_its_springs(tmp_path: Path):
     """A spring inside a part is as of a body of that alone; in the plane between two it has half of each."""
     stiffer = {"young_modulus": 5 * YOUNG}
     lattice, soft, stiff = (
-        of_parts(tmp_path, *parts).lattice for parts in ([{"region": FAR} | stiffer], [], [{"region": ALL} | stiffer])
+        of_parts(tmp_path, *parts).lattice
+        for parts in ([{"region": FAR} | stiffer], [], [{"region": ALL} | stiffer])
     )
     x = lattice.nodes[lattice.springs][:, :, 0]
     between, beyond = (x == 0.25).all(axis=1), (x >= 0.25).all(axis=1)
@@ -68,9 +73,15 @@ def test_the_last_part_of_a_cell_wins_key_by_key(tmp_path: Path):
 
 def test_painted_cells_are_a_part(tmp_path: Path):
     """Each of the eight corners of the surface lies in a cell of its own."""
-    lattice = of_parts(tmp_path, {"region": {"painted": [0, 1, 2, 3, 4, 5, 6, 7]}, "density": 9 * DENSITY}).lattice
-    assert lattice.mass.sum() == pytest.approx(DENSITY * (SIDES.prod() + 8 * 8 * CELL**3), rel=1e-14)
-    corner = (np.isin(lattice.nodes, [0, *SIDES])).all(axis=1) & (lattice.nodes != 0.25)[:, :2].all(axis=1)
+    lattice = of_parts(
+        tmp_path, {"region": {"painted": [0, 1, 2, 3, 4, 5, 6, 7]}, "density": 9 * DENSITY}
+    ).lattice
+    assert lattice.mass.sum() == pytest.approx(
+        DENSITY * (SIDES.prod() + 8 * 8 * CELL**3), rel=1e-14
+    )
+    corner = (np.isin(lattice.nodes, [0, *SIDES])).all(axis=1) & (lattice.nodes != 0.25)[:, :2].all(
+        axis=1
+    )
     corner &= np.isin(lattice.nodes[:, 2], [0, SIDES[2]])
     assert corner.sum() == 8
     np.testing.assert_allclose(lattice.mass[corner], 9 * DENSITY * CELL**3 / 8, rtol=1e-14)
@@ -110,10 +121,15 @@ def test_halves_side_by_side_are_springs_in_parallel(tmp_path: Path, ratio: floa
     model = of_parts(tmp_path, {"region": BACK, "young_modulus": ratio * YOUNG})
     nodes, strain = model.lattice.nodes, 1e-7
     force = forces(model, strain * nodes * [1, -1 / 4, -1 / 4])
-    pull, most = YOUNG * strain * (1 + ratio) / 2 * SIDES[1] * SIDES[2], YOUNG * strain * max(ratio, 1) * CELL**2
+    pull, most = (
+        YOUNG * strain * (1 + ratio) / 2 * SIDES[1] * SIDES[2],
+        YOUNG * strain * max(ratio, 1) * CELL**2,
+    )
     far, near = nodes[:, 0] == SIDES[0], nodes[:, 0] == 0
     assert force[far, 0].sum() == pytest.approx(pull, rel=1e-5)
-    assert np.abs(force[~far & ~near]).max() < 1e-5 * most and np.abs(force[:, 1:]).max() < 1e-5 * most
+    assert (
+        np.abs(force[~far & ~near]).max() < 1e-5 * most and np.abs(force[:, 1:]).max() < 1e-5 * most
+    )
 
 
 # ---- in motion
@@ -132,7 +148,9 @@ def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp
     mass, last = model.lattice.mass, frames[-1]
     np.testing.assert_allclose(frames[0].momentum, [0, 0, mass.sum()], rtol=1e-12, atol=1e-3)
     fallen = 2.0 - 0.5 * 2.0 * (2.0 + 0.1)  # implicit Euler's: n (n + 1) / 2 steps
-    np.testing.assert_allclose(last.position - model.lattice.nodes, np.tile([0, 0, fallen], (len(mass), 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        last.position - model.lattice.nodes, np.tile([0, 0, fallen], (len(mass), 1)), atol=1e-6
+    )
 
 
 # ---- mistakes
@@ -140,5 +158,7 @@ def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp
 
 def test_a_part_of_no_cell_is_refused(tmp_path: Path):
     corner = {"box": [[0, 0, 0], [0.05, 0.05, 0.05]]}  # holds a node, but the middle of no cell
-    with pytest.raises(InputError, match=r"^part\.0\.region holds the centre of no cell: the body is from .* m$"):
+    with pytest.raises(
+        InputError, match=r"^part\.0\.region holds the centre of no cell: the body is from .* m$"
+    ):
         of_parts(tmp_path, {"region": corner, "density": 1.0})

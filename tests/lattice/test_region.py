@@ -46,7 +46,9 @@ def test_a_relative_box_up_to_one_holds_what_sticks_out(tmp_path, cells):
 
 def test_the_example_of_tables_runs_as_written(tmp_path, monkeypatch):
     text = (ROOT / "msmpetsc" / "README.md").read_text()
-    (code,) = (block.split("```")[0] for block in text.split("```python\n")[1:] if "tables = {" in block)
+    (code,) = (
+        block.split("```")[0] for block in text.split("```python\n")[1:] if "tables = {" in block
+    )
     trimesh.creation.box((1, 0.2, 0.2)).export(tmp_path / "body.obj")
     monkeypatch.chdir(tmp_path)
     exec(code, {})
@@ -61,12 +63,18 @@ def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
     touching = surface.points[surface.points[:, 2] <= 1e-6]
     far = np.linalg.norm(pinned(model)[:, None] - touching, axis=2).min(axis=1)
     assert len(far) > 0 and far.max() <= np.sqrt(3) * model.lattice.cell_size
-    (told,) = (record.getMessage() for record in caplog.records if record.levelno == logging.WARNING)
-    assert told.startswith("pin.0.region only grazes the body") and "the region beyond (0, 0, 1e-06) m" in told
+    (told,) = (
+        record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
+    )
+    assert (
+        told.startswith("pin.0.region only grazes the body")
+        and "the region beyond (0, 0, 1e-06) m" in told
+    )
 
 
 @pytest.mark.parametrize(
-    ("kind", "more"), [("anchor", "path = [{ time = 1, by = [0, 0, 1] }]"), ("force", "total = [0, 0, 1]")]
+    ("kind", "more"),
+    [("anchor", "path = [{ time = 1, by = [0, 0, 1] }]"), ("force", "total = [0, 0, 1]")],
 )
 def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
     region = "region = { half_space = { point = [0, 0, 1e-6], normal = [0, 0, -1] } }"
@@ -76,7 +84,9 @@ def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
     assert f" {pinned} nodes" in words and pinned < 30
 
 
-@pytest.mark.parametrize(("law", "low", "high"), [("neo-hookean", 0.95, 1.05), ("linear", 0.7, 1.0)])
+@pytest.mark.parametrize(
+    ("law", "low", "high"), [("neo-hookean", 0.95, 1.05), ("linear", 0.7, 1.0)]
+)
 def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
     """Work of the weight: 9.65e-5 J by 11,206 quadratic tetrahedra (scikit-fem), clamped where they touch the plane."""
     scene = load_scene(CASES / "bunny_grazing_pin.toml", [f"material.law={law}"])
@@ -88,7 +98,11 @@ def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
 @pytest.mark.parametrize("kind", ["pin", "anchor", "force", "part"])
 def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind):
     table = {"region": {"box": [[0, 0, 0.251], [1, 1, 2]]}}  # of the nodes that stick out alone
-    own = {"anchor": {"path": [{"time": 1, "by": [0, 0, 1]}]}, "force": {"total": [0, 0, 1]}, "part": {"density": 1}}
+    own = {
+        "anchor": {"path": [{"time": 1, "by": [0, 0, 1]}]},
+        "force": {"total": [0, 0, 1]},
+        "part": {"density": 1},
+    }
     table |= own.get(kind, {})
     path = block_scene(tmp_path, time=TIME, cages={"cell_size": 0.11}, **{kind: [table]})
     where = r": the body is from \(0, 0, 0\) to \(0.5, 0.5, 0.25\) m, the region from \(0, 0, 0.251\) to \(1, 1, 2\) m"
@@ -113,4 +127,6 @@ def test_a_spring_that_a_clamp_cuts_is_as_stiff_as_what_of_it_is_free(tmp_path, 
     x, held = lattice.nodes[lattice.springs][..., 0], lattice.pinned[lattice.springs]
     free = np.where(held.any(axis=1) & ~held.all(axis=1), (x.max(axis=1) - edge) / CELL, 1.0)
     assert free.min() == pytest.approx(2 - edge / CELL)
-    np.testing.assert_allclose(lattice.stiffness / uncut.stiffness, 1 / np.maximum(free, LEAST), rtol=1e-4)
+    np.testing.assert_allclose(
+        lattice.stiffness / uncut.stiffness, 1 / np.maximum(free, LEAST), rtol=1e-4
+    )

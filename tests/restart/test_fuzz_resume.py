@@ -15,7 +15,10 @@ from stopped_runs import hanging, signal_after
 from msmpetsc.cli.main import main
 from msmpetsc.solve import simulate
 
-NAMES = [f"checkpoint/{name}" for name in ("step", "q", "q_previous", "numbers", "lowest_mode", "new\nline")]
+NAMES = [
+    f"checkpoint/{name}"
+    for name in ("step", "q", "q_previous", "numbers", "lowest_mode", "new\nline")
+]
 NAMES += ["frames/time", "frames/position", "frames/kinetic", "lattice/nodes", "lattice/mass"]
 VALUES = st.sampled_from([np.nan, np.inf, -1.0, 0.0, 3.0, 12.0, 1e308])
 SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 75, 10**12]), max_size=4).map(tuple)
@@ -42,7 +45,9 @@ def change(file: h5py.File, kind: str, name: str, what) -> None:
     if kind == "attribute":
         file.attrs[name] = what
     elif kind == "scene":
-        file.attrs["scene"] = damaged(file.attrs["scene"].encode(), what).decode(errors="replace").replace("\0", "0")
+        file.attrs["scene"] = (
+            damaged(file.attrs["scene"].encode(), what).decode(errors="replace").replace("\0", "0")
+        )
     elif kind == "value" and name in file and file[name].size and file[name].dtype.kind in "if":
         rows = file[name][...]
         with np.errstate(all="ignore"):
@@ -54,7 +59,11 @@ def change(file: h5py.File, kind: str, name: str, what) -> None:
 
 
 edit = st.one_of(
-    st.tuples(st.just("attribute"), ATTRIBUTES, st.one_of(TEXTS, st.sampled_from([7, -1, 2.5, np.arange(3)]))),
+    st.tuples(
+        st.just("attribute"),
+        ATTRIBUTES,
+        st.one_of(TEXTS, st.sampled_from([7, -1, 2.5, np.arange(3)])),
+    ),
     st.tuples(st.just("scene"), st.none(), damage),
     st.tuples(st.just("value"), st.sampled_from(NAMES), VALUES),
     st.tuples(st.just("dataset"), st.sampled_from(NAMES), st.tuples(SHAPES, KINDS)),
@@ -79,7 +88,9 @@ def test_it_goes_on_or_says_in_one_line_why_not(stopped, tmp_path, capsys, edits
         status = main(["run", "--resume", str(path)])
     told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
     assert status in (0, 2, 3) and (status == 0) == (not told)
-    assert all(line.isprintable() for line in told) and not any(re.search("Error|Traceback", line) for line in told)
+    assert all(line.isprintable() for line in told) and not any(
+        re.search("Error|Traceback", line) for line in told
+    )
 
 
 def without(file: h5py.File, name: str) -> None:

@@ -36,7 +36,16 @@ def is_killed(ranks: int, arguments: list[str], wait: float, log: Path) -> bool:
             child.kill()
             child.process.join()
         return child.poll() is not None
-    command = ["mpiexec", "--oversubscribe", "-n", str(ranks), sys.executable, "-m", "msmpetsc", *arguments]
+    command = [
+        "mpiexec",
+        "--oversubscribe",
+        "-n",
+        str(ranks),
+        sys.executable,
+        "-m",
+        "msmpetsc",
+        *arguments,
+    ]
     with subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as process:
         next((line for line in process.stderr if line.startswith("frame ")), None)
         time.sleep(wait)
@@ -79,7 +88,9 @@ def test_killed_at_any_moment(tmp_path: Path, ranks: int, kills: int, steps: int
         for whole, more in runs.items():
             often = chance.choice([[], ["--checkpoint-every", "1"]])
             command = ["run", str(scene), "--resume", str(path), *more, *often]
-            while len(at) < kills and is_killed(ranks, command, chance.uniform(0, seconds), tmp_path / "log"):
+            while len(at) < kills and is_killed(
+                ranks, command, chance.uniform(0, seconds), tmp_path / "log"
+            ):
                 # what comes after its checkpoint a run that goes on takes again
                 kept = (count - 1) // REMEMBERED * REMEMBERED + 1 if count else 0
                 count = frames_left(path, whole, kept)
@@ -88,7 +99,9 @@ def test_killed_at_any_moment(tmp_path: Path, ranks: int, kills: int, steps: int
                 run(ranks, "-m", "msmpetsc", *command, status=0)
             assert_same(path, whole)
     print(at)
-    assert ranks > 1 or len(set(at)) > 3  # spread over the frames: fewer where other work holds up the start
+    assert (
+        ranks > 1 or len(set(at)) > 3
+    )  # spread over the frames: fewer where other work holds up the start
 
 
 def test_a_killed_run_leaves_its_xdmf_file(tmp_path: Path):

@@ -41,21 +41,36 @@ GRAVITY = {"acceleration": [0.0, 1.0, -9.81]}
 SIDE = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
 FAR = {"box": [[0.49, -1, -1], [0.51, 1, 1]]}
 LED = [{"region": FAR, "path": [{"time": 0.05, "by": [0.05, 0, 0.05]}], "stop": 0.08}]
-PUSHED = [{"region": {"box": [[0.24, -1, -1], [0.26, 1, 1]]}, "path": LED[0]["path"], "stop": 0.1}]  # and let go later
+PUSHED = [
+    {"region": {"box": [[0.24, -1, -1], [0.26, 1, 1]]}, "path": LED[0]["path"], "stop": 0.1}
+]  # and let go later
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
-PRESSING = [GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}]
+PRESSING = [
+    GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}
+]
 THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}  # passed within a step
 SOFT = {"young_modulus": 1e4, "density": 1000.0}
 
 
 def swing(**tables) -> dict:
-    return {"gravity": GRAVITY, "pin": SIDE, "material": SOFT, "time": {"step": 0.02, "duration": 0.16}} | tables
+    return {
+        "gravity": GRAVITY,
+        "pin": SIDE,
+        "material": SOFT,
+        "time": {"step": 0.02, "duration": 0.16},
+    } | tables
 
 
 def fall(**tables) -> dict:
     time, start = {"step": 0.01, "duration": 0.16}, {"velocity": [1.0, 0.0, -1.5]}
     mesh = {"source": "scene.ply", "base": [0, 0, 0.01]}
-    return {"gravity": GRAVITY, "mesh": mesh, "material": SOFT, "time": time, "start": start} | tables
+    return {
+        "gravity": GRAVITY,
+        "mesh": mesh,
+        "material": SOFT,
+        "time": time,
+        "start": start,
+    } | tables
 
 
 def by(integrator: str, scene: dict) -> dict:
@@ -80,7 +95,9 @@ CASES = {
         if preset != "anderson"  # which runs astray there
     },
     "loose, pressed": fall(  # the estimate of a start knows what the preconditioner was
-        solver={"preset": "newton", "error": 0.3}, obstacle=PRESSING, time={"step": 0.01, "duration": 0.24}
+        solver={"preset": "newton", "error": 0.3},
+        obstacle=PRESSING,
+        time={"step": 0.01, "duration": 0.24},
     ),
     "anchor": swing(solver=LOOSE, anchor=LED, output={"surface": False, "every": 3}),
     "bdf2": by("bdf2", swing(solver=LOOSE)),
@@ -94,7 +111,8 @@ CASES = {
         solver=solver("anderson"),
         start={"scatter": 0.9},
         safety={"on_failure": "substep"},
-        material=SOFT | {"young_modulus": 1e6},  # pieces of an eighth and more, which the next step begins with
+        material=SOFT
+        | {"young_modulus": 1e6},  # pieces of an eighth and more, which the next step begins with
     ),
     "fallback, scattered": swing(
         solver=solver("anderson"),
@@ -103,7 +121,9 @@ CASES = {
         material=SOFT | {"young_modulus": 1e6},
     ),
     "by error": by_error(0.1, by("bdf2", swing(solver=LOOSE, anchor=LED))),
-    "by error, long steps": by_error(0.5, swing(solver=LOOSE, gravity={"acceleration": [0.0, 1e-3, -1e-2]})),
+    "by error, long steps": by_error(
+        0.5, swing(solver=LOOSE, gravity={"acceleration": [0.0, 1e-3, -1e-2]})
+    ),
     "by error, reflected": by_error(0.1, by("bdf2", fall(solver=LOOSE, obstacle=[GROUND]))),
     "by error, bdf2, pressed": by_error(0.1, by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))),
 }
@@ -122,10 +142,16 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
         with TimeLoop(COMM, read, build_model(COMM, read)) as simulation:
             return simulation.saved.rows.keys() - {"q", "q_previous"}
 
-    followed = {"lowest_mode", "loads"}  # whether a step is at a minimum is asked of every implicit one
+    followed = {
+        "lowest_mode",
+        "loads",
+    }  # whether a step is at a minimum is asked of every implicit one
     assert rows(swing(solver=LOOSE)) == followed
     assert rows(by("verlet", swing())) == set()
-    assert rows(by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))) == followed | {"history_q", "history_v"}
+    assert rows(by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))) == followed | {
+        "history_q",
+        "history_v",
+    }
     assert rows(by("verlet", fall(obstacle=[THIN]))) == {"sides"}
 
 
@@ -133,7 +159,10 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Never stopped; every third step also solved to rounding."""
     folder = tmp_path_factory.mktemp("whole")
-    assert main(["run", str(hanging(folder)), "-o", str(folder / "whole.h5"), "--true-error", "3"]) == 0
+    assert (
+        main(["run", str(hanging(folder)), "-o", str(folder / "whole.h5"), "--true-error", "3"])
+        == 0
+    )
     return folder / "whole.h5"
 
 
@@ -143,7 +172,10 @@ def stopped(whole: Path, tmp_path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "stopped.h5"
     with monkeypatch.context() as patch:
         signal_after(patch, 10, signal.SIGUSR1)
-        assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path), "--true-error", "3"]) == 0
+        assert (
+            main(["run", str(whole.parent / "scene.toml"), "-o", str(path), "--true-error", "3"])
+            == 0
+        )
     return path
 
 
@@ -176,10 +208,17 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
         assert np.array_equal(file["frames/wall_time"][:8], times)
 
 
-@pytest.mark.parametrize(("every", "steps"), [("1", {39, 40}), ("4", {24, 36, 40}), ("1000", {0, 40})])
+@pytest.mark.parametrize(
+    ("every", "steps"), [("1", {39, 40}), ("4", {24, 36, 40}), ("1000", {0, 40})]
+)
 def test_checkpoints_come_as_often_as_asked_and_at_the_end(whole: Path, tmp_path, every, steps):
     path = tmp_path / "x.h5"
-    assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path), "--checkpoint-every", every]) == 0
+    assert (
+        main(
+            ["run", str(whole.parent / "scene.toml"), "-o", str(path), "--checkpoint-every", every]
+        )
+        == 0
+    )
     with h5py.File(path) as file:
         assert set(file["checkpoint/step"]) <= steps and max(file["checkpoint/step"]) == STEPS
 
@@ -197,7 +236,11 @@ def test_another_scene_is_refused_with_its_keys(stopped: Path, capsys):
     given = ["--set", "time.duration=0.8", "--set", "material.density=900", "--preset", "anderson"]
     assert main(["run", str(scene), "--resume", str(stopped), *given]) == 2
     told = capsys.readouterr().err
-    for key, earlier in (("time.duration", 0.4), ("material.density", 1000.0), ("solver.preset", "newton")):
+    for key, earlier in (
+        ("time.duration", 0.4),
+        ("material.density", 1000.0),
+        ("solver.preset", "newton"),
+    ):
         assert f"{key}: {earlier} in {stopped}" in told
     assert main(["run", "--resume", str(stopped), "--set", "time.step=0.005", "--force"]) == 2
     assert "time.step: 0.01 in" in capsys.readouterr().err
@@ -217,7 +260,12 @@ def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
     """From a stopped and from a finished file; the 40th step had a frame as the last one, and has none any more."""
     longer = tmp_path / "longer.h5"
     more = ["--set", "time.duration=0.56"]
-    assert main(["run", str(whole.parent / "scene.toml"), "-o", str(longer), *more, "--true-error", "3"]) == 0
+    assert (
+        main(
+            ["run", str(whole.parent / "scene.toml"), "-o", str(longer), *more, "--true-error", "3"]
+        )
+        == 0
+    )
     done = tmp_path / "done.h5"
     done.write_bytes(whole.read_bytes())
     for path in (stopped, done):
@@ -229,7 +277,9 @@ def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
     assert sorted(path.suffix for path in tmp_path.glob(".*")) == []  # nothing is left beside them
 
 
-def left_by_a_kill(monkeypatch: pytest.MonkeyPatch, step: int, path: Path, arguments: list[str]) -> None:
+def left_by_a_kill(
+    monkeypatch: pytest.MonkeyPatch, step: int, path: Path, arguments: list[str]
+) -> None:
     """The run's file as a kill after that step would leave it."""
     left: list[bytes] = []
     with monkeypatch.context() as patch:
@@ -239,14 +289,26 @@ def left_by_a_kill(monkeypatch: pytest.MonkeyPatch, step: int, path: Path, argum
 
 
 @pytest.mark.parametrize("killed", [11, 13, 25])
-def test_a_longer_run_after_a_stop_between_frames_and_a_kill(whole: Path, stopped: Path, tmp_path, monkeypatch, killed):
+def test_a_longer_run_after_a_stop_between_frames_and_a_kill(
+    whole: Path, stopped: Path, tmp_path, monkeypatch, killed
+):
     """The effort since the frame before the checkpoint counts, whatever frames came after it."""
     longer, more = tmp_path / "longer.h5", ["--set", "time.duration=0.56"]
-    left_by_a_kill(monkeypatch, killed, stopped, ["run", "--resume", str(stopped), "--checkpoint-every", "1000"])
+    left_by_a_kill(
+        monkeypatch,
+        killed,
+        stopped,
+        ["run", "--resume", str(stopped), "--checkpoint-every", "1000"],
+    )
     with h5py.File(stopped) as file:
         assert max(file["checkpoint/step"]) == 10 and finished(file) == 1 + killed // 3
     assert main(["run", "--resume", str(stopped), *more, "--force"]) == 0
-    assert main(["run", str(whole.parent / "scene.toml"), "-o", str(longer), *more, "--true-error", "3"]) == 0
+    assert (
+        main(
+            ["run", str(whole.parent / "scene.toml"), "-o", str(longer), *more, "--true-error", "3"]
+        )
+        == 0
+    )
     assert_same(stopped, longer)
 
 
@@ -260,14 +322,21 @@ def test_numbers_of_another_version_are_not_written_over(stopped: Path, capsys):
 def test_a_run_cannot_end_before_its_checkpoint(stopped: Path, capsys):
     before = stopped.read_bytes()
     for duration, steps in ((0.1, 10), (0.096, 10), (0.094, 9)):
-        status = main(["run", "--resume", str(stopped), "--set", f"time.duration={duration}", "--force"])
+        status = main(
+            ["run", "--resume", str(stopped), "--set", f"time.duration={duration}", "--force"]
+        )
         told = capsys.readouterr().err
         assert (status, "damaged" in told) == ((2, False) if steps == 10 else (0, False)), told
-        assert "has come to step 10 already: it cannot end at step 10" in told or "nothing left to do" in told
+        assert (
+            "has come to step 10 already: it cannot end at step 10" in told
+            or "nothing left to do" in told
+        )
         assert stopped.read_bytes() == before
 
 
-def test_another_start_takes_no_frame_of_before_the_first_checkpoint(whole: Path, tmp_path, monkeypatch):
+def test_another_start_takes_no_frame_of_before_the_first_checkpoint(
+    whole: Path, tmp_path, monkeypatch
+):
     """Killed between frame 0 and the first checkpoint."""
     path, other = tmp_path / "x.h5", ["--set", "start.velocity=[1.0, 0.0, 0.0]"]
     scene = str(whole.parent / "scene.toml")
@@ -286,14 +355,18 @@ def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path):
         scene = tomllib.loads(file.attrs["scene"])
         other = scene["mesh"]["source"] = str(tmp_path / "other.ply")
         file.attrs["scene"] = tomli_w.dumps(scene)
-    assert "the mesh has changed" in command_error("run", "--resume", stopped, "--set", f"mesh.source={other}")
+    assert "the mesh has changed" in command_error(
+        "run", "--resume", stopped, "--set", f"mesh.source={other}"
+    )
     with h5py.File(stopped) as file:
         assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
 
 
 @pytest.mark.parametrize(("step", "value"), [(9, 1e160), (10, 1e8)])
 @pytest.mark.parametrize("name", ["q", "q_previous"])
-def test_positions_that_no_frame_knows_are_refused(whole: Path, tmp_path, monkeypatch, name, step, value):
+def test_positions_that_no_frame_knows_are_refused(
+    whole: Path, tmp_path, monkeypatch, name, step, value
+):
     """After step 9, of which there is a frame, and step 10, of which there is none."""
     path = tmp_path / "x.h5"
     with monkeypatch.context() as patch:
@@ -307,7 +380,9 @@ def test_positions_that_no_frame_knows_are_refused(whole: Path, tmp_path, monkey
 
 
 @pytest.mark.parametrize("lies_there", ["mesh", "mesh and another scene"])
-def test_a_file_cannot_name_meshes_of_another_folder(whole: Path, stopped: Path, tmp_path, lies_there: str):
+def test_a_file_cannot_name_meshes_of_another_folder(
+    whole: Path, stopped: Path, tmp_path, lies_there: str
+):
     """What it says of its scene's folder is not believed: that scene must lie there, and name the mesh."""
     other = tmp_path / "other"
     other.mkdir()
@@ -323,8 +398,12 @@ def test_a_file_cannot_name_meshes_of_another_folder(whole: Path, stopped: Path,
     assert main(["run", str(whole.parent / "scene.toml"), "--resume", str(stopped)]) == 0
 
 
-@pytest.mark.parametrize("option", ["-pc_type python -pc_python_type os.system", "-options_file x", "-log_view :x.py"])
-def test_a_file_cannot_make_a_run_do_more_than_solve(stopped: Path, tmp_path, monkeypatch, option: str):
+@pytest.mark.parametrize(
+    "option", ["-pc_type python -pc_python_type os.system", "-options_file x", "-log_view :x.py"]
+)
+def test_a_file_cannot_make_a_run_do_more_than_solve(
+    stopped: Path, tmp_path, monkeypatch, option: str
+):
     """Options without effect on results are forgotten, all others that choose no solver are refused."""
     monkeypatch.chdir(tmp_path)
     with h5py.File(stopped, "r+") as file:
@@ -377,7 +456,9 @@ def take_and_free(path: Path, times: int, twice) -> None:
 def test_no_two_hold_a_lock(tmp_path):
     context = multiprocessing.get_context("fork")
     twice = context.Value("i", 0)
-    four = [context.Process(target=take_and_free, args=(tmp_path / "x", 2000, twice)) for _ in range(4)]
+    four = [
+        context.Process(target=take_and_free, args=(tmp_path / "x", 2000, twice)) for _ in range(4)
+    ]
     for process in four:
         process.start()
     for process in four:
@@ -385,7 +466,9 @@ def test_no_two_hold_a_lock(tmp_path):
     assert [process.exitcode for process in four] == [0] * 4 and twice.value == 0
 
 
-@pytest.mark.parametrize("given", [[], ["--resume", "none.h5"], ["--resume", "none.h5", "-o", "other.h5"]])
+@pytest.mark.parametrize(
+    "given", [[], ["--resume", "none.h5"], ["--resume", "none.h5", "-o", "other.h5"]]
+)
 def test_what_cannot_be_resumed_is_told(given, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert command_error("run", *given)

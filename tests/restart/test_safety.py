@@ -31,16 +31,27 @@ def of(frames: list[Frame], name: str) -> np.ndarray:
 def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
     """Implicit Euler only loses; explicit substeps and BDF2 swing about what is there by a few percent."""
     _, frames = play(beam(tmp_path, time=TIME | {"integrator": integrator}))
-    worked = of(frames, "potential")[0] - of(frames, "potential").min()  # [J] that the weight put in
+    worked = (
+        of(frames, "potential")[0] - of(frames, "potential").min()
+    )  # [J] that the weight put in
     assert worked > 0
-    assert of(frames, "energy_gained").sum() <= (1e-9 if integrator == "implicit-euler" else 0.2) * worked
+    assert (
+        of(frames, "energy_gained").sum()
+        <= (1e-9 if integrator == "implicit-euler" else 0.2) * worked
+    )
 
 
 @pytest.mark.parametrize("integrator, share", [("implicit-euler", 1e-6), ("bdf2", 0.01)])
 def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, share: float):
     """What anchors and moving obstacles put in is work: a plate of much friction that is pressed in and pulled away."""
     time = TIME | {"integrator": integrator, "step": STEP / 4 if integrator == "bdf2" else STEP}
-    floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.8}
+    floor = {
+        "shape": "plane",
+        "point": [0, 0, 0],
+        "normal": [0, 0, 1],
+        "response": "penalty",
+        "friction": 0.8,
+    }
     floor |= {"path": [{"time": 0.05, "by": [0, 0, 0.01]}, {"time": 0.1, "by": [0.4, 0, 0.01]}]}
     lead = {"region": CLAMPED[0]["region"], "path": [{"time": 0.1, "by": [0.1, 0, 0]}]}
     for more in ({"obstacle": [floor], "gravity": GRAVITY}, {"anchor": [lead]}):
@@ -64,7 +75,9 @@ class Overshooting:
         monkeypatch.setattr(Stepper, "step", overshooting)
 
 
-def test_a_run_that_gains_energy_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_that_gains_energy_without_end_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Forces that act three times as long as they should, at steps far beyond the explicit limit."""
     Overshooting(monkeypatch, 2.0)
     told = r"frame \d+ \(.* gained .* J from nowhere, of .* J that were there: worst at node \d+, at rest at \("
@@ -77,43 +90,71 @@ def test_a_run_that_gains_energy_without_end_is_stopped(tmp_path: Path, monkeypa
 def test_rescue_carries_such_a_run_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str):
     """The steps that gained too much are taken again, and the beam stays together."""
     Overshooting(monkeypatch, 2.0)
-    _, frames = play(beam(tmp_path, time={"step": STEP, "duration": 0.5}), f"safety.on_failure={way}")
+    _, frames = play(
+        beam(tmp_path, time={"step": STEP, "duration": 0.5}), f"safety.on_failure={way}"
+    )
     assert len(frames) == 31 and of(frames, f"{way}s").sum() > 0
     assert np.abs(frames[-1].position).max() < 1.5  # the beam is 1 m long
 
 
 def test_a_step_that_is_not_finite_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     step = Stepper.step
-    monkeypatch.setattr(Stepper, "step", lambda *given: replace(step(*given), position=step(*given).position * np.nan))
+    monkeypatch.setattr(
+        Stepper,
+        "step",
+        lambda *given: replace(step(*given), position=step(*given).position * np.nan),
+    )
     with pytest.raises(StepFailed, match="not finite"):
         play(beam(tmp_path))
 
 
-def test_inverted_cells_are_counted_and_told_with_their_place(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_inverted_cells_are_counted_and_told_with_their_place(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     """A mirrored block is at rest for its springs: all 32 cells stay inside out, and it says so once."""
     scene = block_scene(tmp_path, time=TIME, start={"scale": [-1.0, 1.0, 1.0]})
     _, frames = play(scene)
     assert of(frames, "inverted").tolist() == [32] * (STEPS + 1)
-    first, last = (record.getMessage() for record in caplog.records if "inside out" in record.getMessage())
-    assert first.startswith("frame 0 ") and "32 cells" in first and "neo-hookean" in first and "in 7 frames" in last
+    first, last = (
+        record.getMessage() for record in caplog.records if "inside out" in record.getMessage()
+    )
+    assert (
+        first.startswith("frame 0 ")
+        and "32 cells" in first
+        and "neo-hookean" in first
+        and "in 7 frames" in last
+    )
 
 
 def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """One corner of a block is led through its cell, to the far side of the opposite corner."""
     corner = {"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}
     corner["path"] = [{"time": STEP, "by": [1.2 * CELL] * 3}]
-    _, frames = play(block_scene(tmp_path, time=TIME, anchor=[corner], material={"young_modulus": 1e5, "density": 1e6}))
+    _, frames = play(
+        block_scene(
+            tmp_path, time=TIME, anchor=[corner], material={"young_modulus": 1e5, "density": 1e6}
+        )
+    )
     assert frames[0].inverted == 0 and frames[1].inverted == 1
     place = ", ".join(f"{CELL / 2:.4g}" for _ in range(3))
-    assert any(f"1 cell is inside out, the worst at rest at ({place}) m" in r.getMessage() for r in caplog.records)
+    assert any(
+        f"1 cell is inside out, the worst at rest at ({place}) m" in r.getMessage()
+        for r in caplog.records
+    )
 
 
-def test_a_budget_that_ends_far_off_is_told_once_and_summed_up(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_a_budget_that_ends_far_off_is_told_once_and_summed_up(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     scene = beam(tmp_path, material={"young_modulus": 1e8, "density": 1000.0})
     _, frames = play(scene, "solver={preset='fast-msm', max_iterations=1}")
     far = [frame.index for frame in frames if frame.step_error > 0.3]
-    first, last = (record.getMessage() for record in caplog.records if "off " in record.getMessage())
-    assert len(far) >= 2 and first.startswith(f"frame {far[0]} (") and f"in {len(far)} frames" in last
+    first, last = (
+        record.getMessage() for record in caplog.records if "off " in record.getMessage()
+    )
+    assert (
+        len(far) >= 2 and first.startswith(f"frame {far[0]} (") and f"in {len(far)} frames" in last
+    )
 
 
 def test_stop_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -123,16 +164,23 @@ def test_stop_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert (caught.value.kind, caught.value.frame) == ("line search", 3)
 
 
-def test_a_failed_step_is_halved_and_whole_steps_follow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_failed_step_is_halved_and_whole_steps_follow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Call 3 is step 3 as a whole, call 4 its first half, call 5 the first quarter: 2 quarters, 1 half; then step 4
     in quarters, step 5 in halves, and whole steps again."""
     failing = Failing(monkeypatch, {3, 4})
     _, frames = play(beam(tmp_path), "safety.on_failure=substep")
-    assert of(frames, "substeps").tolist() == [0, 0, 0, 3, 4, 2, 0] and not of(frames, "fallbacks").any()
+    assert (
+        of(frames, "substeps").tolist() == [0, 0, 0, 3, 4, 2, 0]
+        and not of(frames, "fallbacks").any()
+    )
     assert failing.count == 2 + 1 + 1 + 3 + 4 + 2 + 1
 
 
-def test_steps_in_halves_are_those_of_half_the_time_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_steps_in_halves_are_those_of_half_the_time_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """A rescued first step is two steps of t / 2 of another run, to the solver's error; and so is its velocity."""
     scene = beam(tmp_path)
     _, half = play(scene, f"time.step={STEP / 2}")
@@ -154,7 +202,9 @@ def test_the_robust_method_finds_the_same_step(tmp_path: Path, monkeypatch: pyte
     np.testing.assert_allclose(frames[-1].position, usual[-1].position, atol=1e-7 * moved)
 
 
-def test_what_no_halving_mends_stops_with_the_number_of_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_no_halving_mends_stops_with_the_number_of_pieces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     Failing(monkeypatch, set(range(2, 100)))
     with pytest.raises(StepFailed, match=r"frame 2 .*\(and failed in 1024 pieces\)"):
         play(beam(tmp_path), "safety.on_failure=substep")

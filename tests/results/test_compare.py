@@ -65,21 +65,42 @@ def test_the_first_frame_and_node_that_differ_are_named(a: Path, tmp_path: Path,
 @pytest.mark.parametrize(
     ("name", "value", "error"),
     [
-        ("kinetic", 3.008, 0.008 / 8),  # of the largest energy in the run, the elastic one's 2 * 4 J
+        (
+            "kinetic",
+            3.008,
+            0.008 / 8,
+        ),  # of the largest energy in the run, the elastic one's 2 * 4 J
         ("elastic", 6.0 + 8e-4, 1e-4),
         ("potential", -1.8, 0.1),
-        ("momentum", np.array([1, 0.03, 3]), 0.03 / np.sqrt(2 * 12 * 0.25 * 4)),  # m = 12 * 0.25 kg, K = 4 J
-        ("surface", POINTS + np.array([0.03, 0.004, 0]), 0.1),  # moved by 0.01 m a frame; frame 4 is the farthest
+        (
+            "momentum",
+            np.array([1, 0.03, 3]),
+            0.03 / np.sqrt(2 * 12 * 0.25 * 4),
+        ),  # m = 12 * 0.25 kg, K = 4 J
+        (
+            "surface",
+            POINTS + np.array([0.03, 0.004, 0]),
+            0.1,
+        ),  # moved by 0.01 m a frame; frame 4 is the farthest
     ],
 )
-def test_errors_are_relative_to_what_is_stated(a: Path, tmp_path: Path, name: str, value, error: float):
+def test_errors_are_relative_to_what_is_stated(
+    a: Path, tmp_path: Path, name: str, value, error: float
+):
     errors = error_of(a, changed(tmp_path, 3, **{name: value}), name)
     # the surface has six digits or so
     assert errors == pytest.approx([0, 0, 0, error, 0], rel=1e-4 if name == "surface" else 1e-9)
 
 
 def test_what_costs_are_measured_does_not_count(a: Path, tmp_path: Path, capsys):
-    assert told(capsys, a, changed(tmp_path, 3, wall_time=9.0, iterations=99, ksp_its=99, step_error=0.5))[0] == 0
+    assert (
+        told(
+            capsys,
+            a,
+            changed(tmp_path, 3, wall_time=9.0, iterations=99, ksp_its=99, step_error=0.5),
+        )[0]
+        == 0
+    )
 
 
 def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
@@ -87,7 +108,10 @@ def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
     assert told(capsys, nan, nan)[0] == 0
     status, out, _ = told(capsys, a, nan)
     assert status == 1 and "from frame 1 on" in out and " inf " in out
-    a, b = np.array([np.nan, np.nan, np.inf, np.inf, 1]), np.array([np.nan, 1, np.inf, -np.inf, np.inf])
+    a, b = (
+        np.array([np.nan, np.nan, np.inf, np.inf, 1]),
+        np.array([np.nan, 1, np.inf, -np.inf, np.inf]),
+    )
     assert difference(a, b, 0.0).tolist() == [0, np.inf, 0, np.inf, np.inf]
 
 
@@ -97,16 +121,25 @@ def test_rounding_is_no_difference(tmp_path: Path):
 
     def written(sign: int, **other) -> Path:
         places = dict(position=NODES * (1 + sign * 1e-15), surface=POINTS * (1 + sign * 1e-15))
-        return small_result.write(tmp_path / f"{sign}.h5", [frame(i, **places | still | other) for i in (0, 1)])
+        return small_result.write(
+            tmp_path / f"{sign}.h5", [frame(i, **places | still | other) for i in (0, 1)]
+        )
 
-    with Result(written(1, elastic=2e-30, momentum=np.full(3, 1e-20))) as a, Result(written(-1)) as b:
+    with (
+        Result(written(1, elastic=2e-30, momentum=np.full(3, 1e-20))) as a,
+        Result(written(-1)) as b,
+    ):
         assert all(field.first_above(1e-6) is None for field in compare(a, b).fields)
 
 
 def test_other_times_are_compared_where_shared_and_count(a: Path, tmp_path: Path, capsys):
     b = small_result.write(tmp_path / "b.h5", [frame(index) for index in (0, 2, 4)])
     status, out, _ = told(capsys, a, b)
-    assert status == 1 and "5 and 3 frames, of which 3 have the same time" in out and "they agree" in out
+    assert (
+        status == 1
+        and "5 and 3 frames, of which 3 have the same time" in out
+        and "they agree" in out
+    )
     late = small_result.write(tmp_path / "c.h5", [frame(0, time=0.5)])
     status, _, said = told(capsys, a, late)
     assert status == 2 and "no finished frame of the same time" in said
@@ -119,7 +152,9 @@ def test_frames_are_numbered_as_in_the_first_file(a: Path, tmp_path: Path, capsy
 
 
 def test_fields_that_one_alone_has_are_told(a: Path, tmp_path: Path, capsys):
-    b = small_result.write(tmp_path / "b.h5", [frame(i, surface=None) for i in range(FRAMES)], surface=False)
+    b = small_result.write(
+        tmp_path / "b.h5", [frame(i, surface=None) for i in range(FRAMES)], surface=False
+    )
     status, out, _ = told(capsys, b, a)
     assert status == 0 and f"surface is in {a} only: not compared" in out
 
@@ -133,7 +168,9 @@ def test_fields_that_one_alone_has_are_told(a: Path, tmp_path: Path, capsys):
         (dict(cells=np.full((2, 8), 99)), "lattice/cells names what is not among its 12 nodes"),
     ],
 )
-def test_other_lattices_are_refused_with_the_reason(a: Path, tmp_path: Path, lattice: dict, reason: str):
+def test_other_lattices_are_refused_with_the_reason(
+    a: Path, tmp_path: Path, lattice: dict, reason: str
+):
     n = len(lattice.get("nodes", NODES))
     frames = [frame(i, position=np.zeros((n, 3)), surface=None) for i in range(2)]
     b = small_result.write(tmp_path / "b.h5", frames, surface=False, **lattice)
@@ -148,12 +185,17 @@ def other_lattice(path: Path, by: float = 0.0, points: np.ndarray = POINTS) -> P
     return small_result.write(path, frames, points=points, nodes=2 * NODES)
 
 
-def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(a: Path, tmp_path: Path, capsys):
+def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(
+    a: Path, tmp_path: Path, capsys
+):
     b = other_lattice(tmp_path / "b.h5", by=0.02)
     status, out, _ = told(capsys, a, b)
     largest = np.hypot(0.04, 0.02)  # of a displacement in b
     assert status == 1 and "their surfaces alone are compared" in out
-    assert "from frame 2 on, t = 0.02 s: surface, surface, rms" in out and "surface point 3, at rest" in out
+    assert (
+        "from frame 2 on, t = 0.02 s: surface, surface, rms" in out
+        and "surface point 3, at rest" in out
+    )
     with Result(a) as one, Result(b) as other:
         _, mean = compare_surfaces(one, other).fields
         assert mean.scale == pytest.approx(largest, rel=1e-6)
@@ -168,7 +210,9 @@ def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(a: Pa
 def test_points_count_by_the_area_around_them(a: Path):
     with Result(a) as run:
         p, areas = POINTS, point_areas(run)
-    first, second = (np.linalg.norm(np.cross(p[b] - p[a], p[c] - p[a])) / 6 for a, b, c in ((0, 1, 2), (1, 2, 3)))
+    first, second = (
+        np.linalg.norm(np.cross(p[b] - p[a], p[c] - p[a])) / 6 for a, b, c in ((0, 1, 2), (1, 2, 3))
+    )
     assert areas == pytest.approx([first, first + second, first + second, second])
 
 
@@ -180,6 +224,8 @@ def test_other_meshes_are_refused_in_one_line(a: Path, tmp_path: Path):
         surface_error(a, still)
 
 
-@pytest.mark.parametrize("options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--field"]])
+@pytest.mark.parametrize(
+    "options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--field"]]
+)
 def test_odd_options_are_refused(a: Path, options: list[str]):
     assert command_error("compare", a, a, *options)

@@ -28,7 +28,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 4 MB of its own."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "none", folder], capture_output=True, text=True)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=4m", "none", folder], capture_output=True, text=True
+    )
     if mounted.returncode:
         pytest.skip(f"no file system can be mounted here: {mounted.stderr.strip()}")
     yield folder
@@ -48,7 +50,9 @@ def test_a_disk_that_fills_up(whole: Path, small_disk: Path, monkeypatch):
 
     with monkeypatch.context() as patch:
         at_step(patch, BEFORE, fill)
-        text = command_error("run", whole.parent / "scene.toml", "-o", path, "--checkpoint-every", "1")
+        text = command_error(
+            "run", whole.parent / "scene.toml", "-o", path, "--checkpoint-every", "1"
+        )
         assert f"{path} cannot be written" in text and "No space left" in text
     with h5py.File(path) as file:
         assert finished(file) == 1 + BEFORE and max(file["checkpoint/step"]) == BEFORE

@@ -31,13 +31,43 @@ def compared(one: Path, other: Path) -> None:
     compare.run(argparse.Namespace(first=one, second=other, rtol=1e-6, json=False))
 
 
-NAMES = ["lattice/nodes", "lattice/cells", "lattice/springs", "lattice/mass", "surface/points", "surface/triangles"]
-NAMES += ["embedding/indptr", "embedding/indices", "embedding/weights", "frames/time", "frames/position"]
-NAMES += ["frames/kinetic", "frames/iterations", "checkpoint/step", "checkpoint/q", "checkpoint/q_previous"]
+NAMES = [
+    "lattice/nodes",
+    "lattice/cells",
+    "lattice/springs",
+    "lattice/mass",
+    "surface/points",
+    "surface/triangles",
+]
+NAMES += [
+    "embedding/indptr",
+    "embedding/indices",
+    "embedding/weights",
+    "frames/time",
+    "frames/position",
+]
+NAMES += [
+    "frames/kinetic",
+    "frames/iterations",
+    "checkpoint/step",
+    "checkpoint/q",
+    "checkpoint/q_previous",
+]
 NAMES += ["frames/new\nline"]
 SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 5, 12, 10**12]), max_size=4).map(tuple)
 TYPES = st.sampled_from(
-    ["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string_dtype(), h5py.vlen_dtype("f8"), h5py.ref_dtype]
+    [
+        "f8",
+        "f4",
+        ">f8",
+        "i8",
+        "u1",
+        "S3",
+        "c16",
+        h5py.string_dtype(),
+        h5py.vlen_dtype("f8"),
+        h5py.ref_dtype,
+    ]
 )
 VALUES = st.sampled_from([np.nan, np.inf, -1, 0, 12, 1e308, 2**62])
 
@@ -45,7 +75,9 @@ VALUES = st.sampled_from([np.nan, np.inf, -1, 0, 12, 1e308, 2**62])
 @settings(TRIALS, max_examples=25)
 @given(
     edits=st.lists(
-        st.tuples(st.sampled_from(NAMES), SHAPES, TYPES, VALUES, st.booleans(), st.booleans()), min_size=1, max_size=2
+        st.tuples(st.sampled_from(NAMES), SHAPES, TYPES, VALUES, st.booleans(), st.booleans()),
+        min_size=1,
+        max_size=2,
     )
 )
 def test_other_contents_are_read_or_refused(bar_result, tmp_path, capfd, edits):
@@ -62,9 +94,17 @@ def test_other_contents_are_read_or_refused(bar_result, tmp_path, capfd, edits):
             file.pop(name, None)
             packed = packed and all(shape) and shape
             file.create_dataset(
-                name, shape, kind, chunks=(1,) * len(shape) if packed else None, compression="gzip" if packed else None
+                name,
+                shape,
+                kind,
+                chunks=(1,) * len(shape) if packed else None,
+                compression="gzip" if packed else None,
             )
-    for call in (lambda: read_all(path), lambda: compared(bar_result, path), lambda: Earlier.read(path)):
+    for call in (
+        lambda: read_all(path),
+        lambda: compared(bar_result, path),
+        lambda: Earlier.read(path),
+    ):
         refusal(call)
 
 
@@ -76,7 +116,9 @@ def replaced(file: h5py.File, name: str, by) -> None:
 def external(file: h5py.File, name: str, folder: Path) -> None:
     shape = file[name].shape
     del file[name]
-    file.create_dataset(name, shape, "f8", external=[(str(folder / "secret.bin"), 0, h5py.h5f.UNLIMITED)])
+    file.create_dataset(
+        name, shape, "f8", external=[(str(folder / "secret.bin"), 0, h5py.h5f.UNLIMITED)]
+    )
 
 
 def virtual(file: h5py.File, name: str, folder: Path) -> None:

@@ -26,11 +26,17 @@ def copy(bar_result: Path, tmp_path: Path) -> Path:
 def test_what_was_written_is_read(bar_result: Path):
     with msmpetsc.open(bar_result) as run:
         assert run.frames.time[:] == pytest.approx(DT * np.arange(FRAMES))
-        assert np.array_equal(run.frames.position[-1], position(FRAMES - 1)) and run.frames.position.unit == "m"
+        assert (
+            np.array_equal(run.frames.position[-1], position(FRAMES - 1))
+            and run.frames.position.unit == "m"
+        )
         assert np.array_equal(run.lattice["nodes"], NODES) and run.lattice.cells.shape == (2, 8)
         assert run.scene["material"]["density"] == 1000 and run.attributes["ranks"] == 1
         assert run.surface.triangles[1, 2] == 3
-        assert np.allclose(run.embedding @ np.ones(len(NODES)), 1) and run.embedding.shape == (len(POINTS), len(NODES))
+        assert np.allclose(run.embedding @ np.ones(len(NODES)), 1) and run.embedding.shape == (
+            len(POINTS),
+            len(NODES),
+        )
         assert "5 frames of 12 nodes" in repr(run) and "elastic" in dir(run.frames)
         assert len(run.frames) == FRAMES and {"time", "position"} < set(run.frames)
     with pytest.raises(InputError, match="is closed"):
@@ -54,7 +60,18 @@ def test_lazy_arrays_are_indexed_as_numpys(bar_result: Path, key):
 
 
 @pytest.mark.parametrize(
-    "key", [5, -6, (0, 12), (0, 0, 0, 0), None, ([0, 1], [0, 1]), (..., 0, ...), slice(None, None, -1), [4, 0]]
+    "key",
+    [
+        5,
+        -6,
+        (0, 12),
+        (0, 0, 0, 0),
+        None,
+        ([0, 1], [0, 1]),
+        (..., 0, ...),
+        slice(None, None, -1),
+        [4, 0],
+    ],
 )
 def test_what_is_not_there_is_an_index_error(bar_result: Path, key):
     with msmpetsc.open(bar_result) as run, pytest.raises(IndexError):
@@ -72,7 +89,10 @@ def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
         with msmpetsc.open(tmp_path / "x.h5") as run:
             file.append(frame(3))
             assert len(run.frames) == len(run.frames.time) == len(list(run.frames.position)) == 3
-            assert np.array_equal(run.frames.position[-1], position(2)) and np.isfinite(run.frames.time).all()
+            assert (
+                np.array_equal(run.frames.position[-1], position(2))
+                and np.isfinite(run.frames.time).all()
+            )
 
 
 DIMENSIONS = {
@@ -87,10 +107,15 @@ DIMENSIONS = {
 
 def test_axes_of_frames_have_names_and_coordinates(tmp_path: Path):
     stress = {"stress": np.ones((len(NODES), 6)), "cell_von_mises": np.ones(2)}
-    with h5py.File(small_result.write(tmp_path / "x.h5", [frame(k, **stress) for k in range(3)])) as file:
+    with h5py.File(
+        small_result.write(tmp_path / "x.h5", [frame(k, **stress) for k in range(3)])
+    ) as file:
         frames = file["frames"]
         for name, dimensions in DIMENSIONS.items():
-            assert tuple(axis[0].name.removeprefix("/frames/") for axis in frames[name].dims) == dimensions
+            assert (
+                tuple(axis[0].name.removeprefix("/frames/") for axis in frames[name].dims)
+                == dimensions
+            )
         assert frames["axis"].asstr()[:].tolist() == ["x", "y", "z"]
         assert frames["component"].asstr()[:].tolist() == ["xx", "yy", "zz", "xy", "yz", "xz"]
         assert frames["node"].id.get_storage_size() == 0
@@ -108,8 +133,14 @@ def test_a_result_opens_beside_another_reader_of_the_process(bar_result: Path, o
 def test_xarray_has_names_coordinates_and_units(bar_result: Path, engine: str):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
-    with msmpetsc.open(bar_result) as run, xarray.open_dataset(bar_result, group="frames", engine=engine) as frames:
-        assert frames.position.dims == DIMENSIONS["position"] and set(frames.coords) == {"time", "axis"}
+    with (
+        msmpetsc.open(bar_result) as run,
+        xarray.open_dataset(bar_result, group="frames", engine=engine) as frames,
+    ):
+        assert frames.position.dims == DIMENSIONS["position"] and set(frames.coords) == {
+            "time",
+            "axis",
+        }
         height = frames.position.sel(axis="z").sel(time=2 * DT, method="nearest")
         assert np.array_equal(height, run.frames.position[2][:, 2])
         assert frames.kinetic.attrs["units"] == "J" and frames.time.attrs["units"] == "s"
@@ -117,7 +148,10 @@ def test_xarray_has_names_coordinates_and_units(bar_result: Path, engine: str):
 
 def test_the_embedding_names_the_extra_that_it_needs(bar_result: Path, monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.sparse", None)
-    with msmpetsc.open(bar_result) as run, pytest.raises(InputError, match=r"scipy .* 'msmpetsc\[render\]' brings it"):
+    with (
+        msmpetsc.open(bar_result) as run,
+        pytest.raises(InputError, match=r"scipy .* 'msmpetsc\[render\]' brings it"),
+    ):
         _ = run.embedding
 
 
@@ -129,9 +163,15 @@ def test_a_file_of_an_older_version_is_read_without_what_it_lacks(copy: Path):
         for name in ("lattice/pinned", "embedding", "surface", "checkpoint"):
             del file[name]
     with msmpetsc.open(copy) as run:
-        assert "contact" not in run.frames and "points" not in run.surface and run.frames.kinetic.unit == "J"
+        assert (
+            "contact" not in run.frames
+            and "points" not in run.surface
+            and run.frames.kinetic.unit == "J"
+        )
         assert run.embedding is None
-        with pytest.raises(AttributeError, match="no frames/contact in this file, but time, position"):
+        with pytest.raises(
+            AttributeError, match="no frames/contact in this file, but time, position"
+        ):
             _ = run.frames.contact
 
 
@@ -163,7 +203,9 @@ def replaced(name: str, rows=None, **options) -> Callable[[Path], None]:
 
 
 def attribute(name: str, value) -> Callable[[Path], None]:
-    return damage(lambda file: file.attrs.pop(name) if value is None else file.attrs.__setitem__(name, value))
+    return damage(
+        lambda file: file.attrs.pop(name) if value is None else file.attrs.__setitem__(name, value)
+    )
 
 
 def cut(part: float) -> Callable[[Path], None]:
@@ -224,10 +266,16 @@ def springs_out_of_range(file: h5py.File) -> None:
         (damage(indices_out_of_range), "embedding", "embedding is no matrix"),
         (replaced("embedding/weights"), "embedding", "it has no embedding/weights"),
         (replaced("embedding/indptr", np.array([0, 32])), "embedding", "has 1 rows for 4 points"),
-        (damage(springs_out_of_range), "springs", "lattice/springs names what is not among its 12 nodes"),
+        (
+            damage(springs_out_of_range),
+            "springs",
+            "lattice/springs names what is not among its 12 nodes",
+        ),
     ],
 )
-def test_what_is_wrong_in_a_part_is_told_when_it_is_asked_for(copy: Path, spoil, ask: str, words: str):
+def test_what_is_wrong_in_a_part_is_told_when_it_is_asked_for(
+    copy: Path, spoil, ask: str, words: str
+):
     spoil(copy)
     with msmpetsc.open(copy) as run, pytest.raises(InputError, match=words):
         _ = run.indices("lattice/springs") if ask == "springs" else getattr(run, ask)

@@ -37,8 +37,15 @@ def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
 def assert_holds(file: h5py.File, count: int, surface: str | None = "f8") -> None:
     """The first `count` frames are those of frames_worker, bit for bit."""
     expected = [frame(index) for index in range(count)]
-    fields = {name: FRAME_FIELDS[name].dtype for name in FRAME_FIELDS.keys() & file["frames"] if name != "surface"}
-    assert {"position", *(name for name, field in FRAME_FIELDS.items() if field.shape == ("T",))} <= set(fields)
+    fields = {
+        name: FRAME_FIELDS[name].dtype
+        for name in FRAME_FIELDS.keys() & file["frames"]
+        if name != "surface"
+    }
+    assert {
+        "position",
+        *(name for name, field in FRAME_FIELDS.items() if field.shape == ("T",)),
+    } <= set(fields)
     if surface is not None:
         fields["surface"] = surface
     for name, kind in fields.items():
@@ -51,7 +58,9 @@ def newest_checkpoint(file: h5py.File) -> tuple[int, np.ndarray, np.ndarray] | N
     """Step, q and q_previous, of a file that need not have a path."""
     group = file["checkpoint"]
     slot = newest_slot(group["step"][:])
-    return None if slot is None else (group["step"][slot], group["q"][slot], group["q_previous"][slot])
+    return (
+        None if slot is None else (group["step"][slot], group["q"][slot], group["q_previous"][slot])
+    )
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
@@ -61,18 +70,36 @@ def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
     with h5py.File(tmp_path / "out" / "x.h5") as file:
         assert finished(file) == STEPS + 1
         assert_holds(file, STEPS + 1)
-        assert {**file.attrs} == {"format": "msmpetsc", "format_version": 1, "scene": "title = 'a test'", "ranks": 3}
-        assert file["frames/position"].shape == (STEPS + 1, NODES, 3) and file["frames/position"].dtype == "f8"
-        assert file["frames/surface"].shape == (STEPS + 1, POINTS, 3) and file["frames/surface"].dtype == "f8"
+        assert {**file.attrs} == {
+            "format": "msmpetsc",
+            "format_version": 1,
+            "scene": "title = 'a test'",
+            "ranks": 3,
+        }
+        assert (
+            file["frames/position"].shape == (STEPS + 1, NODES, 3)
+            and file["frames/position"].dtype == "f8"
+        )
+        assert (
+            file["frames/surface"].shape == (STEPS + 1, POINTS, 3)
+            and file["frames/surface"].dtype == "f8"
+        )
         assert np.array_equal(file["lattice/nodes"], positions(0, NODES))
         assert np.array_equal(file["lattice/springs"], np.arange(2 * NODES).reshape(-1, 2))
         assert file["lattice/pinned"].shape == (0,)
-        units = {name: file["frames"][name].attrs["units"] for name in FRAME_FIELDS.keys() & file["frames"]}
-        assert units["momentum"] == "kg m/s" and units["elastic"] == "J" and units["position"] == "m"
+        units = {
+            name: file["frames"][name].attrs["units"]
+            for name in FRAME_FIELDS.keys() & file["frames"]
+        }
+        assert (
+            units["momentum"] == "kg m/s" and units["elastic"] == "J" and units["position"] == "m"
+        )
         assert file["lattice/nodes"].attrs["units"] == "m"
         step, q, q_previous = newest_checkpoint(file)
         assert step == STEPS
-        assert np.array_equal(q, positions(STEPS, NODES)) and np.array_equal(q_previous, positions(STEPS - 1, NODES))
+        assert np.array_equal(q, positions(STEPS, NODES)) and np.array_equal(
+            q_previous, positions(STEPS - 1, NODES)
+        )
 
 
 def test_who_writes_does_not_show_in_the_file(tmp_path):
@@ -97,7 +124,9 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
         file.append(frame(index))
         marks[len(disk.log)] = index + 1, index - 1
         file.write_checkpoint(
-            Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+            Checkpoint(
+                index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}
+            )
         )
     marks[len(disk.log)] = 12, 11
     file.close()
@@ -136,7 +165,9 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
     file.close(trim=False)
     with h5py.File(io.BytesIO(before)) as laid:
         numbers = sorted(places(laid))
-    assert {change for change in disk.log if isinstance(change, int)} <= {len(before)}  # not cut, not stretched
+    assert {change for change in disk.log if isinstance(change, int)} <= {
+        len(before)
+    }  # not cut, not stretched
     for offset, data in [change for change in disk.log if not isinstance(change, int)]:
         changed = [at for at, byte in enumerate(data, offset) if byte != before[at]]
         inside = [any(start <= at < end for start, end in numbers) for at in changed]
@@ -145,11 +176,15 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
         with h5py.File(io.BytesIO(image), "r") as killed:
             assert_holds(killed, finished(killed))
             step, q, _ = newest_checkpoint(killed)
-            assert step in (finished(killed) - 1, finished(killed) - 2) and np.array_equal(q, positions(step, NODES))
+            assert step in (finished(killed) - 1, finished(killed) - 2) and np.array_equal(
+                q, positions(step, NODES)
+            )
 
 
 def saved(index: int) -> Checkpoint:
-    return Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+    return Checkpoint(
+        index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}
+    )
 
 
 def places(file: h5py.File) -> Iterator[tuple[int, int]]:
@@ -243,16 +278,25 @@ def test_replaced_only_when_told_and_only_by_a_new_one(tmp_path):
 def test_refused_on_all_ranks_together(tmp_path):
     path = tmp_path / "x.h5"
     write_serial(path, 1)
-    assert run_on_ranks(2, "refuse", path) == f"refused: {path} exists: --overwrite replaces it\n" * 2
-    assert run_on_ranks(2, "refuse", path / "y.h5").count("cannot be written: ") == 2  # a folder that is a file
+    assert (
+        run_on_ranks(2, "refuse", path) == f"refused: {path} exists: --overwrite replaces it\n" * 2
+    )
+    assert (
+        run_on_ranks(2, "refuse", path / "y.h5").count("cannot be written: ") == 2
+    )  # a folder that is a file
 
 
 @pytest.mark.parametrize("action", ["full", "full for one"])
 def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path, action):
     path = tmp_path / "x.h5"
-    assert run_on_ranks(3, action, path) == f"refused: {path} cannot be written: No space left on device\n" * 3
+    assert (
+        run_on_ranks(3, action, path)
+        == f"refused: {path} cannot be written: No space left on device\n" * 3
+    )
     with open_result(path) as file:
-        assert finished(file) == 2 and len(file["frames/position"]) == STEPS + 1  # left as it was: room to go on
+        assert (
+            finished(file) == 2 and len(file["frames/position"]) == STEPS + 1
+        )  # left as it was: room to go on
         assert_holds(file, 2, None)
 
 

@@ -69,7 +69,9 @@ def page(result: Path, path: Path) -> None:
 
 def chart(path: Path) -> None:
     made = Chart(path.stem, "sizes", "a title", "", curve_styles(["a", "b"]))
-    made.panel("", log_axis("x", [1, 10], COUNT), log_axis("y", [1, 10], COUNT)).stair([1, 10], [1, 10])
+    made.panel("", log_axis("x", [1, 10], COUNT), log_axis("y", [1, 10], COUNT)).stair(
+        [1, 10], [1, 10]
+    )
     save_png(made, path.parent)
 
 
@@ -90,7 +92,10 @@ def writers(sources: Path) -> dict[str, Writer]:
             lambda path: write_xdmf(path.with_suffix(".h5")),
             lambda path: small_result.write(path.with_suffix(".h5")),
         ),
-        "x.toml": Writer("cli/commands/new.py", lambda path: new.run(parsed(["new", str(path), "--from", "pile"]))),
+        "x.toml": Writer(
+            "cli/commands/new.py",
+            lambda path: new.run(parsed(["new", str(path), "--from", "pile"])),
+        ),
         "x.baseline.json": Writer("cli/commands/check.py", lambda path: check.write(path, NUMBERS)),
         "planned.toml": Writer(
             "study/sizing/choice.py",
@@ -104,12 +109,16 @@ def writers(sources: Path) -> dict[str, Writer]:
             ask_for_no_cases,
         ),
         "report.html": Writer(
-            "study/report.py", lambda path: write_report(path.parent), lambda path: write_table(path.parent, [])
+            "study/report.py",
+            lambda path: write_report(path.parent),
+            lambda path: write_table(path.parent, []),
         ),
         "chart.png": Writer("study/charts/plot.py", chart),
     }
     table |= {f"y{end}": Writer("export/formats.py", partial(export, bar)) for end in FORMATS}
-    table |= {f"z{end}": Writer("view/sheet.py", partial(contact_sheet, ball)) for end in PICTURE_NAMES}
+    table |= {
+        f"z{end}": Writer("view/sheet.py", partial(contact_sheet, ball)) for end in PICTURE_NAMES
+    }
     table |= {f"z{end}": Writer("view/film.py", film) for end in MOVIE_NAMES}
     return table | {f"z{end}": Writer("view/page.py", partial(page, ball)) for end in PAGE_NAMES}
 
@@ -168,10 +177,16 @@ def test_an_older_file_stays_where_a_new_one_fails(sources: Path, tmp_path: Path
     assert contents(tmp_path) == {"x.obj": b"old"}
     (tmp_path / "link.obj").symlink_to(path)
     export(sources / "bar.h5", tmp_path / "link.obj")
-    assert (tmp_path / "link.obj").is_symlink() and path.stat().st_size > 3 and path.stat().st_mode & 0o777 == 0o640
+    assert (
+        (tmp_path / "link.obj").is_symlink()
+        and path.stat().st_size > 3
+        and path.stat().st_mode & 0o777 == 0o640
+    )
 
 
-BY_HAND = re.compile(r"\.write_text\(|\.write_bytes\(|os\.replace\(|\.savefig\(|open\([^)\n]*\"[wax]|File\([^)\n]*\"w")
+BY_HAND = re.compile(
+    r"\.write_text\(|\.write_bytes\(|os\.replace\(|\.savefig\(|open\([^)\n]*\"[wax]|File\([^)\n]*\"w"
+)
 ALLOWED = {
     "results/disk.py": "the one way",
     "results/writer.py": "a result, which grows",
@@ -188,6 +203,10 @@ ALLOWED = {
 def test_nothing_is_written_by_hand():
     texts = {str(path.relative_to(PACKAGE)): path.read_text() for path in PACKAGE.rglob("*.py")}
     assert {name for name, text in texts.items() if BY_HAND.search(text)} == ALLOWED.keys()
-    users = {name for name, text in texts.items() if re.search(r"import .*\b(whole_file|write_whole)\b", text)}
+    users = {
+        name
+        for name, text in texts.items()
+        if re.search(r"import .*\b(whole_file|write_whole)\b", text)
+    }
     tried = {writer.module for writer in writers(Path()).values()}
     assert users | {"results/writer.py"} == tried | NOT_TRIED

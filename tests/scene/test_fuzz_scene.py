@@ -46,7 +46,15 @@ def naming(folder: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    "name", ["../out.ply", "link.ply", "loop.ply", "loop.ply/in.ply", "below/../../out.ply", "/etc/hostname"]
+    "name",
+    [
+        "../out.ply",
+        "link.ply",
+        "loop.ply",
+        "loop.ply/in.ply",
+        "below/../../out.ply",
+        "/etc/hostname",
+    ],
 )
 def test_a_scene_names_no_file_outside_its_folder(folder, name):
     path = naming(folder, name)
@@ -68,7 +76,8 @@ def test_painted_points_come_from_the_folder_too(folder):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("mesh.source", '"a\\nb.ply"'), ("mesh.source", '"\\u001b[31m"'), ("title", "\udcff")]
+    ("key", "value"),
+    [("mesh.source", '"a\\nb.ply"'), ("mesh.source", '"\\u001b[31m"'), ("title", "\udcff")],
 )
 def test_names_are_printable_text(folder, key, value):
     assert refusal(lambda: load_scene(folder / "scene.toml", [f"{key}={value}"]))
@@ -100,7 +109,9 @@ def test_a_study_chooses_solvers_and_no_more(folder, options):
 
 
 def test_a_study_names_no_mesh_outside(folder):
-    (folder / "study.toml").write_text(STUDY.format("mesh.source=../out.ply", "-pc_type jacobi -ksp_rtol 1e-2"))
+    (folder / "study.toml").write_text(
+        STUDY.format("mesh.source=../out.ply", "-pc_type jacobi -ksp_rtol 1e-2")
+    )
     with pytest.raises(InputError, match=r"mesh\.source"):
         study_cases(load_study(folder / "study.toml"), folder, False)
 
@@ -128,7 +139,9 @@ def test_a_key_of_many_parts_takes_no_time(tmp_path, name):
         begun = time.process_time()
         assert refusal(lambda load=load: load(path)) == f"{path}: is nested too deeply"
         assert time.process_time() - begun < 1
-    assert "is nested too deeply" in refusal(lambda: load_scene(block_scene(tmp_path), ["a" + ".a" * 20_000 + "=1"]))
+    assert "is nested too deeply" in refusal(
+        lambda: load_scene(block_scene(tmp_path), ["a" + ".a" * 20_000 + "=1"])
+    )
 
 
 def test_many_mistakes_take_no_time(tmp_path):

@@ -106,7 +106,9 @@ def test_defaults(tmp_path):
 def test_line_ends_and_byte_order_mark_of_windows_editors(tmp_path):
     text = "\ufeff" + EXAMPLE.replace("\n", "\r\n")
     assert load(tmp_path, text).cages.count == 9946
-    assert problems(tmp_path, text.replace("9946", "0")) == ["scene.toml: cages.count: must be > 0, got 0 (line 9)"]
+    assert problems(tmp_path, text.replace("9946", "0")) == [
+        "scene.toml: cages.count: must be > 0, got 0 (line 9)"
+    ]
 
 
 @given(st.tuples(*3 * [st.floats(allow_nan=False, allow_infinity=False)]).filter(any))
@@ -145,7 +147,12 @@ MISTAKES = [  # what is changed, into what, the key that is named, and its line
     ('"affine"', '"cages"\nsmoothing = 1.5', "cages.smoothing", 11),
     ("young_modulus = 5e4", "young_modulus = 5e4\nstiffness = 1", "material", 12),
     ("density = 1000", "", "material.density", 12),
-    ("density = 1000", 'density = 1000\nlaw = "linear"\npoisson_ratio = 0.3', "material.poisson_ratio", 16),
+    (
+        "density = 1000",
+        'density = 1000\nlaw = "linear"\npoisson_ratio = 0.3',
+        "material.poisson_ratio",
+        16,
+    ),
     ("[material]", "[materail]", "materail", 12),
     ("step = 0.0166667", 'step = "1e-3"', "time.step", 17),
     ("duration = 2.0", "duration = 0.001", "time.duration", 18),
@@ -166,7 +173,12 @@ MISTAKES = [  # what is changed, into what, the key that is named, and its line
         "obstacle.0.path",
         28,
     ),
-    ("[solver]", "[[anchor]]\nregion = { painted = 'a.txt' }\npath = []\n[solver]", "anchor.0.path", 42),
+    (
+        "[solver]",
+        "[[anchor]]\nregion = { painted = 'a.txt' }\npath = []\n[solver]",
+        "anchor.0.path",
+        42,
+    ),
     ('"anderson"', '""', "solver.preset", 41),
     ('"orient"', '"simplify"', "mesh.prepare.1", 5),
     ('"orient"', "{}", "mesh.prepare.1", 5),
@@ -174,7 +186,9 @@ MISTAKES = [  # what is changed, into what, the key that is named, and its line
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "key", "line"), MISTAKES, ids=[m[2] + m[1] for m in MISTAKES])
+@pytest.mark.parametrize(
+    ("old", "new", "key", "line"), MISTAKES, ids=[m[2] + m[1] for m in MISTAKES]
+)
 def test_a_mistake_is_named(tmp_path, old, new, key, line):
     (text,) = problems(tmp_path, changed(old, new))
     assert text.startswith(f"scene.toml: {key}: ") and text.endswith(f" (line {line})"), text
@@ -183,11 +197,18 @@ def test_a_mistake_is_named(tmp_path, old, new, key, line):
 def test_a_stiffness_without_a_law_is_refused_with_the_remedy(tmp_path):
     (text,) = problems(tmp_path, changed("young_modulus = 5e4", "stiffness = 1"))
     assert 'give law = "linear"' in text
-    assert load(tmp_path, changed("young_modulus = 5e4", 'law = "linear"\nstiffness = 1')).material.poisson is None
+    assert (
+        load(
+            tmp_path, changed("young_modulus = 5e4", 'law = "linear"\nstiffness = 1')
+        ).material.poisson
+        is None
+    )
 
 
 def test_all_problems_at_once_each_with_its_line(tmp_path):
-    text = SMALLEST.replace("100\n", "0\ncages.cell_size = -1\n").replace("time.step = 0.01", "time.setp = 0.01")
+    text = SMALLEST.replace("100\n", "0\ncages.cell_size = -1\n").replace(
+        "time.step = 0.01", "time.setp = 0.01"
+    )
     assert problems(tmp_path, text + "colour = 'red'\n") == [
         "scene.toml: cages: must give exactly one of count, cell_size; has count and cell_size (line 2)",
         "scene.toml: cages.count: must be > 0, got 0 (line 2)",
@@ -199,20 +220,31 @@ def test_all_problems_at_once_each_with_its_line(tmp_path):
 
 
 def test_empty_file_names_every_required_table(tmp_path):
-    missing = [f"scene.toml: {name}: required, but missing" for name in ("cages", "material", "time")]
-    assert problems(tmp_path, "") == ["scene.toml: must give exactly one of mesh, body; has none", *missing]
+    missing = [
+        f"scene.toml: {name}: required, but missing" for name in ("cages", "material", "time")
+    ]
+    assert problems(tmp_path, "") == [
+        "scene.toml: must give exactly one of mesh, body; has none",
+        *missing,
+    ]
 
 
 def test_text_and_folder_are_no_keys_of_the_file(tmp_path):
     found = problems(tmp_path, "text = ''\nfolder = '.'\n" + SMALLEST)
-    assert [line.split(",")[0] for line in found] == [f"scene.toml: {key}: unknown key" for key in ("text", "folder")]
+    assert [line.split(",")[0] for line in found] == [
+        f"scene.toml: {key}: unknown key" for key in ("text", "folder")
+    ]
 
 
 def test_huge_integers_are_refused_not_converted(tmp_path):
-    assert "must be < 9223372036854775808" in problems(tmp_path, changed("9946", "0x" + "F" * 6000))[0]
+    assert (
+        "must be < 9223372036854775808" in problems(tmp_path, changed("9946", "0x" + "F" * 6000))[0]
+    )
     assert "too many digits" in problems(tmp_path, changed("9946", "9" * 5000))[0]
     assert "must be a number" in problems(tmp_path, changed("= 1000 ", "= 1" + "0" * 400))[0]
-    (line,) = problems(tmp_path, SMALLEST.replace("0.01", "1e-50").replace("duration = 1", "duration = 1e50"))
+    (line,) = problems(
+        tmp_path, SMALLEST.replace("0.01", "1e-50").replace("duration = 1", "duration = 1e50")
+    )
     assert "time.duration: holds too many steps" in line
 
 
@@ -248,7 +280,11 @@ def test_no_file_a_folder_and_no_utf8(tmp_path):
         ("obstacle.0.restitution=0.5", lambda s: s.obstacle[0].restitution, 0.5),
         ("gravity.acceleration.2=1.62", lambda s: s.gravity.acceleration, (0, 0, 1.62)),
         ("mesh.prepare.4=union", lambda s: s.mesh.prepare[4:], ("union",)),
-        ("pin.2.region.sphere={center=[0,0,0], radius=2}", lambda s: [p.region.sphere.radius for p in s.pin[2:]], [2]),
+        (
+            "pin.2.region.sphere={center=[0,0,0], radius=2}",
+            lambda s: [p.region.sphere.radius for p in s.pin[2:]],
+            [2],
+        ),
         ("pin=[]", lambda s: s.pin, ()),
     ],
 )
@@ -258,7 +294,11 @@ def test_override(tmp_path, override, look, value):
 
 
 def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):
-    overrides = ["gravity.acceleration=[0, 0, 1]", "gravity.acceleration.2=2", "pin.0.region.box=[[0,0,0],[1,1,1]]"]
+    overrides = [
+        "gravity.acceleration=[0, 0, 1]",
+        "gravity.acceleration.2=2",
+        "pin.0.region.box=[[0,0,0],[1,1,1]]",
+    ]
     scene = load(tmp_path, SMALLEST, *overrides)
     assert scene.gravity.acceleration == (0, 0, 2)
     assert scene.pin[0].region.box == ((0, 0, 0), (1, 1, 1))
@@ -268,7 +308,10 @@ def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):
     ("override", "expected"),
     [
         ("cages.count=-3", "scene.toml: cages.count: must be > 0, got -3 (--set cages.count=-3)"),
-        ("gravity=-9.81", "got -9.81; for example gravity = { acceleration = [0, 0, -9.81] } (--set gravity=-9.81)"),
+        (
+            "gravity=-9.81",
+            "got -9.81; for example gravity = { acceleration = [0, 0, -9.81] } (--set gravity=-9.81)",
+        ),
         ("cages.cout=3", "scene.toml: cages.cout: unknown key, did you mean 'count'?"),
         ("cages.cell_size=1", "in place of all keys there: --set 'cages={cell_size=1}')"),
         ("time.step=5", "scene.toml: time.duration: must hold at least one step of 5 s"),
@@ -308,7 +351,9 @@ def test_statics_that_stay_the_same_want_no_step_and_no_duration(tmp_path):
     time = load(tmp_path, STATE).time
     assert (time.steps, time.step, time.duration) == (1, 1.0, 1.0)
     again = load(tmp_path, STATE, "time.step=0.5").time
-    assert (again.step, again.duration) == (0.5, 0.5) and load(tmp_path, STATE, "time.duration=2").time.steps == 1
+    assert (again.step, again.duration) == (0.5, 0.5) and load(
+        tmp_path, STATE, "time.duration=2"
+    ).time.steps == 1
     assert load(tmp_path, STATE, "time.step=0.5", "time.duration=2").time.steps == 4
 
 
@@ -340,8 +385,14 @@ def test_a_table_given_as_a_number_has_a_remedy_that_holds(tmp_path: Path, place
     table, _, within = place.partition(".")
     around = [f"{table}={EXAMPLES[table]}"] if within and table != "output" else []
     text = STATE.replace('integrator = "static"', "step = 0.01, duration = 1.0")
-    (line,) = (line for line in problems(tmp_path, text, *around, f"{place}=-9.81") if f" {place}: " in line)
-    key, _, remedy = line.partition("for example ")[2].removesuffix(f" (--set {place}=-9.81)").partition(" = ")
+    (line,) = (
+        line
+        for line in problems(tmp_path, text, *around, f"{place}=-9.81")
+        if f" {place}: " in line
+    )
+    key, _, remedy = (
+        line.partition("for example ")[2].removesuffix(f" (--set {place}=-9.81)").partition(" = ")
+    )
     assert "got -9.81" in line and key == place.rpartition(".")[2]
     others = text if place != "body" else text.replace('mesh = { source = "bunny_scan" }', "")
     load(tmp_path, others, *around, f"{place}={remedy}")

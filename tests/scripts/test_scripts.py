@@ -11,15 +11,23 @@ from pathlib import Path
 import pytest
 from conftest import AS_ROOT, ROOT
 
-SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem not in ("clone", "lab"))
-HOME = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/nonexistent", **AS_ROOT}  # nothing is activated
+SCRIPTS = sorted(
+    path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem not in ("clone", "lab")
+)
+HOME = {
+    "PATH": "/usr/local/bin:/usr/bin:/bin",
+    "HOME": "/nonexistent",
+    **AS_ROOT,
+}  # nothing is activated
 SYSTEM_PYTHON = sys._base_executable  # what the clone's .venv was made with
 
 
 @pytest.mark.skipif(not (ROOT / ".venv").exists(), reason="the clone has no .venv")
 def test_a_script_finds_its_python():
     script = ROOT / "scripts" / "house.py"
-    done = subprocess.run([SYSTEM_PYTHON, script, "--help"], env=HOME, capture_output=True, text=True)
+    done = subprocess.run(
+        [SYSTEM_PYTHON, script, "--help"], env=HOME, capture_output=True, text=True
+    )
     assert done.returncode == 0 and done.stdout.startswith("usage: "), done.stderr
 
 
@@ -77,7 +85,9 @@ def set_up(clone: Path, *extras: str, **variables: str) -> subprocess.CompletedP
         **variables,
     }
     command = [clone / "scripts" / "setup", *extras]
-    return subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    return subprocess.run(
+        command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
 
 
 def test_pip_is_silent_and_not_asked_twice(clone: Path):
@@ -124,7 +134,9 @@ def bare(tmp_path: Path) -> Path:
     return folder
 
 
-def build(path: Path, prefix: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess:
+def build(
+    path: Path, prefix: Path, *arguments: str, **variables: str
+) -> subprocess.CompletedProcess:
     """The script with this PATH and prefix."""
     command = ["bash", BUILD, "--prefix", prefix, *arguments]
     clean = {"PATH": str(path), "HOME": str(prefix), **variables}
@@ -141,7 +153,9 @@ def build(path: Path, prefix: Path, *arguments: str, **variables: str) -> subpro
         (("--arch", "90", "--", "--with-mumps=1"), "no C++ compiler"),
     ],
 )
-def test_what_is_missing_is_one_line(bare: Path, tmp_path: Path, arguments: tuple, said: str) -> None:
+def test_what_is_missing_is_one_line(
+    bare: Path, tmp_path: Path, arguments: tuple, said: str
+) -> None:
     done = build(bare, tmp_path / "petsc", *arguments)
     assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1, done
     assert done.stdout == "" and not (tmp_path / "petsc").exists()
@@ -159,7 +173,11 @@ def test_who_may_not_install_is_told_what_to_ask_for(bare: Path, tmp_path: Path)
 def test_a_folder_of_others_is_left_alone(bare: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("keep")
     done = build(bare, tmp_path, "--arch", "90")
-    assert done.returncode == 2 and "holds something else" in done.stderr and (tmp_path / "mine").exists()
+    assert (
+        done.returncode == 2
+        and "holds something else" in done.stderr
+        and (tmp_path / "mine").exists()
+    )
 
 
 def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
@@ -172,4 +190,6 @@ def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
     (prefix / "env").write_text("export PETSC_DIR=there\n")
     done = build(bare, prefix, "--", "--with-x=1")
     assert (done.returncode, done.stdout) == (0, "export PETSC_DIR=there\n"), done
-    assert build(bare, prefix, "--", "--with-x=2").returncode == 2  # another build: goes on to look for compilers
+    assert (
+        build(bare, prefix, "--", "--with-x=2").returncode == 2
+    )  # another build: goes on to look for compilers

@@ -64,9 +64,17 @@ class Job:
 
     def start(self) -> subprocess.Popen:
         """As Slurm starts it, first or again."""
-        array = {"SLURM_ARRAY_JOB_ID": "70", "SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_MAX": "16"}
+        array = {
+            "SLURM_ARRAY_JOB_ID": "70",
+            "SLURM_ARRAY_TASK_ID": "3",
+            "SLURM_ARRAY_TASK_MAX": "16",
+        }
         environment = {**os.environ, **AS_ROOT, "SLURM_JOB_ID": "77", **array}
-        environment = {name: value for name, value in environment.items() if not name.startswith(("OMPI_COMM", "PMIX"))}
+        environment = {
+            name: value
+            for name, value in environment.items()
+            if not name.startswith(("OMPI_COMM", "PMIX"))
+        }
         environment.pop("OMP_NUM_THREADS", None)
         return subprocess.Popen(
             ["bash", self.script], cwd=self.folder, env=environment, text=True,
@@ -126,6 +134,8 @@ def test_what_fails_is_not_queued_again(script: Path, tmp_path: Path):
 def test_a_task_of_an_array_is_queued_again_until_its_part_is_done(tmp_path: Path):
     job = Job(SCRIPTS[0], tmp_path)
     assert "queued again" in job.stopped(1)
-    assert job.told() == ["study growth.toml --part 3/16 threads=1"] and job.requeued == ["requeue 70_3"]
+    assert job.told() == ["study growth.toml --part 3/16 threads=1"] and job.requeued == [
+        "requeue 70_3"
+    ]
     (tmp_path / "done").write_text("0")
     assert job.status() == 0 and job.requeued == ["requeue 70_3"]

@@ -17,7 +17,9 @@ STEP, DURATION = 0.01, 0.96
 LOOSE = {"preset": "newton", "error": 1e-4}
 
 
-def beam(folder: Path, integrator: str = "bdf2", step: float = STEP, duration: float = DURATION, **tables) -> Path:
+def beam(
+    folder: Path, integrator: str = "bdf2", step: float = STEP, duration: float = DURATION, **tables
+) -> Path:
     """A clamped beam of 32 cells that swings under its weight, some periods in ``DURATION``."""
     more = {"error": tables.pop("error")} if "error" in tables else {}
     time = {"step": step, "duration": duration, "integrator": integrator} | more
@@ -56,8 +58,12 @@ def test_the_local_error_of_a_swing(method: str, order: int):
     assert abs(ratios[1] - 1) < 0.6 * abs(ratios[0] - 1) < 0.1
 
 
-@pytest.mark.parametrize("integrator, error", [("bdf2", 3e-2), ("bdf2", 1e-2), ("implicit-euler", 0.1)])
-def test_the_error_reached_is_the_error_asked(tmp_path: Path, exact: list[Frame], integrator: str, error: float):
+@pytest.mark.parametrize(
+    "integrator, error", [("bdf2", 3e-2), ("bdf2", 1e-2), ("implicit-euler", 0.1)]
+)
+def test_the_error_reached_is_the_error_asked(
+    tmp_path: Path, exact: list[Frame], integrator: str, error: float
+):
     """Within a factor of three, and so is the estimate of it."""
     model, frames = play(beam(tmp_path, integrator, error=error))
     reached = error_of(model, frames, exact)
@@ -84,7 +90,15 @@ LANDING = {  # it falls by 5 mm, lands at 0.5 m/s, and slides under a force that
     "mesh": {"source": "scene.ply", "base": [0, 0, 0.005]},
     "start": {"velocity": [0.3, 0.0, -0.5]},
     "gravity": GRAVITY,
-    "obstacle": [{"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}],
+    "obstacle": [
+        {
+            "shape": "plane",
+            "point": [0, 0, 0],
+            "normal": [0, 0, 1],
+            "response": "penalty",
+            "friction": 0.5,
+        }
+    ],
     "force": [
         {
             "region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}},
@@ -109,7 +123,9 @@ def ball(folder: Path, **tables) -> Path:
     """A block that falls, and is thrown back by the ground after 0.1 s."""
     ground = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": "reflect"}
     time = {"step": 0.01, "duration": 0.15, "integrator": "bdf2", "error": 2e-2}
-    return block_scene(folder, gravity=GRAVITY, obstacle=[ground], time=time, solver=LOOSE, **tables)
+    return block_scene(
+        folder, gravity=GRAVITY, obstacle=[ground], time=time, solver=LOOSE, **tables
+    )
 
 
 def test_a_fall_is_a_few_long_steps_and_an_impact_many_short_ones(tmp_path: Path):
@@ -127,7 +143,9 @@ def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float)
     end = {"region": {"half_space": {"point": [0.99, 0, 0], "normal": [1, 0, 0]}}}
     led = [end | {"path": [{"time": stop, "by": [0, 0, 0.02]}], "stop": stop}]
     time = {"step": 0.005, "duration": 0.16}
-    model, frames = play(beam(tmp_path, **time, error=0.1, anchor=led, gravity={"acceleration": [0, 0, 0]}))
+    model, frames = play(
+        beam(tmp_path, **time, error=0.1, anchor=led, gravity={"acceleration": [0, 0, 0]})
+    )
     last = next(frame for frame in frames if frame.time == pytest.approx(stop))
     tip = model.lattice.nodes[:, 0] > 0.99
     assert last.position[tip, 2] - model.lattice.nodes[tip, 2] == pytest.approx(0.02, rel=1e-8)
@@ -141,7 +159,9 @@ def test_a_failed_step_is_taken_again_shorter(tmp_path: Path, monkeypatch: pytes
     assert len(frames) == 41
 
 
-def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_the_shortest_step_cannot_do_is_left_to_safety(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """The scene's step is then taken in pieces, and steps are chosen again after it."""
     Failing(monkeypatch, {6})
     monkeypatch.setattr(adaptive, "LOWEST", 0)
@@ -153,4 +173,6 @@ def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monk
 
 def test_an_integrator_whose_steps_have_one_length_is_refused_in_a_line(tmp_path: Path):
     scene = beam(tmp_path, integrator="verlet", error=0.1)
-    assert 'time.error: is for integrator = "implicit-euler" or "bdf2" only' in input_error(lambda: load_scene(scene))
+    assert 'time.error: is for integrator = "implicit-euler" or "bdf2" only' in input_error(
+        lambda: load_scene(scene)
+    )

@@ -21,9 +21,15 @@ def dense() -> np.ndarray:
 
 
 @contextmanager
-def solved(dense: np.ndarray, right: np.ndarray, its: int) -> Iterator[tuple[SolveBound, float, np.ndarray]]:
+def solved(
+    dense: np.ndarray, right: np.ndarray, its: int
+) -> Iterator[tuple[SolveBound, float, np.ndarray]]:
     """The bound of so many iterations of CG with D, the residual that they leave, |r|_(D^-1), and what they find."""
-    bound, ksp, matrix = SolveBound(), PETSc.KSP().create(), PETSc.Mat().createDense(dense.shape, array=dense)
+    bound, ksp, matrix = (
+        SolveBound(),
+        PETSc.KSP().create(),
+        PETSc.Mat().createDense(dense.shape, array=dense),
+    )
     matrix.assemble()
     ksp.setType(PETSc.KSP.Type.CG)
     ksp.setNormType(PETSc.KSP.NormType.NATURAL)
@@ -39,7 +45,9 @@ def solved(dense: np.ndarray, right: np.ndarray, its: int) -> Iterator[tuple[Sol
 
 
 @pytest.mark.parametrize("its", [1, 5, 15, 40])
-def test_it_is_no_less_than_the_error_and_nearer_than_the_residual_tells(dense: np.ndarray, its: int):
+def test_it_is_no_less_than_the_error_and_nearer_than_the_residual_tells(
+    dense: np.ndarray, its: int
+):
     right = np.random.default_rng(1).normal(size=200)
     scale = 1 / np.sqrt(dense.diagonal())
     least = np.linalg.eigvalsh(scale[:, None] * dense * scale)[0]

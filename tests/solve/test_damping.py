@@ -13,8 +13,12 @@ FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}
 SPEED = [0.5, 0.0, -1.0]
 
 
-def damped(folder: Path, integrator: str, steps: int, alpha: float = ALPHA, step: float = STEP, **tables) -> Path:
-    time = {"step": step, "duration": steps * step, "integrator": integrator} | tables.pop("time", {})
+def damped(
+    folder: Path, integrator: str, steps: int, alpha: float = ALPHA, step: float = STEP, **tables
+) -> Path:
+    time = {"step": step, "duration": steps * step, "integrator": integrator} | tables.pop(
+        "time", {}
+    )
     material = {"young_modulus": 1e5, "density": 1000.0, "damping": alpha}
     return block_scene(folder, time=time, material=material, **tables)
 
@@ -29,9 +33,13 @@ def test_free_flight_decays_by_each_schemes_own_formula(tmp_path: Path):
     n = np.arange(9)[:, None]
     start = {"start": {"velocity": SPEED}}
     euler = velocities(damped(tmp_path, "implicit-euler", 8, **start))
-    np.testing.assert_allclose(euler, np.array(SPEED) * (1 + ALPHA * STEP) ** -n, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        euler, np.array(SPEED) * (1 + ALPHA * STEP) ** -n, rtol=1e-9, atol=1e-12
+    )
     verlet = velocities(damped(tmp_path, "verlet", 8, **start))
-    np.testing.assert_allclose(verlet, np.array(SPEED) * np.exp(-ALPHA * STEP * n), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        verlet, np.array(SPEED) * np.exp(-ALPHA * STEP * n), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_bdf2_converges_to_the_exponential_with_second_order(tmp_path: Path):
@@ -51,7 +59,9 @@ def test_a_swing_loses_its_energy_as_the_exponential(tmp_path: Path, integrator:
         _, frames = play(damped(tmp_path, integrator, 120, alpha=alpha, step=1 / 400, **swing))
         return np.array([frame.kinetic + frame.elastic for frame in frames])
 
-    ratio = energy(ALPHA)[60:] / energy(0.0)[60:]  # over several swings: kinetic energy alone is lost, half of the time
+    ratio = (
+        energy(ALPHA)[60:] / energy(0.0)[60:]
+    )  # over several swings: kinetic energy alone is lost, half of the time
     expected = np.exp(-ALPHA * np.arange(60, 121) / 400)
     assert np.abs(ratio / expected - 1).max() < 0.1
     assert "nowhere" not in caplog.text
@@ -61,9 +71,13 @@ SOLID = {"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"}
 RETARDATION = 0.1  # [s]
 
 
-def viscous(folder: Path, integrator: str, step: float, duration: float, retardation: float, **tables) -> Path:
+def viscous(
+    folder: Path, integrator: str, step: float, duration: float, retardation: float, **tables
+) -> Path:
     time = {"step": step, "duration": duration, "integrator": integrator}
-    return block_scene(folder, time=time, material=SOLID | {"retardation_time": retardation}, **tables)
+    return block_scene(
+        folder, time=time, material=SOLID | {"retardation_time": retardation}, **tables
+    )
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
@@ -71,9 +85,16 @@ def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
     """Under a force that comes at once it gives as 1 - exp(-t / beta); its inertia takes 1/70 of beta."""
     top = {"box": [[-1, -1, 0.24], [1, 1, 0.26]]}
     pulled = {"pin": [{"region": FOOT}], "force": [{"region": top, "total": [0, 0, 50.0]}]}
-    model, frames = play(viscous(tmp_path, integrator, RETARDATION / 50, 3 * RETARDATION, RETARDATION, **pulled))
-    at_rest = play(block_scene(tmp_path, material=SOLID, time={"integrator": "static"}, **pulled))[1][-1]
-    moved = [model.lattice.mass @ (frame.position - model.lattice.nodes)[:, 2] for frame in (*frames, at_rest)]
+    model, frames = play(
+        viscous(tmp_path, integrator, RETARDATION / 50, 3 * RETARDATION, RETARDATION, **pulled)
+    )
+    at_rest = play(block_scene(tmp_path, material=SOLID, time={"integrator": "static"}, **pulled))[
+        1
+    ][-1]
+    moved = [
+        model.lattice.mass @ (frame.position - model.lattice.nodes)[:, 2]
+        for frame in (*frames, at_rest)
+    ]
     given = np.array(moved[:-1]) / moved[-1]
     expected = 1 - np.exp(-np.array([frame.time for frame in frames]) / RETARDATION)
     assert np.abs(given - expected).max() < 0.03 and abs(given[-1] - expected[-1]) < 0.002
@@ -81,15 +102,21 @@ def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
 
 def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
     """Stretched by its spin of 20 / s: rates in axes that did not turn along took 87% of it."""
-    model, frames = play(viscous(tmp_path, "bdf2", 1 / 400, 0.25, RETARDATION, start={"spin": [0, 0, 20.0]}))
+    model, frames = play(
+        viscous(tmp_path, "bdf2", 1 / 400, 0.25, RETARDATION, start={"spin": [0, 0, 20.0]})
+    )
 
     def angular(k: int) -> float:
-        v = (3 * frames[k].position - 4 * frames[k - 1].position + frames[k - 2].position) / (2 / 400)
+        v = (3 * frames[k].position - 4 * frames[k - 1].position + frames[k - 2].position) / (
+            2 / 400
+        )
         x = frames[k].position - np.average(frames[k].position, axis=0, weights=model.lattice.mass)
         return model.lattice.mass @ np.cross(x, v)[:, 2]
 
     assert angular(len(frames) - 1) == pytest.approx(angular(2), rel=5e-3)
-    assert (np.diff([frame.elastic for frame in frames[2:]]) > 0).all()  # it creeps, without a swing
+    assert (
+        np.diff([frame.elastic for frame in frames[2:]]) > 0
+    ).all()  # it creeps, without a swing
 
 
 @pytest.mark.parametrize("integrator", ["verlet", "static"])
@@ -103,10 +130,19 @@ def test_a_bent_solid_that_is_let_go_creeps_back_and_gains_nothing(tmp_path: Pat
     top = {"box": [[-1, -1, 0.49], [1, 1, 0.51]]}
     anchor = {"region": top, "path": [{"time": 0.05, "by": [0.1, 0, 0]}], "stop": 0.1}
     scene = viscous(
-        tmp_path, "implicit-euler", 0.01, 0.4, 2.0, sides=[0.25, 0.25, 0.5], pin=[{"region": FOOT}], anchor=[anchor]
+        tmp_path,
+        "implicit-euler",
+        0.01,
+        0.4,
+        2.0,
+        sides=[0.25, 0.25, 0.5],
+        pin=[{"region": FOOT}],
+        anchor=[anchor],
     )
     _, frames = play(scene)
     elastic = np.array([frame.elastic for frame in frames[10:]])
     assert elastic[1] < 0.99 * elastic[0]
-    assert (np.diff(elastic) < 0).all() and max(frame.kinetic for frame in frames[10:]) < 0.01 * elastic[0]
+    assert (np.diff(elastic) < 0).all() and max(
+        frame.kinetic for frame in frames[10:]
+    ) < 0.01 * elastic[0]
     assert "nowhere" not in caplog.text

@@ -25,7 +25,11 @@ from msmpetsc.solve.presets import PRESETS, find_preset
 from msmpetsc.solve.simulate import TimeLoop
 
 FLOOR = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
-PLATE = {"shape": "box", "box": [[-1, -1, 0.26], [2, 2, 0.5]], "path": [{"time": 0.2, "by": [0, 0, -0.1]}]}
+PLATE = {
+    "shape": "box",
+    "box": [[-1, -1, 0.26], [2, 2, 0.5]],
+    "path": [{"time": 0.2, "by": [0, 0, -0.1]}],
+}
 SCENES = {
     "leaps": {
         "time": {"step": 0.005, "duration": 0.15},
@@ -35,7 +39,10 @@ SCENES = {
     "is pressed": {
         "time": {"step": 0.01, "duration": 0.2},
         "material": {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"},
-        "obstacle": [FLOOR | {"response": "penalty", "friction": 0.5}, PLATE | {"response": "penalty"}],
+        "obstacle": [
+            FLOOR | {"response": "penalty", "friction": 0.5},
+            PLATE | {"response": "penalty"},
+        ],
     },
     "swings": {
         "time": {"step": 0.02, "duration": 0.3},
@@ -54,7 +61,8 @@ def test_the_estimate_is_within_three_of_the_true_error(
         monkeypatch.setattr(module, "KNOWN", 0.0)
     monkeypatch.setattr(SolveBound, "of", lambda *_: np.inf)
     scene = load_scene(
-        block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]), [f"solver={{preset='{preset}', error=1e-3}}"]
+        block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]),
+        [f"solver={{preset='{preset}', error=1e-3}}"],
     )
     model = build_model(MPI.COMM_SELF, scene)
     ratios, estimated = [], []
@@ -63,7 +71,9 @@ def test_the_estimate_is_within_three_of_the_true_error(
         for frame in simulation.frames():
             if frame.index and frame.true_error > 1e-9:
                 ratios.append(frame.step_error / frame.true_error)
-                estimated.append(stepper.snes.reason == PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE)
+                estimated.append(
+                    stepper.snes.reason == PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
+                )
     ratios, estimated = np.array(ratios), np.array(estimated)
     assert estimated.sum() >= 5 and (ratios[estimated] < 3).all() and (ratios > 1 / 3).all()
 
@@ -73,12 +83,18 @@ def test_with_multigrid_one_cycle_confirms_what_a_step_has_left(tmp_path: Path, 
     """What is said is then a bound; a share of 0.6 of all products proved these steps when each was estimated by CG."""
     scene = SCENES["swings"] | {"material": {"young_modulus": 5e5, "density": 1000.0, "law": law}}
     solver = "solver={preset='newton-multigrid', error=1e-3}"
-    loaded = load_scene(block_scene(tmp_path, gravity=GRAVITY, **scene), [solver, "cages={cell_size=0.05}"])
-    with TimeLoop(MPI.COMM_SELF, loaded, build_model(MPI.COMM_SELF, loaded), true_error=1) as simulation:
+    loaded = load_scene(
+        block_scene(tmp_path, gravity=GRAVITY, **scene), [solver, "cages={cell_size=0.05}"]
+    )
+    with TimeLoop(
+        MPI.COMM_SELF, loaded, build_model(MPI.COMM_SELF, loaded), true_error=1
+    ) as simulation:
         frames = [frame for frame in simulation.frames() if frame.index]
     assert min(frame.step_error / frame.true_error for frame in frames) > 0.99
     assert max(frame.step_error for frame in frames) <= 1e-3
-    proof, products = (sum(getattr(frame, name) for frame in frames) for name in ("proof_products", "products"))
+    proof, products = (
+        sum(getattr(frame, name) for frame in frames) for name in ("proof_products", "products")
+    )
     assert 0 < proof < 0.35 * products
 
 
@@ -100,7 +116,11 @@ def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
 
 
 def test_a_run_tells_its_true_errors_and_its_cost(tmp_path: Path):
-    path, out, told = block_scene(tmp_path, gravity=GRAVITY, **SCENES["swings"]), tmp_path / "o.h5", tmp_path / "m.json"
+    path, out, told = (
+        block_scene(tmp_path, gravity=GRAVITY, **SCENES["swings"]),
+        tmp_path / "o.h5",
+        tmp_path / "m.json",
+    )
     words = ["--true-error", "2", "--frames", "4", "--error", "1e-4", "-reference_ksp_rtol", "1e-2"]
     run(1, "-m", "msmpetsc", "run", path, "-o", out, "--measure", told, *words, status=0)
     with h5py.File(out) as file:
@@ -120,13 +140,20 @@ def test_a_run_tells_its_true_errors_and_its_cost(tmp_path: Path):
     ("words", "said"),
     [
         (["--true-error", "0"], "--true-error must be at least 1, not 0"),
-        (["--true-error", "1", "-reference_gone", "1"], "-reference_gone: no part of this run uses"),
+        (
+            ["--true-error", "1", "-reference_gone", "1"],
+            "-reference_gone: no part of this run uses",
+        ),
         (["--true-error", "1", "--set", "time.integrator=verlet"], "verlet has none"),
     ],
 )
 def test_what_cannot_be_measured_is_one_clear_line(tmp_path: Path, words: list[str], said: str):
     path = block_scene(tmp_path, **SCENES["swings"])
-    assert_one_line(run(1, "-m", "msmpetsc", "run", path, "-o", tmp_path / "o.h5", "--frames", "1", *words), 2, said)
+    assert_one_line(
+        run(1, "-m", "msmpetsc", "run", path, "-o", tmp_path / "o.h5", "--frames", "1", *words),
+        2,
+        said,
+    )
 
 
 def test_linear_solves_are_no_tighter_than_the_step_needs():
@@ -136,7 +163,9 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
         lattice, seen = beam(), []
         stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=error)
         stepper.ksp.setMonitor(lambda ksp, *_: seen.append(ksp.getTolerances()[0]))
-        stepper.step(StepProblem(lattice.nodes, lattice.nodes + np.array([0, 0, 1e-3]), weight(lattice)))
+        stepper.step(
+            StepProblem(lattice.nodes, lattice.nodes + np.array([0, 0, 1e-3]), weight(lattice))
+        )
         stepper.destroy()
         return seen
 
@@ -157,7 +186,12 @@ def test_a_short_solve_does_not_forget_the_least_eigenvalue_of_a_long_one():
 
     stepper = Stepper(COMM, beam(), T, find_preset("newton-multigrid"), error=1e-3)
     estimate = stepper.control.estimate
-    for solve, least in [(Solve(91, 5e-4), 5e-4), (Solve(5, 0.38), 1e-3), (Solve(2, 0.5), 1e-3), (Solve(9, 0.3), 2e-3)]:
+    for solve, least in [
+        (Solve(91, 5e-4), 5e-4),
+        (Solve(5, 0.38), 1e-3),
+        (Solve(2, 0.5), 1e-3),
+        (Solve(9, 0.3), 2e-3),
+    ]:
         estimate.learn(solve)
         assert estimate.least == pytest.approx(least)
     stepper.destroy()

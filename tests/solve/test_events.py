@@ -34,9 +34,25 @@ def logged(text: str) -> dict[str, dict[str, tuple[int, float]]]:
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, dict, dict]:
     """Stages of the log, the measure file and the frames' numbers of a run that has a reference, too."""
     folder = tmp_path_factory.mktemp("run")
-    words = "-o", folder / "o.h5", "--measure", folder / "m.json", "--true-error", 2, "-pc_type", "mg", "-log_view"
-    words = *words, "-ksp_norm_type", "preconditioned"  # whose solves say nothing of their error: it is estimated
-    done = on_ranks(1, "-m", "msmpetsc.cli.main", "run", block_scene(folder, **SWINGS), *words, status=0)
+    words = (
+        "-o",
+        folder / "o.h5",
+        "--measure",
+        folder / "m.json",
+        "--true-error",
+        2,
+        "-pc_type",
+        "mg",
+        "-log_view",
+    )
+    words = (
+        *words,
+        "-ksp_norm_type",
+        "preconditioned",
+    )  # whose solves say nothing of their error: it is estimated
+    done = on_ranks(
+        1, "-m", "msmpetsc.cli.main", "run", block_scene(folder, **SWINGS), *words, status=0
+    )
     with h5py.File(folder / "o.h5") as file:
         frames = {name: file["frames"][name][:] for name in ("products", "ksp_its", "wall_time")}
     return logged(done.stdout), json.loads((folder / "m.json").read_text()), frames
@@ -47,8 +63,12 @@ def test_events_are_in_their_stages(run: tuple):
     assert {"msmpetsc grids", "msmpetsc hierarchy", "msmpetsc hessian"} <= set(stages["set-up"])
     names = "gradient", "energy", "hessian", "product", "fine", "cycle", "estimate", "local"
     assert {f"msmpetsc {name}" for name in names} <= set(stages["steps"])
-    assert stages["output"]["msmpetsc output"][0] == 1 + FRAMES and "SNESSolve" in stages["reference"]
-    assert not any(name.startswith("SNES") for stage in ("Main Stage", "output") for name in stages[stage])
+    assert (
+        stages["output"]["msmpetsc output"][0] == 1 + FRAMES and "SNESSolve" in stages["reference"]
+    )
+    assert not any(
+        name.startswith("SNES") for stage in ("Main Stage", "output") for name in stages[stage]
+    )
 
 
 @pytest.mark.slow
@@ -57,16 +77,28 @@ def test_ghosts_and_contact_are_told_on_two_ranks(tmp_path: Path):
     words = block_scene(tmp_path, **SWINGS, obstacle=[floor]), "-o", tmp_path / "o.h5", "-log_view"
     done = on_ranks(2, "-m", "msmpetsc", "run", *words, status=0)
     steps = logged(done.stdout)["steps"]
-    assert steps["msmpetsc ghosts"][0] >= steps["msmpetsc product"][0] + steps["msmpetsc gradient"][0]
+    assert (
+        steps["msmpetsc ghosts"][0] >= steps["msmpetsc product"][0] + steps["msmpetsc gradient"][0]
+    )
     assert steps["msmpetsc contact"][0] > 0
 
 
 def test_times_are_of_all_stages_of_the_run_but_not_of_its_reference(run: tuple):
     stages, cost, frames = run
-    told = {"local": ["msmpetsc local"], "ksp": ["KSPSolve"], "hierarchy": ["msmpetsc grids", "msmpetsc hierarchy"]}
+    told = {
+        "local": ["msmpetsc local"],
+        "ksp": ["KSPSolve"],
+        "hierarchy": ["msmpetsc grids", "msmpetsc hierarchy"],
+    }
     for name, sources in told.items():
-        rows = [stages[s].get(event) for s in ("Main Stage", "set-up", "steps", "output") for event in sources]
-        assert cost["time"][name] == pytest.approx(sum(row[1] for row in rows if row), rel=1e-3) and any(rows)
+        rows = [
+            stages[s].get(event)
+            for s in ("Main Stage", "set-up", "steps", "output")
+            for event in sources
+        ]
+        assert cost["time"][name] == pytest.approx(
+            sum(row[1] for row in rows if row), rel=1e-3
+        ) and any(rows)
     assert cost["time"]["local"] + cost["time"]["ksp"] < cost["time"]["stepping"]
     assert cost["time"]["stepping"] == pytest.approx(frames["wall_time"].sum())
 
@@ -79,6 +111,11 @@ def test_products_are_those_of_the_log(run: tuple):
 
 
 def test_products_repeat_and_verlet_has_none(tmp_path: Path):
-    first, again = ([frame.products for frame in play(block_scene(tmp_path, **SWINGS))[1]] for _ in range(2))
+    first, again = (
+        [frame.products for frame in play(block_scene(tmp_path, **SWINGS))[1]] for _ in range(2)
+    )
     assert first == again and first[0] == 0 and min(first[1:]) > 0
-    assert {frame.products for frame in play(block_scene(tmp_path, **SWINGS), 'time.integrator="verlet"')[1]} == {0}
+    assert {
+        frame.products
+        for frame in play(block_scene(tmp_path, **SWINGS), 'time.integrator="verlet"')[1]
+    } == {0}

@@ -7,7 +7,10 @@ import pytest
 from block_scene import block_scene, play
 
 DURATION = 0.03  # [s]: about a period
-SWING = {"start": {"scale": [1.2, 1.0, 0.9]}, "output": {"surface": False, "every": 1000}}  # let go, far from at rest
+SWING = {
+    "start": {"scale": [1.2, 1.0, 0.9]},
+    "output": {"surface": False, "every": 1000},
+}  # let go, far from at rest
 
 
 def bar(folder: Path, **tables) -> Path:
@@ -18,7 +21,12 @@ def bar(folder: Path, **tables) -> Path:
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """By explicit substeps of which 60 make the shortest step tried: their own error is of second order."""
-    time = {"step": DURATION / 8, "duration": DURATION, "integrator": "verlet", "substep": DURATION / 20000}
+    time = {
+        "step": DURATION / 8,
+        "duration": DURATION,
+        "integrator": "verlet",
+        "substep": DURATION / 20000,
+    }
     return play(bar(tmp_path_factory.mktemp("exact"), time=time))[1][-1].position
 
 
@@ -26,7 +34,9 @@ ORDERS = [("implicit-euler", 1, (256, 512)), ("bdf2", 2, (128, 256)), ("verlet",
 
 
 @pytest.mark.parametrize("integrator, order, parts", ORDERS)
-def test_order_in_time(tmp_path: Path, exact: np.ndarray, integrator: str, order: int, parts: tuple[int, int]):
+def test_order_in_time(
+    tmp_path: Path, exact: np.ndarray, integrator: str, order: int, parts: tuple[int, int]
+):
     """The slope of the error over the time step."""
     errors = []
     for part in parts:
@@ -46,13 +56,18 @@ def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
     """
     small = 1e-5
     scene = block_scene(
-        tmp_path, np.full(3, 0.125), start={"scale": [1 + small] * 3}, solver={"preset": "newton", "error": 1e-10}
+        tmp_path,
+        np.full(3, 0.125),
+        start={"scale": [1 + small] * 3},
+        solver={"preset": "newton", "error": 1e-10},
     )
     model, frames = play(scene, "time={step=1e-6, duration=1e-6}")
     moved = model.start[0] - model.lattice.nodes
     w = np.sqrt(2 * frames[0].elastic / (model.lattice.mass @ (moved**2).sum(axis=1)))
     t = float(2 * np.pi / w / 32)
-    _, frames = play(scene, f"time={{step={t!r}, duration={steps * t!r}, integrator='{integrator}'}}")
+    _, frames = play(
+        scene, f"time={{step={t!r}, duration={steps * t!r}, integrator='{integrator}'}}"
+    )
     left = (frames[-1].elastic + frames[-1].kinetic) / frames[0].elastic
     assert left == pytest.approx(energy_left(integrator, w * t, steps), rel=1e-4)
 

@@ -32,7 +32,13 @@ from msmpetsc.solve.simulate import TimeLoop
 BEAM, CUBE = [1, 0.2, 0.2], [1, 1, 1]
 GRAVITY = {"acceleration": [0, 0, -9.81]}
 PLATES = [
-    {"shape": "plane", "point": [0, 0, -0.11], "normal": [0, 0, 1], "response": "penalty", "friction": 0.3},
+    {
+        "shape": "plane",
+        "point": [0, 0, -0.11],
+        "normal": [0, 0, 1],
+        "response": "penalty",
+        "friction": 0.3,
+    },
     {"shape": "plane", "point": [0, 0, 0.1], "normal": [0, 0, -1], "response": "penalty"},
 ]
 CASES = {
@@ -53,7 +59,10 @@ def write_case(folder: Path, name: str, **solver) -> Path:
     trimesh.creation.box(case.pop("sides")).export(folder / "body.ply")
     scene = {
         "mesh": {"source": "body.ply"},
-        "cages": {"count": case.pop("cells"), "boundary": "whole"},  # as where the saddles were found
+        "cages": {
+            "count": case.pop("cells"),
+            "boundary": "whole",
+        },  # as where the saddles were found
         "material": {"young_modulus": case.pop("young"), "density": 1000.0, "law": "linear"},
         "time": {"step": (step := case.pop("step")), "duration": case.pop("frames") * step},
         "solver": {"error": 1e-3} | solver,
@@ -82,7 +91,9 @@ def play(path: Path, *overrides: str) -> list[Frame]:
         ("collapsed", "anderson"),
     ],
 )
-def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(tmp_path: Path, name: str, preset: str):
+def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(
+    tmp_path: Path, name: str, preset: str
+):
     frames = play(write_case(tmp_path, name, preset=preset))
     assert frames or preset == "anderson", "which may stop with status 3, as the others may not"
     for frame in frames:
@@ -92,7 +103,8 @@ def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(tmp_path: 
 def test_a_budget_that_ends_where_no_minimum_is_near_says_so(tmp_path: Path):
     """One published iteration leaves the crushed beam flat: nothing bounds how far it is from where it will go."""
     (frame,) = play(
-        write_case(tmp_path, "crushed", preset="newton", max_iterations=1), "solver={preset='newton', max_iterations=1}"
+        write_case(tmp_path, "crushed", preset="newton", max_iterations=1),
+        "solver={preset='newton', max_iterations=1}",
     )
     assert frame.step_error > frame.true_error / 3
 
@@ -119,7 +131,9 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     stepper.jacobian.hessian.linearise(q, None)
     found, direction = curvature.lowest(q, curvature.compression(q), Alarm.NOWHERE, None)
     preconditioner = stepper.jacobian.preconditioner
-    assert preconditioner.multigrid is None and (preconditioner.for_searches is not None) == multigrid
+    assert (
+        preconditioner.multigrid is None and (preconditioner.for_searches is not None) == multigrid
+    )
     dense, root = dense_hessian(stepper), np.sqrt(functional.mass)
     lowest = np.linalg.eigvalsh(dense / root / root[:, None])[0]
     if direction is None:  # a bound by the load factor
@@ -139,7 +153,9 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     simulation.destroy()
 
 
-def test_a_load_factor_serves_until_the_body_is_pressed_much_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_load_factor_serves_until_the_body_is_pressed_much_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(preconditioning, "LARGE", 1)
     simulation, q = squashed(tmp_path, 0.97)
     stepper = simulation.integrator.stepper
@@ -150,7 +166,9 @@ def test_a_load_factor_serves_until_the_body_is_pressed_much_more(tmp_path: Path
         stepper.functional.begin(StepProblem(at, at, np.zeros((len(at), 3))))
         stepper.jacobian.hessian.linearise(at, None)
         before = curvature.products
-        return curvature.lowest(at, curvature.compression(at), Alarm.NOWHERE, None)[0], curvature.products - before
+        return curvature.lowest(at, curvature.compression(at), Alarm.NOWHERE, None)[
+            0
+        ], curvature.products - before
 
     (first, searched), (second, free), (third, again) = look(0.97), look(0.94), look(0.6)
     assert searched > 0 and free == 0 and again > 0
@@ -205,7 +223,11 @@ def test_a_body_at_rest_is_not_far_off_its_solution(tmp_path: Path, caplog):
 def test_rounding_is_an_error_and_no_zero(tmp_path: Path):
     """At a goal below what doubles can do the step says what they leave; it does not go on for ever, nor say 0."""
     for preset in ("newton", "anderson"):
-        (frame,) = play(write_case(tmp_path, "crushed", preset=preset), "start.scale=[1,1,1]", "solver.error=1e-15")
+        (frame,) = play(
+            write_case(tmp_path, "crushed", preset=preset),
+            "start.scale=[1,1,1]",
+            "solver.error=1e-15",
+        )
         assert 1e-16 < frame.step_error < 1e-6 and frame.true_error > 0
 
 
@@ -213,10 +235,14 @@ PART = "part=[{region={half_space={point=[0.0,0.0,0.0], normal=[1,0,0]}}, young_
 
 
 @pytest.mark.parametrize("soft, stiff", [(1e5, 1e40), (1e-9, 1e5), (1e3, 1e11)])
-def test_parts_that_are_as_good_as_rigid_are_refused_at_once(tmp_path: Path, soft: float, stiff: float):
+def test_parts_that_are_as_good_as_rigid_are_refused_at_once(
+    tmp_path: Path, soft: float, stiff: float
+):
     """At 1e8 to 1 a squashed body ended after 3,000 iterations of newton, or did not end."""
     with pytest.raises(InputError, match="as good as rigid"):
-        load_scene(write_case(tmp_path, "crushed"), [f"material.young_modulus={soft!r}", PART % stiff])
+        load_scene(
+            write_case(tmp_path, "crushed"), [f"material.young_modulus={soft!r}", PART % stiff]
+        )
 
 
 def error_study(*words: object) -> str:
@@ -228,13 +254,23 @@ def error_study(*words: object) -> str:
 
 def shares_said(seed: int, number: int, *changes: str) -> list[float]:
     """The error that each step of one of its scenes says, over the true one."""
-    printed = error_study("--seed", seed, "--only", number, *(word for change in changes for word in ("--set", change)))
+    printed = error_study(
+        "--seed",
+        seed,
+        "--only",
+        number,
+        *(word for change in changes for word in ("--set", change)),
+    )
     return [error / true for error, true in json.loads(printed)["steps"]]
 
 
 def test_random_hard_scenes_say_no_less_than_a_third_of_their_error():
     """A sample of what scripts/error_study.py draws; it takes 500."""
-    (last,) = (line for line in error_study("--scenes", 12, "--seed", 7).splitlines() if line.startswith("| all |"))
+    (last,) = (
+        line
+        for line in error_study("--scenes", 12, "--seed", 7).splitlines()
+        if line.startswith("| all |")
+    )
     done, stopped, refused, cut_off, faults, steps = map(int, last.split("|")[2:8])
     assert done + stopped + refused + cut_off + faults == 12 and steps > 15
 
@@ -243,7 +279,9 @@ SOLID = 'material.law="neo-hookean"', "material.poisson_ratio=0.45"
 
 
 @pytest.mark.parametrize("seed, number, changes", [(31, 10, ()), (32, 30, SOLID)])
-def test_what_cg_has_left_is_no_bound_across_a_kink(seed: int, number: int, changes: tuple[str, ...]):
+def test_what_cg_has_left_is_no_bound_across_a_kink(
+    seed: int, number: int, changes: tuple[str, ...]
+):
     """Friction and contact make F at the next iterate another than CG has left of it: errors of 0.3 and 1.6 were
     said to be 0.08 and 0.07, 0.27 and 0.04 of them. What is said is an estimate all the same: where a body springs
     back from an eighth of its length, of the first step's error 0.47, 0.76 or over 0.9, by the way of 70 iterations."""
@@ -252,7 +290,9 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(seed: int, number: int, chan
 
 
 @pytest.mark.parametrize("seed, number, was", [(85, 40, 0.025), (85, 54, 0.078), (86, 115, 0.09)])
-def test_an_error_is_no_less_than_what_its_estimate_does_not_know(seed: int, number: int, was: float):
+def test_an_error_is_no_less_than_what_its_estimate_does_not_know(
+    seed: int, number: int, was: float
+):
     """A stiff block lands on a plane with friction (40, 54): nodes come to touch within what is missing of e, where g
     was never looked at. A cell hangs by an edge (115): CG of few iterations has nothing of its mode.
 
@@ -282,7 +322,9 @@ def test_a_preconditioner_far_from_the_hessian_bounds_no_error(tmp_path: Path):
             "spin": [-38.34936159106727, -267.39473131613147, -109.9781407748381],
             "velocity": [-2.3607346401851053, 5.561076327491708, 5.703682468065478],
         },
-        "obstacle": [{"shape": "plane", "point": [0, 0, -0.3], "normal": [0, 0, 1], "response": "reflect"}],
+        "obstacle": [
+            {"shape": "plane", "point": [0, 0, -0.3], "normal": [0, 0, 1], "response": "reflect"}
+        ],
         "solver": {"preset": "newton", "error": 0.3},
         "output": {"surface": False},
     }

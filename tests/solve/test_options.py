@@ -70,12 +70,18 @@ def test_what_cannot_be_of_use_is_one_line_that_says_what_is(petsc_options, name
 def test_a_misspelt_option_is_told_with_the_nearest(petsc_options, name: str):
     petsc_options(**{name: "cg"})
     refuse_early(COMM)
-    with pytest.raises(InputError, match=f"-{name}: no part of this run.*, did you mean '{name[:5]}"):
+    with pytest.raises(
+        InputError, match=f"-{name}: no part of this run.*, did you mean '{name[:5]}"
+    ):
         refuse_unused(COMM, at_end=True)
 
 
-LINES = dict.fromkeys(("-ksp_type cg", "", '-log_view "a b"', "-shift -0.5", "alias -a -b"), True)  # PETSc can read it
-LINES |= dict.fromkeys(("ksp_type cg", "-ksp_type cg -pc_type none", "-ksp_type cg jacobi", "-fp_trap"), False)
+LINES = dict.fromkeys(
+    ("-ksp_type cg", "", '-log_view "a b"', "-shift -0.5", "alias -a -b"), True
+)  # PETSc can read it
+LINES |= dict.fromkeys(
+    ("ksp_type cg", "-ksp_type cg -pc_type none", "-ksp_type cg jacobi", "-fp_trap"), False
+)
 
 
 @pytest.mark.parametrize("line", LINES)
@@ -87,7 +93,9 @@ def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
         _check_words(["-options_file", str(file)])
 
 
-@pytest.mark.parametrize("words", [["-options_file"], ["-options_file", "-ksp_view"], ["-options_file", "/dev/null"]])
+@pytest.mark.parametrize(
+    "words", [["-options_file"], ["-options_file", "-ksp_view"], ["-options_file", "/dev/null"]]
+)
 def test_an_options_file_is_a_file(words: list[str]):
     with pytest.raises(InputError, match="-options_file"):
         _check_words(words)
@@ -111,7 +119,8 @@ WITH_THE_SOLVERS = {
 
 
 @pytest.mark.parametrize(
-    ("ranks", "options"), [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone")]
+    ("ranks", "options"),
+    [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone")],
 )
 def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options: str):
     """Which is not there."""
@@ -124,7 +133,12 @@ def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options:
 
 
 def test_an_option_of_ours_with_one_dash_is_told_its_name():
-    options = [(name, option) for name in COMMANDS for option in option_names(name) if option.startswith("--")]
+    options = [
+        (name, option)
+        for name in COMMANDS
+        for option in option_names(name)
+        if option.startswith("--")
+    ]
     assert len(options) > 40
     for name, option in set(options) - {("run", "--help"), ("inspect", "--help")}:
         assert f"did you mean '{option}'?" in command_error(name, option[1:], "3")
@@ -133,7 +147,9 @@ def test_an_option_of_ours_with_one_dash_is_told_its_name():
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("options", WITH_THE_SOLVERS)
-def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(tmp_path: Path, options: str, ranks: int):
+def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(
+    tmp_path: Path, options: str, ranks: int
+):
     scene = block_scene(tmp_path, **SCENE)
     done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split())
     assert_one_line(done, 2, WITH_THE_SOLVERS[options])
@@ -143,10 +159,21 @@ FRAMES = "import sys, msmpetsc; list(msmpetsc.frames(sys.argv[1], petsc_options=
 
 
 @pytest.mark.parametrize("options", ["-pc_type jacobbi", "-pc_type hypre -pc_hypre_type foo"])
-def test_a_process_ends_with_its_error_though_python_has_left_petsc_an_object(tmp_path: Path, options: str):
+def test_a_process_ends_with_its_error_though_python_has_left_petsc_an_object(
+    tmp_path: Path, options: str
+):
     """The traceback holds a PC of type python, which PETSc destroyed once Python was no more."""
     scene = block_scene(tmp_path, **SCENE)
-    done = python("-m", "msmpetsc", "run", scene, "-o", tmp_path / "o.h5", *options.split(), env=ENVIRONMENT | ALONE)
+    done = python(
+        "-m",
+        "msmpetsc",
+        "run",
+        scene,
+        "-o",
+        tmp_path / "o.h5",
+        *options.split(),
+        env=ENVIRONMENT | ALONE,
+    )
     assert_one_line(done, 2, "PETSc")
     done = python("-c", FRAMES, scene, options, env=ENVIRONMENT | ALONE)
     assert done.returncode == 1 and "PETSC ERROR" not in done.stderr, done.stderr
@@ -164,7 +191,9 @@ def test_an_option_that_is_read_while_solving_is_awaited_until_something_is_solv
     """A body at rest without loads solves nothing."""
     still = SCENE | {"gravity": {"acceleration": [0, 0, 0]}}
     run(1, *COMMAND, block_scene(tmp_path, **still), "-o", tmp_path / "o.h5", "-ksp_view", status=0)
-    done = run(1, *COMMAND, block_scene(tmp_path, **SCENE), "-o", tmp_path / "p.h5", "-ksp_view", status=0)
+    done = run(
+        1, *COMMAND, block_scene(tmp_path, **SCENE), "-o", tmp_path / "p.h5", "-ksp_view", status=0
+    )
     assert "KSP Object" in done.stdout
 
 
@@ -176,7 +205,9 @@ def test_newton_refuses_options_of_the_loop_that_it_has_itself(petsc_options, op
 
 
 def test_newtons_loop_keeps_what_options_of_snes_mean(tmp_path: Path):
-    path = block_scene(tmp_path, **SCENE | {"solver": {"preset": "newton-multigrid", "error": 1e-4}})
+    path = block_scene(
+        tmp_path, **SCENE | {"solver": {"preset": "newton-multigrid", "error": 1e-4}}
+    )
     words = ["-snes_monitor", "-snes_converged_reason", "-snes_view", "-ksp_view"]
     said = run(1, *COMMAND, path, "-o", tmp_path / "o.h5", *words, status=0).stdout
     iterations = [int(number) for number in re.findall(r"(\d+) SNES Function norm", said)]
@@ -197,14 +228,18 @@ def test_a_solver_that_ends_by_a_rule_of_its_own_is_told(petsc_options):
 
 def test_iterations_of_a_step_have_a_bound_that_no_option_lifts(petsc_options):
     """Steps that are cut short to nothing go on as long as they may."""
-    petsc_options(snes_type="newtonls", snes_linesearch_maxstep="1e-9", snes_max_it="100000", pc_type="jacobi")
+    petsc_options(
+        snes_type="newtonls", snes_linesearch_maxstep="1e-9", snes_max_it="100000", pc_type="jacobi"
+    )
     lattice = beam()
     stepper = Stepper(COMM, lattice, T, find_preset("anderson"), 1e-9)
     problem = StepProblem(lattice.nodes, lattice.nodes, weight(lattice))
     with pytest.raises(StepFailed, match="DIVERGED_MAX_IT"):
         stepper.step(problem)
     assert (
-        0.5 * MOST_ITERATIONS < stepper.work_so_far().ksp_its + 10 * stepper.method.iterations < 1.1 * MOST_ITERATIONS
+        0.5 * MOST_ITERATIONS
+        < stepper.work_so_far().ksp_its + 10 * stepper.method.iterations
+        < 1.1 * MOST_ITERATIONS
     )
     stepper.destroy()
 
@@ -212,7 +247,9 @@ def test_iterations_of_a_step_have_a_bound_that_no_option_lifts(petsc_options):
 @pytest.mark.parametrize("load", ["gravity", "force"])
 def test_a_load_beyond_all_numbers_is_told(tmp_path: Path, load: str):
     force = {"region": {"box": [[0, 0, 0], [1, 1, 0.1]], "relative": True}, "total": [1e30, 0, 0]}
-    tables = {"gravity": {"acceleration": [1e30, 0, 0]}} if load == "gravity" else {"force": [force]}
+    tables = (
+        {"gravity": {"acceleration": [1e30, 0, 0]}} if load == "gravity" else {"force": [force]}
+    )
     path = block_scene(tmp_path, **SCENE | tables)
     assert "check gravity, force" in command_error("run", path, "-o", tmp_path / "o.h5")
 
@@ -244,7 +281,11 @@ def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options
 def test_shown_options_given_back_change_nothing(petsc_options, preset: str):
     before = swing(preset, 2)
     lines = shown_options({"": (find_preset(preset), 0)})
-    given = dict(line[1:].split() if " " in line else (line[1:], "") for line in lines if line.startswith("-"))
+    given = dict(
+        line[1:].split() if " " in line else (line[1:], "")
+        for line in lines
+        if line.startswith("-")
+    )
     assert {f"-{name} {value}".strip() for name, value in PRESETS[preset].options.items()} <= {
         line.removeprefix("# ").partition("    ")[0] for line in lines
     }
@@ -262,19 +303,28 @@ def test_options_are_shown_without_a_mesh_as_a_file_that_can_be_given(tmp_path: 
     assert "-ksp_max_it 77" in shown.stdout and "# -ksp_rtol 1e-1" in shown.stdout
     (tmp_path / "options").write_text(shown.stdout)
     scene = block_scene(
-        tmp_path, **SCENE, mesh={"source": "gone.ply"}, solver={"preset": "paper", "max_iterations": 2000}
+        tmp_path,
+        **SCENE,
+        mesh={"source": "gone.ply"},
+        solver={"preset": "paper", "max_iterations": 2000},
     )
     other = ("--show-options", scene, "--true-error", "1", "-pc_type", "sor")
     shown = run(1, *COMMAND, *other)
-    assert "-reference_pc_type mg" in shown.stdout and "-snes_max_it 2000" in shown.stdout, shown.stderr
+    assert "-reference_pc_type mg" in shown.stdout and "-snes_max_it 2000" in shown.stdout, (
+        shown.stderr
+    )
     assert "-pc_type sor" in shown.stdout and "-pc_type none" not in shown.stdout
     scene = block_scene(tmp_path, **SCENE)
     given = ("--preset", "anderson", "--frames", "1", "-options_file", tmp_path / "options")
     run(1, *COMMAND, scene, "-o", tmp_path / "o.h5", *given, status=0)
 
 
-@pytest.mark.parametrize(("option", "wanted"), [("ksp_type=pipcg", "pipecg"), ("pc_type=jacoby", "jacobi")])
-def test_a_misspelt_type_of_solver_is_named_with_the_nearest(option: str, wanted: str, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("option", "wanted"), [("ksp_type=pipcg", "pipecg"), ("pc_type=jacoby", "jacobi")]
+)
+def test_a_misspelt_type_of_solver_is_named_with_the_nearest(
+    option: str, wanted: str, tmp_path: Path
+):
     name, value = option.split("=")
     words = ["run", block_scene(tmp_path, **SCENE), "-o", tmp_path / "o.h5", f"-{name}", value]
     assert f"{value}, did you mean {wanted!r}?" in command_error(*words)

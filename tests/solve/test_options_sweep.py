@@ -24,11 +24,19 @@ PINNED = [{"region": {"box": [[-1, -1, 0.9], [2, 2, 2]], "relative": True}}]
 FLOOR = [{"shape": "plane", "point": [0, 0, -0.001], "normal": [0, 0, 1], "response": "penalty"}]
 MOVES = {"time": {"step": 0.01, "duration": 0.01}, "gravity": GRAVITY}
 SCENES = {  # tables, and options that make the objects
-    "multigrid": (MOVES | {"pin": PINNED, "solver": {"preset": "newton-multigrid", "error": 1e-6}}, []),
-    "contact": (MOVES | {"obstacle": FLOOR, "solver": {"preset": "newton", "error": 1e-4}}, ["-pc_type", "gamg"]),
+    "multigrid": (
+        MOVES | {"pin": PINNED, "solver": {"preset": "newton-multigrid", "error": 1e-6}},
+        [],
+    ),
+    "contact": (
+        MOVES | {"obstacle": FLOOR, "solver": {"preset": "newton", "error": 1e-4}},
+        ["-pc_type", "gamg"],
+    ),
     "anderson": (MOVES | {"pin": PINNED, "solver": {"preset": "anderson", "error": 1e-4}}, []),
 }
-OF_OBJECTS = re.compile(r"(?!\w*(plot|_lg))\w*?(snes|ksp|pc|mat|mg|sub|npc)_")  # there may be no display
+OF_OBJECTS = re.compile(
+    r"(?!\w*(plot|_lg))\w*?(snes|ksp|pc|mat|mg|sub|npc)_"
+)  # there may be no display
 VIEWER = re.compile(r" (ascii|binary|draw|socket|saws)\[?:")
 CHOICES = re.compile(r"\((?:choose )?one of\)?(.*?)\(\w*\)?$")
 NOT_WORDS = ["abc", "0", "-1", "nan"]
@@ -57,7 +65,9 @@ def attempt(folder: Path, words: list[str]) -> tuple[int | None, str]:
         status = 1
         try:
             resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-            for number in SIGNALS:  # PETSc's handlers would wait for an MPI that this process does not have
+            for (
+                number
+            ) in SIGNALS:  # PETSc's handlers would wait for an MPI that this process does not have
                 signal.signal(number, signal.SIG_DFL)
             said = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
@@ -94,7 +104,14 @@ def fault_of(status: int | None, said: str) -> str:
 )
 def test_each_option_is_obeyed_or_refused_in_one_line(tmp_path: Path, name: str, every: int):
     tables, objects = SCENES[name]
-    words = ["run", block_scene(tmp_path, **tables), "-o", tmp_path / "o.h5", "--overwrite", *objects]
+    words = [
+        "run",
+        block_scene(tmp_path, **tables),
+        "-o",
+        tmp_path / "o.h5",
+        "--overwrite",
+        *objects,
+    ]
     words = [str(word) for word in words]
     listed = run(1, "-m", "msmpetsc", *words, "-help", status=0).stdout
     start_for_runs(MPI.COMM_WORLD, [])
@@ -103,6 +120,10 @@ def test_each_option_is_obeyed_or_refused_in_one_line(tmp_path: Path, name: str,
     assert len(tried) > 300
     ends = {option: attempt(tmp_path, [*words, *option]) for option in tried[::every]}
     faults = {
-        " ".join(option): (fault, ends[option][1][-400:]) for option in ends if (fault := fault_of(*ends[option]))
+        " ".join(option): (fault, ends[option][1][-400:])
+        for option in ends
+        if (fault := fault_of(*ends[option]))
     }
-    assert not faults, "\n".join(f"{option}: {fault}\n{said}" for option, (fault, said) in faults.items())
+    assert not faults, "\n".join(
+        f"{option}: {fault}\n{said}" for option, (fault, said) in faults.items()
+    )

@@ -23,11 +23,25 @@ from msmpetsc.study.metrics import distance_of_shapes
 
 STUDIES = ROOT / "scenes" / "studies"
 MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]
-CASES = {case["name"]: case for of in MAPS for case in of.get("case", ()) if case["file"].startswith("hard/")}
+CASES = {
+    case["name"]: case
+    for of in MAPS
+    for case in of.get("case", ())
+    if case["file"].startswith("hard/")
+}
 SOLID = ", solid"  # a case with it in its name is of a neo-Hookean solid, not of springs
 SOLIDS = [
     name + SOLID
-    for name in ("squeezed far", "flat", "mirrored", "cloud", "column", "pressed", "pressed flat", "through")
+    for name in (
+        "squeezed far",
+        "flat",
+        "mirrored",
+        "cloud",
+        "column",
+        "pressed",
+        "pressed flat",
+        "through",
+    )
 ]
 TOUCHING = {case["name"]: case for of in MAPS if of["name"] == "touching" for case in of["case"]}
 
@@ -62,7 +76,9 @@ class Played:
         return int((least_volumes(frame.position, self.lattice.cells) <= 0).sum())
 
     def shape_error(self, mirror: tuple = (1, 1, 1)) -> float:
-        return distance_of_shapes(self.last.position, self.lattice.nodes * mirror, self.lattice.mass)
+        return distance_of_shapes(
+            self.last.position, self.lattice.nodes * mirror, self.lattice.mass
+        )
 
 
 @cache
@@ -89,7 +105,8 @@ LONG = {"stiff half, twisted", "pressed flat, solid"}  # ten seconds
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in [*CASES, *SOLIDS]]
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in [*CASES, *SOLIDS]],
 )
 def test_newton_survives(name: str):
     played = play(name)
@@ -122,7 +139,9 @@ BACK = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in BACK])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in BACK]
+)
 def test_it_comes_back_to_its_rest_shape(name: str):
     """Somewhere in space, within a part of its length; no cell stays inverted."""
     played = play(name)
@@ -147,7 +166,9 @@ def test_a_nearly_flat_body_comes_back_to_its_rest_shape_or_the_mirror_image():
 # ---- bodies that hang
 
 
-@pytest.mark.parametrize("name", ["beam", "light half", "stiff half", "one cell", "sheet", "by a node", "by an edge"])
+@pytest.mark.parametrize(
+    "name", ["beam", "light half", "stiff half", "one cell", "sheet", "by a node", "by an edge"]
+)
 def test_it_hangs_at_rest(name: str):
     played = play(name)
     # the one cell that two blocks share along an edge is cut: the joint is soft and swings longer
@@ -174,11 +195,18 @@ def test_a_column_bows_aside(name: str):
 
 def test_parts_of_the_greatest_contrast_are_solved():
     """A clamped beam squashed to 0.62, half of it 1e6 times as stiff: at 1e8, now refused, a step did not end."""
-    played = play("stiff half", "start.scale=[0.62, 0.62, 0.62]", "cages.cell_size=0.125", "time.duration=0.5")
+    played = play(
+        "stiff half", "start.scale=[0.62, 0.62, 0.62]", "cages.cell_size=0.125", "time.duration=0.5"
+    )
     assert not played.words and played.last.step_error <= 1e-3 and played.last.iterations < 1500
     stiff = np.flatnonzero(played.lattice.nodes[:, 0] > 0.6)
-    (x, y), middle = (q[stiff] for q in (played.lattice.nodes, played.last.position)), len(stiff) // 2
-    np.testing.assert_allclose(np.linalg.norm(y - y[middle], axis=1), np.linalg.norm(x - x[middle], axis=1), atol=1e-4)
+    (x, y), middle = (
+        (q[stiff] for q in (played.lattice.nodes, played.last.position)),
+        len(stiff) // 2,
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(y - y[middle], axis=1), np.linalg.norm(x - x[middle], axis=1), atol=1e-4
+    )
 
 
 # ---- what springs cannot see
@@ -195,7 +223,10 @@ def test_a_flat_body_leaves_its_plane():
 def test_a_mirrored_body_stays_mirrored():
     played = play("mirrored")
     assert played.inverted(played.last) == len(played.lattice.cells)
-    assert played.last.elastic < 1e-20 and played.shape_error(mirror=(-1, 1, 1)) < 1e-6 < 0.1 < played.shape_error()
+    assert (
+        played.last.elastic < 1e-20
+        and played.shape_error(mirror=(-1, 1, 1)) < 1e-6 < 0.1 < played.shape_error()
+    )
 
 
 @pytest.mark.parametrize("name", ["squeezed far", "pressed"])
@@ -205,7 +236,10 @@ def test_cells_that_went_through_each_other_stay_so_under_hookes_law(name: str, 
     petsc_options(pc_type="jacobi")
     played = play.__wrapped__(name)
     assert 0 < played.inverted(played.last) < len(played.lattice.cells)
-    assert played.last.elastic < 1e-4 * max(frame.elastic for frame in played.frames) and played.shape_error() > 0.05
+    assert (
+        played.last.elastic < 1e-4 * max(frame.elastic for frame in played.frames)
+        and played.shape_error() > 0.05
+    )
 
 
 def test_faces_led_through_each_other_leave_a_body_turned_over():
@@ -229,9 +263,13 @@ def test_springs_pass_through_no_length_exactly():
 
 def test_lengths_and_times_a_million_times_as_long_or_short_are_the_same_motion():
     same = [play(name) for name in ("stretched", "tiny", "huge")]
-    one, *others = [[(f.position - f.position.mean(axis=0)) / p.size for f in p.frames] for p in same]
+    one, *others = [
+        [(f.position - f.position.mean(axis=0)) / p.size for f in p.frames] for p in same
+    ]
     for other in others:
-        assert max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 2e-2  # ten steps, of 1e-3 each
+        assert (
+            max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 2e-2
+        )  # ten steps, of 1e-3 each
 
 
 # ---- other methods
@@ -269,7 +307,12 @@ def test_other_presets_bring_it_back_too(method: str, name: str):
 def test_other_presets_fail_and_say_so(method: str, name: str, words: str):
     """In one line, with the frame and what to try."""
     told = play(name, *OTHERS[method]).words
-    assert told.startswith("frame ") and words in told and "try a smaller time.step" in told and "\n" not in told
+    assert (
+        told.startswith("frame ")
+        and words in told
+        and "try a smaller time.step" in told
+        and "\n" not in told
+    )
 
 
 RESCUED = [("substep", "cages.cell_size=0.125"), ("fallback", "material.poisson_ratio=0.4")]
@@ -281,14 +324,18 @@ def test_what_anderson_cannot_do_is_rescued(how: str, change: str):
     name, anderson = "mirrored, solid", [*OTHERS["anderson"], change]
     assert "DIVERGED" in play(name, *anderson).words
     played = play(name, *anderson, f"safety.on_failure={how}")
-    assert not played.words and played.shape_error() < 1e-4 and played.inverted(played.last) == 0  # it still swings
+    assert (
+        not played.words and played.shape_error() < 1e-4 and played.inverted(played.last) == 0
+    )  # it still swings
     rescued = [getattr(frame, f"{how}s") for frame in played.frames]
     assert max(rescued) > rescued[-1]  # less and less
 
 
 def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):
     """--force takes another safety.on_failure: there its halvings and its tally mean nothing."""
-    path = block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0.0, 0.0, -9.81]})
+    path = block_scene(
+        tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0.0, 0.0, -9.81]}
+    )
     scene = load_scene(path)
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         saved = simulation.saved
@@ -308,6 +355,11 @@ def test_surfaces_that_meet_do_not_cross(name: str):
     assert len(frames) == 1 + scene.time.steps and np.isfinite(frames[-1].position).all()
     assert max(frame.self_contacts for frame in frames) > 5
     assert sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames) == 0
-    if name.startswith("tips"):  # nothing acts on them from outside: it stays what it was, none, to the steps' error
+    if name.startswith(
+        "tips"
+    ):  # nothing acts on them from outside: it stays what it was, none, to the steps' error
         speed = scene.body[0].start.velocity[2]
-        assert np.abs(frames[-1].momentum).max() < scene.solver.error * model.lattice.mass.sum() * speed
+        assert (
+            np.abs(frames[-1].momentum).max()
+            < scene.solver.error * model.lattice.mass.sum() * speed
+        )

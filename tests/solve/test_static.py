@@ -25,7 +25,9 @@ SWITCHED = [  # to one side, to the other, gone
     {"region": TOP, "total": [1.0, 0.0, 0.0], "stop": 3.0},
     {"region": TOP, "total": [-1.0, 0.0, 0.0], "start": 3.0, "stop": 5.0},
 ]
-EULER = np.pi**2 / 4 * YOUNG * COLUMN[0] ** 4 / 12 / COLUMN[2] ** 2  # [N] that a clamped column buckles at
+EULER = (
+    np.pi**2 / 4 * YOUNG * COLUMN[0] ** 4 / 12 / COLUMN[2] ** 2
+)  # [N] that a clamped column buckles at
 
 
 def column(folder: Path, time: dict = STATE, **tables) -> Path:
@@ -83,7 +85,13 @@ def test_anchors_lead_from_state_to_state_and_let_go(tmp_path: Path):
 
 def test_an_obstacle_presses(tmp_path: Path):
     """k d of all nodes that it holds is the weight, where the body is but guided from the side."""
-    plane = {"shape": "plane", "point": [0, 0, 0.01], "normal": [0, 0, 1], "response": "penalty", "stiffness": 1e3}
+    plane = {
+        "shape": "plane",
+        "point": [0, 0, 0.01],
+        "normal": [0, 0, 1],
+        "response": "penalty",
+        "stiffness": 1e3,
+    }
     guide = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.0, 0.0]}]}]
     model, frames = play(column(tmp_path, anchor=guide, obstacle=[plane]))
     bottom = model.lattice.nodes[:, 2] < 0.01
@@ -96,7 +104,9 @@ def test_an_obstacle_presses(tmp_path: Path):
 POINT = {"pin": [{"region": {"box": [[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]]}}]}
 
 
-@pytest.mark.parametrize("tables, words", [({}, "held by nothing"), (POINT, "held at a point or two")])
+@pytest.mark.parametrize(
+    "tables, words", [({}, "held by nothing"), (POINT, "held at a point or two")]
+)
 def test_a_body_that_may_turn_or_move_is_refused(tmp_path: Path, tables: dict, words: str):
     scene = column(tmp_path, gravity={"acceleration": [0.0, 0.0, -0.1]}, **tables)
     assert words in input_error(lambda: play(scene))
@@ -128,7 +138,9 @@ def test_a_column_buckles(tmp_path: Path, sideways: float, share: float, buckles
     assert frames[-1].step_error < 1e-7
 
 
-def test_a_load_comes_on_in_steps_and_ends_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_load_comes_on_in_steps_and_ends_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Brought on at once or in parts: the equilibrium is but one."""
     _, at_once = play(column(tmp_path, **BEAM))
     monkeypatch.setattr(LoadSteps, "__init__", start_with_an_eighth)
@@ -154,7 +166,9 @@ def test_shares_of_a_load():
 
 
 @pytest.mark.parametrize("on_failure", ["fallback", "substep"])
-def test_a_state_that_fails_is_found_another_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_failure: str):
+def test_a_state_that_fails_is_found_another_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_failure: str
+):
     """By the robust preset, or by way of states at times between, which are states, too: anchors go there in parts."""
     anchor = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.05, 0.0]}]}]
     tables = {"pin": [{"region": BOTTOM}], "anchor": anchor}

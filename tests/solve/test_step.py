@@ -38,10 +38,14 @@ def reference() -> list:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_free_fall_is_the_schemes_own(preset: str):
     """q_n = q_0 + g t^2 n (n + 1) / 2: implicit Euler from rest, to the KSP's tolerance for ``paper``."""
-    lattice = build_lattice(cages_of(block(3, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear"))
+    lattice = build_lattice(
+        cages_of(block(3, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
+    )
     fallen = swing(preset, 5, lattice)[-1].position - lattice.nodes
     tolerance = {"paper": 1e-8}.get(preset, 1e-12)
-    np.testing.assert_allclose(fallen, np.tile(GRAVITY * T**2 * 15, (len(fallen), 1)), atol=tolerance)
+    np.testing.assert_allclose(
+        fallen, np.tile(GRAVITY * T**2 * 15, (len(fallen), 1)), atol=tolerance
+    )
 
 
 def test_newton_solves_the_step_to_rounding(reference: list):
@@ -80,7 +84,10 @@ def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
         stepper = Stepper(COMM, lattice, T, find_preset(name), error=error)
         try:
             result = stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
-            return result, stepper.snes.reason == PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
+            return (
+                result,
+                stepper.snes.reason == PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE,
+            )
         finally:
             stepper.destroy()
 
@@ -100,12 +107,19 @@ def test_too_loose_a_solve_is_told():
 def test_published_presets_take_ten_iterations_and_say_their_error():
     for result in swing("fast-msm", 3):
         # each iteration is one solve; the rest is CG that estimates the error
-        assert result.cost.iterations == 10 and 10 < result.cost.ksp_its <= 20 and 0 < result.cost.step_error < 1
+        assert (
+            result.cost.iterations == 10
+            and 10 < result.cost.ksp_its <= 20
+            and 0 < result.cost.step_error < 1
+        )
 
 
 def test_a_budget_is_kept_and_the_error_reported():
     results = swing("anderson", 3, error=1e-12, max_iterations=4)
-    assert all(result.cost.iterations <= 4 for result in results) and results[-1].cost.step_error > 1e-12
+    assert (
+        all(result.cost.iterations <= 4 for result in results)
+        and results[-1].cost.step_error > 1e-12
+    )
 
 
 def test_cg_and_cholesky_give_the_same_step(petsc_options):
@@ -117,7 +131,10 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
 @pytest.mark.parametrize(
     ("preset", "options"),
     [
-        ("newton", {"ksp_type": "preonly", "pc_type": "cholesky"}),  # which takes no start for its solves
+        (
+            "newton",
+            {"ksp_type": "preonly", "pc_type": "cholesky"},
+        ),  # which takes no start for its solves
         ("newton", {"ksp_type": "chebyshev"}),  # which tries the Hessian when it is set up
         ("anderson", {"snes_type": "newtonls"}),  # which solves without an NPC
         ("anderson", {"snes_type": "newtontr"}),
@@ -153,7 +170,9 @@ def test_a_preset_leaves_no_options_behind():
 
 def test_A_is_M_plus_t2_L():
     """Against a dense sum over springs: symmetric, positive definite, its rows sum to the mass without pins."""
-    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear"))
+    lattice = build_lattice(
+        cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
+    )
     stepper = Stepper(COMM, lattice, T, find_preset("anderson"))
     rows = np.arange(lattice.owned, dtype=np.int32)
     A = stepper.jacobian.matrix.getValues(rows, rows)
@@ -168,7 +187,9 @@ def test_A_is_M_plus_t2_L():
 
 def test_a_plain_iteration_is_the_papers_global_step():
     """x <- x - A^(-1) F(x) from y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext) (Eq. 17), dense here."""
-    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear"))
+    lattice = build_lattice(
+        cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
+    )
     lattice = replace(lattice, rest_length=0.95 * lattice.rest_length)
     stepper = Stepper(COMM, lattice, T, find_preset("fast-msm"), max_iterations=1)
     rows = np.arange(lattice.owned, dtype=np.int32)
@@ -203,8 +224,12 @@ def test_a_strut_that_buckles_under_its_load():
 
 def test_a_body_pressed_to_half_still_gives_a_descent():
     """Springs under compression make the true Hessian indefinite; newton must come through."""
-    lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), Material(density=1000, young_modulus=2e6, law="linear"))
-    pressed = lattice.nodes * [1, 1, 0.5] + 1e-3 * np.random.default_rng(1).normal(size=lattice.nodes.shape)
+    lattice = build_lattice(
+        cages_of(block(4, 3, 3), 0.1), Material(density=1000, young_modulus=2e6, law="linear")
+    )
+    pressed = lattice.nodes * [1, 1, 0.5] + 1e-3 * np.random.default_rng(1).normal(
+        size=lattice.nodes.shape
+    )
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-6)
     x = stepper.step(StepProblem(pressed, pressed, weight(lattice))).position
     stepper.destroy()

@@ -13,7 +13,9 @@ def control(order: int, error: float, levels: tuple[int, int] = LEVELS) -> StepC
     return StepControl(order, error, STEP, STEP * STEPS, levels)
 
 
-def march(control: StepControl, rate: Callable[[float], float], until: float = 1.0) -> list[tuple[float, int]]:
+def march(
+    control: StepControl, rate: Callable[[float], float], until: float = 1.0
+) -> list[tuple[float, int]]:
     """Start and level of each step of a motion of size 1; local errors are t^(order + 1) times the greater rate at
     their ends."""
     ticks, tick, taken = Ticks(STEP, STEPS, LEVELS[0], []), 0, []
@@ -64,7 +66,9 @@ def test_a_step_too_far_off_is_taken_again_shorter_but_for_the_shortest():
 def test_steps_start_at_multiples_of_themselves_and_end_at_events_and_at_the_end():
     ticks = Ticks(STEP, 10, -4, [0.03, 0.0556, 7.0])
     assert ticks.length(0) == 16 and ticks.time(3 * 16) == pytest.approx(0.03)
-    assert ticks.fitting(0, 6) == 1  # two steps, then half of the next two would be beyond the event
+    assert (
+        ticks.fitting(0, 6) == 1
+    )  # two steps, then half of the next two would be beyond the event
     assert ticks.fitting(2 * 16, 1) == 0
     assert ticks.fitting(3 * 16 + 1, 6) == -4
     assert 3 * 16 in ticks.events and 3 * 16 + 1 not in ticks.events

@@ -29,12 +29,16 @@ EXPLICIT = {"integrator": "verlet"}
 
 
 def integrator(lattice: Lattice, substep: float | None = None) -> Verlet:
-    model = Model(None, lattice, None, [], [], [], [], (lattice.nodes, np.zeros_like(lattice.nodes)))
+    model = Model(
+        None, lattice, None, [], [], [], [], (lattice.nodes, np.zeros_like(lattice.nodes))
+    )
     time = Time(step=T, duration=1.0, substep=substep, **EXPLICIT)
     return Verlet(COMM, Environment(model), time, Solver(), "")
 
 
-def fly(lattice: Lattice, q: np.ndarray, v: np.ndarray, steps: int, substep: float | None = None) -> list[State]:
+def fly(
+    lattice: Lattice, q: np.ndarray, v: np.ndarray, steps: int, substep: float | None = None
+) -> list[State]:
     """States of a body that nothing acts on, at the start and after each step."""
     stepper, states = integrator(lattice, substep), [State(q, q - T * v)]
     try:
@@ -51,7 +55,9 @@ def velocity(state: State) -> np.ndarray:
 
 def cube(law: str = "linear") -> Lattice:
     """2 x 2 x 2 cells of 0.1 m."""
-    return build_lattice(cages_of(block(2, 2, 2), 0.1), Material(density=1000, young_modulus=2e4, law=law))
+    return build_lattice(
+        cages_of(block(2, 2, 2), 0.1), Material(density=1000, young_modulus=2e4, law=law)
+    )
 
 
 def shaken(lattice: Lattice, size: float) -> np.ndarray:
@@ -76,11 +82,15 @@ def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
 def test_free_flight_keeps_momentum_and_angular_momentum():
     """The forces are central, and a kick changes v at one q: the leapfrog keeps r x m v, implicit Euler does not."""
     lattice = cube()
-    v = np.cross([0, 2, 9], lattice.nodes) + np.random.default_rng(1).normal(size=lattice.nodes.shape)
+    v = np.cross([0, 2, 9], lattice.nodes) + np.random.default_rng(1).normal(
+        size=lattice.nodes.shape
+    )
     states = fly(lattice, shaken(lattice, 0.01), v, 60)
     m = lattice.mass
     moments = np.array([(m @ velocity(s), m @ np.cross(s.q, velocity(s))) for s in states])
-    np.testing.assert_allclose(moments, np.broadcast_to(moments[0], moments.shape), atol=1e-11 * np.abs(moments).max())
+    np.testing.assert_allclose(
+        moments, np.broadcast_to(moments[0], moments.shape), atol=1e-11 * np.abs(moments).max()
+    )
     assert np.abs(states[-1].q - states[0].q).max() > 0.1
 
 
@@ -146,10 +156,14 @@ def test_the_limit_is_that_of_the_greatest_eigenvalue(law: str, held: bool):
 
 def test_a_substep_beyond_the_limit_is_shortened_and_a_shorter_one_kept(tmp_path: Path, caplog):
     scene = block_scene(tmp_path, time={"step": T, "duration": 3 * T} | EXPLICIT)
-    counts = {s: [f.iterations for f in play(scene, f"time.substep={s}")[1][1:]] for s in (1.0, 1e-4)}
+    counts = {
+        s: [f.iterations for f in play(scene, f"time.substep={s}")[1][1:]] for s in (1.0, 1e-4)
+    }
     usual = [f.iterations for f in play(scene)[1][1:]]
     assert counts[1.0] == usual and counts[1e-4] == [167] * 3
-    told = [record.getMessage() for record in caplog.records if "time.substep" in record.getMessage()]
+    told = [
+        record.getMessage() for record in caplog.records if "time.substep" in record.getMessage()
+    ]
     assert len(told) == 1 and "beyond the stability limit" in told[0]
 
 
@@ -194,24 +208,35 @@ def test_a_body_that_folds_is_not_heated(tmp_path: Path, monkeypatch):
 def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp_path: Path):
     left = {"box": [[-1, -1, -1], [0.01, 1, 1]]}
     path = [{"time": 1.0, "by": [0, 0, 0.5]}]
-    anchors = [{"region": r, "path": path, "stop": 6.5 * T} for r in (left, {"box": [[0.1, -1, -1], [1, 1, 0.2]]})]
-    model, frames = play(block_scene(tmp_path, time={"step": T, "duration": 12 * T} | EXPLICIT, anchor=anchors))
+    anchors = [
+        {"region": r, "path": path, "stop": 6.5 * T}
+        for r in (left, {"box": [[0.1, -1, -1], [1, 1, 0.2]]})
+    ]
+    model, frames = play(
+        block_scene(tmp_path, time={"step": T, "duration": 12 * T} | EXPLICIT, anchor=anchors)
+    )
     prescribed = model.lattice.nodes[:, 0] == 0
     for frame in frames[:7]:
         place = model.lattice.nodes[prescribed] + [0, 0, 0.5 * frame.time]
         np.testing.assert_allclose(frame.position[prescribed], place, atol=1e-14)
     np.testing.assert_allclose(frames[-1].momentum, frames[7].momentum, atol=1e-10)
-    assert frames[-1].momentum[2] == pytest.approx(0.5 * model.lattice.mass.sum(), rel=0.2)  # the rest sways
+    assert frames[-1].momentum[2] == pytest.approx(
+        0.5 * model.lattice.mass.sum(), rel=0.2
+    )  # the rest sways
 
 
 @pytest.mark.parametrize("stop", [6.0, 6.5])
 def test_the_work_of_an_anchor_that_lets_go_is_no_energy_from_nowhere(tmp_path: Path, stop: float):
     """It turns round half a step before it lets go within a step, and the nodes keep the speed that this gave them."""
     top = {"box": [[-1, -1, 0.2], [1, 1, 1]]}
-    path = [{"time": time * T, "by": [0, 0, 0.03 * height]} for time, height in ((6.25, 1), (12, 6))]
+    path = [
+        {"time": time * T, "by": [0, 0, 0.03 * height]} for time, height in ((6.25, 1), (12, 6))
+    ]
     anchor = [{"region": top, "path": path, "stop": stop * T}]
     time = {"step": T, "duration": 9 * T, "substep": 1e-4} | EXPLICIT
-    _, frames = play(block_scene(tmp_path, time=time, anchor=anchor, gravity={"acceleration": [0, 0, -G]}))
+    _, frames = play(
+        block_scene(tmp_path, time=time, anchor=anchor, gravity={"acceleration": [0, 0, -G]})
+    )
     assert frames[6].kinetic + frames[6].elastic > 0.1
     assert max(frame.energy_gained for frame in frames) < 3e-3 * frames[6].kinetic
 
@@ -221,7 +246,13 @@ TILT = 0.3  # [rad] of the slope
 
 def on_a_slope(folder: Path, friction: float, **time) -> Path:
     """A block on a plane, with gravity tilted."""
-    floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": friction}
+    floor = {
+        "shape": "plane",
+        "point": [0, 0, 0],
+        "normal": [0, 0, 1],
+        "response": "penalty",
+        "friction": friction,
+    }
     gravity = {"acceleration": [G * np.sin(TILT), 0, -G * np.cos(TILT)]}
     return block_scene(folder, gravity=gravity, obstacle=[floor], time=time)
 
@@ -254,6 +285,10 @@ def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
     scene = on_a_slope(tmp_path, mu, step=T, duration=1.0)
     model, frames = go_on(scene, State(start.q, start.q), 30)
     m, last = model.lattice.mass.sum(), frames[-1]
-    expected = m * G * np.sin(TILT) * last.time - mu * (last.momentum[2] + m * G * np.cos(TILT) * last.time)
+    expected = m * G * np.sin(TILT) * last.time - mu * (
+        last.momentum[2] + m * G * np.cos(TILT) * last.time
+    )
     assert last.momentum[0] == pytest.approx(expected, rel=1e-6)
-    assert last.momentum[0] == pytest.approx(m * G * (np.sin(TILT) - mu * np.cos(TILT)) * last.time, rel=1e-6)
+    assert last.momentum[0] == pytest.approx(
+        m * G * (np.sin(TILT) - mu * np.cos(TILT)) * last.time, rel=1e-6
+    )

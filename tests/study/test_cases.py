@@ -20,8 +20,14 @@ from msmpetsc.study.study_file import load_study
         (ONE_SCENE + "[[sweep]]\nprests = []", ["sweep.0.prests", "'presets'", "(line 5)"]),
         (ONE_SCENE + '[[sweep]]\npresets = ["newtom"]', ["sweep.0.presets.0", "'newton'"]),
         (ONE_SCENE + "[[sweep]]\nerrors = [2.0]", ["sweep.0.errors.0", "must be < 1"]),
-        (ONE_SCENE + '[[sweep]]\noptions = ["-pc_type \'icc"]', ["sweep.0.options.0", "no closing quotation"]),
-        (ONE_SCENE + 'reference = { integrator = "implicit-euler" }\n[[sweep]]', ["scene.0.reference", "needs step"]),
+        (
+            ONE_SCENE + '[[sweep]]\noptions = ["-pc_type \'icc"]',
+            ["sweep.0.options.0", "no closing quotation"],
+        ),
+        (
+            ONE_SCENE + 'reference = { integrator = "implicit-euler" }\n[[sweep]]',
+            ["scene.0.reference", "needs step"],
+        ),
         (ONE_SCENE + "steps = 3\nduration = 0.5\n[[sweep]]", ["scene.0.duration", "beside steps"]),
         (ONE_SCENE + ONE_SCENE + "[[sweep]]", ["scene", "two scenes", "'a'"]),
         ("[[sweep]]", ["scene", "required"]),
@@ -37,10 +43,15 @@ def test_a_mistake_in_a_study_file_is_one_line(tmp_path: Path, wrong: str, words
     [
         ('file = "gone.toml"', ["gone.toml", "no such scene"]),
         ('file = "scene.toml"\nset = ["cages.cuont=3"]', ["cages.cuont", "'count'"]),
-        ('file = "scene.toml"\nreference = { integrator = "implicit-euler", step = 0.003 }', ["no multiple", "0.003"]),
+        (
+            'file = "scene.toml"\nreference = { integrator = "implicit-euler", step = 0.003 }',
+            ["no multiple", "0.003"],
+        ),
     ],
 )
-def test_a_wrong_scene_is_told_before_anything_is_run(tmp_path: Path, stand_in, wrong: str, words: list[str]):
+def test_a_wrong_scene_is_told_before_anything_is_run(
+    tmp_path: Path, stand_in, wrong: str, words: list[str]
+):
     text = input_error(lambda: carry_out(tmp_path, f'[[scene]]\nname = "a"\n{wrong}\n[[sweep]]'))
     assert all(word in text for word in words), text
     assert not (tmp_path / "out").exists()
@@ -59,7 +70,11 @@ def test_a_sweep_is_a_product(tmp_path: Path):
         "presets": ["newton", "anderson"], "options": ["", "-pc_type icc"], "cells": [10, 20],
         "time_steps": [0.01, 0.02], "errors": [0.1, 0.01], "max_iterations": [5], "ranks": [1, 2],
     }  # fmt: skip
-    text = ONE_SCENE + "[[sweep]]\n" + "\n".join(f"{name} = {json.dumps(values)}" for name, values in lists.items())
+    text = (
+        ONE_SCENE
+        + "[[sweep]]\n"
+        + "\n".join(f"{name} = {json.dumps(values)}" for name, values in lists.items())
+    )
     found = all_cases(tmp_path, text)
     assert len(found) == 2 * 2 * 2 * 2 * (2 + 1) * 2  # an error or a budget, not both
     assert len({one.id for one in found}) == len(found)
@@ -67,12 +82,18 @@ def test_a_sweep_is_a_product(tmp_path: Path):
     last = shown_command(found[-1])
     assert last.startswith("mpiexec -n 2 msmpetsc run ")
     assert last.endswith("-pc_type icc")
-    for told in ("cages.count=20", 'preset = "anderson", max_iterations = 5', "step = 0.02, duration = 0.1"):
+    for told in (
+        "cages.count=20",
+        'preset = "anderson", max_iterations = 5',
+        "step = 0.02, duration = 0.1",
+    ):
         assert told in last
 
 
 def test_what_has_no_meaning_for_verlet_is_not_multiplied(tmp_path: Path):
-    sweep = '[[sweep]]\nintegrators = ["verlet", "implicit-euler"]\npresets = ["newton", "anderson"]\n'
+    sweep = (
+        '[[sweep]]\nintegrators = ["verlet", "implicit-euler"]\npresets = ["newton", "anderson"]\n'
+    )
     sweep += "substeps = [1e-4, 1e-5]"
     found = all_cases(tmp_path, ONE_SCENE + sweep)
     assert [(one.integrator, one.preset, one.substep) for one in found] == [
@@ -111,10 +132,21 @@ def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
     sweep = '[[sweep]]\ncells = [10, 80]\n[[sweep]]\ncells = [10]\nset = ["cages.boundary=whole"]'
     found = all_cases(tmp_path, ONE_SCENE + reference + sweep)
     (one,) = {case.reference.id: case.reference for case in found}.values()
-    assert one.cells == 5000 and "cages.count=5000" in one.set and "cages.boundary=whole" not in one.set
+    assert (
+        one.cells == 5000
+        and "cages.count=5000" in one.set
+        and "cages.boundary=whole" not in one.set
+    )
     assert len(found) == 3 and all(case.stores_surface for case in (one, *found))
-    (own, _) = all_cases(tmp_path, ONE_SCENE + reference.replace("cells = 5000, ", "") + "[[sweep]]\ncells = [10, 80]")
-    assert own.reference.set[0] == "cages.count=10" and not own.stores_surface and not own.reference.stores_surface
+    (own, _) = all_cases(
+        tmp_path,
+        ONE_SCENE + reference.replace("cells = 5000, ", "") + "[[sweep]]\ncells = [10, 80]",
+    )
+    assert (
+        own.reference.set[0] == "cages.count=10"
+        and not own.stores_surface
+        and not own.reference.stores_surface
+    )
 
 
 def test_a_law_is_that_of_the_reference_too(tmp_path: Path):
@@ -124,9 +156,16 @@ def test_a_law_is_that_of_the_reference_too(tmp_path: Path):
     found = all_cases(tmp_path, ONE_SCENE + reference + sweep)
     assert [case.label for case in found] == ["linear", "neo-hookean"]
     for case in found:
-        assert f"material.law={case.label}" in case.set and f"material.law={case.label}" in case.reference.set
-    for case in all_cases(tmp_path, ONE_SCENE + reference.replace("cells", 'law = "linear", cells') + sweep):
-        assert [word for word in case.reference.set if word.startswith("material.law")][-1] == "material.law=linear"
+        assert (
+            f"material.law={case.label}" in case.set
+            and f"material.law={case.label}" in case.reference.set
+        )
+    for case in all_cases(
+        tmp_path, ONE_SCENE + reference.replace("cells", 'law = "linear", cells') + sweep
+    ):
+        assert [word for word in case.reference.set if word.startswith("material.law")][
+            -1
+        ] == "material.law=linear"
 
 
 def test_the_studies_shipped_are_sound():
@@ -135,7 +174,12 @@ def test_the_studies_shipped_are_sound():
         few, many = (study_cases(load_study(path), path.parent, full) for full in (False, True))
         assert 10 < len(few) < 130 and len(few) < len(many)
     sizes, atlas = (
-        study_cases(load_study(path.with_name(f"{name}.toml")), path.parent, False) for name in ("size", "stability")
+        study_cases(load_study(path.with_name(f"{name}.toml")), path.parent, False)
+        for name in ("size", "stability")
     )
-    assert 500 < len(atlas) < 1200 and {one.point.map for one in atlas if one.point} >= {"beam", "press", "cases"}
+    assert 500 < len(atlas) < 1200 and {one.point.map for one in atlas if one.point} >= {
+        "beam",
+        "press",
+        "cases",
+    }
     assert len({case.scene for case in sizes}) == 4 and all(case.stores_surface for case in sizes)

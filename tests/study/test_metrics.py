@@ -14,7 +14,9 @@ from msmpetsc.results.writer import ResultFile
 from msmpetsc.study.metrics import distance_of_shapes, of_frames, together, trajectory_error
 
 
-def result(path: Path, times: list[float], positions: list[np.ndarray], mass: list[float], **series) -> Path:
+def result(
+    path: Path, times: list[float], positions: list[np.ndarray], mass: list[float], **series
+) -> Path:
     """A result file; positions (n, 3) of each time, the first at rest."""
     with ResultFile(path, MPI.COMM_SELF, {"scene": ""}) as file:
         file.write("lattice/nodes", positions[0])
@@ -45,7 +47,9 @@ def test_runs_without_common_times_or_nodes_have_no_trajectory_error(tmp_path: P
     with pytest.raises(InputError, match="1 times in common"):
         trajectory_error(result(tmp_path / "a.h5", [0, 0.03], [rest, rest], [1]), reference)
     with pytest.raises(InputError, match="different lattices"):
-        trajectory_error(result(tmp_path / "b.h5", [0, 0.1], [np.zeros((2, 3))] * 2, [1, 1]), reference)
+        trajectory_error(
+            result(tmp_path / "b.h5", [0, 0.1], [np.zeros((2, 3))] * 2, [1, 1]), reference
+        )
     with pytest.raises(InputError, match="different lattices"):
         trajectory_error(result(tmp_path / "d.h5", [0, 0.1], [rest + 1, rest], [1]), reference)
     with pytest.raises(InputError, match="nothing moves"):
@@ -68,7 +72,9 @@ def test_means_are_of_steps_and_leave_the_first_frame_out(tmp_path: Path):
 
 def test_repeats_become_medians_with_their_range_and_a_single_run_has_none():
     known = ((0.3, 9, 0.1), (0.1, 7, None), (0.2, 8, None))
-    runs = [{"time_frame": time, "memory": memory, "true_error": error} for time, memory, error in known]
+    runs = [
+        {"time_frame": time, "memory": memory, "true_error": error} for time, memory, error in known
+    ]
     ends = {"time_frame_min": 0.1, "time_frame_max": 0.3}
     assert together(runs) == {"time_frame": 0.2, "memory": 7, "true_error": 0.1} | ends
     assert together(runs[:1]) == runs[0]
@@ -97,13 +103,24 @@ def test_the_error_of_a_swollen_body_by_hand():
 
 def test_a_mirrored_body_is_not_in_its_rest_shape():
     """Mirrored through the thinnest side, at best: two masses at +-a along it are 2 a off."""
-    rest = np.array([[2.0, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.5], [0, 0, -0.5], [1, 0.5, 0.3]])
+    rest = np.array(
+        [[2.0, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.5], [0, 0, -0.5], [1, 0.5, 0.3]]
+    )
     assert distance_of_shapes(rest * [1, 1, -1], rest, np.ones(7)) > 0.02
 
 
-def test_energy_is_not_compared_where_a_load_acts_and_a_number_that_is_none_has_no_shape(tmp_path: Path):
+def test_energy_is_not_compared_where_a_load_acts_and_a_number_that_is_none_has_no_shape(
+    tmp_path: Path,
+):
     rest, mass = block()
     positions = [rest, *[rest + math.nan] * 3]
-    path = result(tmp_path / "x.h5", [0, 0.1, 0.2, 0.3], positions, mass, kinetic=[1] * 4, potential=[0, 0, 0, -1])
+    path = result(
+        tmp_path / "x.h5",
+        [0, 0.1, 0.2, 0.3],
+        positions,
+        mass,
+        kinetic=[1] * 4,
+        potential=[0, 0, 0, -1],
+    )
     row = of_frames(path, 0.1)
     assert "energy_left" not in row and row["shape_error"] is None

@@ -33,7 +33,9 @@ def carry_out(
 ) -> tuple[Ended, str]:
     """How it ended, and what it said."""
     log = path.with_suffix(".log")
-    ended = processes.run([*COLD, "run", str(path), "-o", str(path.with_suffix(".h5")), *words], log, timeout, warm)
+    ended = processes.run(
+        [*COLD, "run", str(path), "-o", str(path.with_suffix(".h5")), *words], log, timeout, warm
+    )
     return ended, log.read_text()
 
 
@@ -45,15 +47,24 @@ def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
         assert ended.status == 0, told
         with h5py.File(path.with_suffix(".h5")) as file:
             frames.append(file["frames/position"][:])
-            assert file.attrs["petsc_options"] == " ".join(words) and str(path) in file.attrs["command"]
+            assert (
+                file.attrs["petsc_options"] == " ".join(words)
+                and str(path) in file.attrs["command"]
+            )
     np.testing.assert_array_equal(frames[2], frames[0])
 
 
 def test_one_process_serves_until_a_command_fails(tmp_path: Path, processes: Processes):
-    path, cost, pids = block_scene(tmp_path, time=TIME, gravity={"acceleration": [0, 0, -9.81]}), [], []
+    path, cost, pids = (
+        block_scene(tmp_path, time=TIME, gravity={"acceleration": [0, 0, -9.81]}),
+        [],
+        [],
+    )
     for frames, status in (("10", 0), ("1", 0), ("0", 2), ("1", 0)):
         measure = tmp_path / "cost.json"
-        ended, told = carry_out(processes, path, "--overwrite", "--frames", frames, "--measure", str(measure))
+        ended, told = carry_out(
+            processes, path, "--overwrite", "--frames", frames, "--measure", str(measure)
+        )
         assert ended.status == status, told
         cost.append(json.loads(measure.read_text()))
         pids.append([process.pid for process in processes._idle])
@@ -61,7 +72,9 @@ def test_one_process_serves_until_a_command_fails(tmp_path: Path, processes: Pro
     assert cost[1]["time"]["local"] < 0.6 * cost[0]["time"]["local"]  # its own, not those of both
 
 
-def test_a_process_alone_takes_no_folder_from_others(tmp_path: Path, processes: Processes, monkeypatch):
+def test_a_process_alone_takes_no_folder_from_others(
+    tmp_path: Path, processes: Processes, monkeypatch
+):
     """One that ended robbed one that began of a folder of both: a case in 300 failed. Open MPI 5 leaves them."""
     (tmp_path / "shared").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "shared"))
@@ -104,7 +117,9 @@ def test_a_case_may_have_more_ranks_than_cores(monkeypatch):
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="Open MPI refuses root alone")
-def test_what_root_must_set_for_mpiexec_is_said(tmp_path: Path, processes: Processes, monkeypatch: pytest.MonkeyPatch):
+def test_what_root_must_set_for_mpiexec_is_said(
+    tmp_path: Path, processes: Processes, monkeypatch: pytest.MonkeyPatch
+):
     """By a study's cases, check --ranks and doctor, in place of the last line of Open MPI's."""
     for name in AS_ROOT:
         monkeypatch.delenv(name)

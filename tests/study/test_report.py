@@ -25,15 +25,47 @@ from msmpetsc.study.report import write_report
 from msmpetsc.study.table import read_table, succeeded, typed
 
 ERRORS = [
-    row_of("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
+    row_of(
+        "newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2
+    ),
     row_of("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
-    row_of("anderson", case="anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
+    row_of(
+        "anderson",
+        case="anderson",
+        error=1e-2,
+        time_frame=0.03,
+        true_error=6e-3,
+        trajectory_error=0.21,
+    ),
     row_of("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
-    row_of("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
-    row_of("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
+    row_of(
+        "verlet",
+        integrator="verlet",
+        preset="",
+        time_frame=0.02,
+        trajectory_error=4e-4,
+        substep=0.001,
+    ),
+    row_of(
+        "paper",
+        status="failed",
+        reason="frame 3 did not converge",
+        error=1e-4,
+        time_frame=1e-3,
+        true_error=1e-7,
+    ),
 ]
 SWEEP = [
-    row_of(label, scene="bunny", cells=n, time_frame=time, preset=preset, true_error=5e-4, ksp_its=its, memory=1e6 * n)
+    row_of(
+        label,
+        scene="bunny",
+        cells=n,
+        time_frame=time,
+        preset=preset,
+        true_error=5e-4,
+        ksp_its=its,
+        memory=1e6 * n,
+    )
     for label, preset, times, its in (
         ("cholesky", "fast-msm", (0.01, 0.1, 2.0), 10),
         ("cg", "anderson", (0.02, 0.09, 0.5), 40),
@@ -68,11 +100,15 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
 
     found = front([x for x, _ in points], [y for _, y in points])
     assert set(found) == {index for index, point in enumerate(points) if not beaten(point)}
-    assert len(set(found)) == len(found) and [points[i][0] for i in found] == sorted(points[i][0] for i in found)
+    assert len(set(found)) == len(found) and [points[i][0] for i in found] == sorted(
+        points[i][0] for i in found
+    )
 
 
 def test_errors_that_read_alike_are_no_reason_to_pay_more():
-    rows = typed(row_of("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3)))
+    rows = typed(
+        row_of("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3))
+    )
     assert list(front_rows(rows, STEP)["time_frame"]) == [3, 1]
 
 
@@ -83,15 +119,23 @@ def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
         [("anderson", 1e-2)], [("newton", 1e-2)], [("newton", 1e-4)],
     ]  # fmt: skip
     assert contenders(rows, STEP, 1e-6).empty
-    assert [*contenders(rows, TRAJECTORY, 0.2)["label"]] == ["verlet"], "0.02 s for 0.01 s: 2 s a simulated second"
+    assert [*contenders(rows, TRAJECTORY, 0.2)["label"]] == ["verlet"], (
+        "0.02 s for 0.01 s: 2 s a simulated second"
+    )
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
-    assert "anderson, 30 ms a frame" in step[0] and "verlet, 2 s a simulated second" in trajectory[2]
-    assert "nothing" in step[3] and len(step) == 5, "a line more: how much times vary is not known of single runs"
+    assert (
+        "anderson, 30 ms a frame" in step[0] and "verlet, 2 s a simulated second" in trajectory[2]
+    )
+    assert "nothing" in step[3] and len(step) == 5, (
+        "a line more: how much times vary is not known of single runs"
+    )
 
 
 def repeated(label: str, low: float, time: float, high: float, **given) -> dict[str, str]:
-    return row_of(label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given)
+    return row_of(
+        label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given
+    )
 
 
 NOISY = [
@@ -109,27 +153,48 @@ def test_no_winner_is_told_within_its_noise():
     assert [*contenders(rows, STEP, 1e-3)["label"]] == ["anderson", "lbfgs"]
     assert [*contenders(rows[:1], STEP, 1e-2)["label"]] == ["newton"], "nothing else was measured"
     once = typed(
-        [NOISY[0], row_of("cg", time_frame=0.02, true_error=4e-3), row_of("mg", time_frame=0.03, true_error=4e-3)]
+        [
+            NOISY[0],
+            row_of("cg", time_frame=0.02, true_error=4e-3),
+            row_of("mg", time_frame=0.03, true_error=4e-3),
+        ]
     )
-    assert [*contenders(once, STEP, 1e-2)["label"]] == ["newton", "cg"], "a time within the range of the cheapest"
+    assert [*contenders(once, STEP, 1e-2)["label"]] == ["newton", "cg"], (
+        "a time within the range of the cheapest"
+    )
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
     assert "newton, 10 ms [9 ms to 21 ms] a frame" in step[1] and "noise" in step[1]
     assert re.findall(r"(\w+) [\d.]+ ms (\[.*?\])", step[1].partition("noise")[2]) == [
         ("pipecg", "[9 ms to 22 ms]"), ("anderson", "[20 ms to 37 ms]"),
     ]  # fmt: skip
-    assert "newton, 1 s [900 ms to 2.1 s] a simulated second" in trajectory[0] and "pipecg" in trajectory[0]
+    assert (
+        "newton, 1 s [900 ms to 2.1 s] a simulated second" in trajectory[0]
+        and "pipecg" in trajectory[0]
+    )
     (rings,) = [layer for layer in chart.panels[0].layers if layer["mark"].get("shape") == RING]
-    assert sorted(ring["y"] for ring in rings["data"]["values"]) == [0.01, 0.012, 0.028, 0.029, 0.03], "lbfgs is slower"
+    assert sorted(ring["y"] for ring in rings["data"]["values"]) == [
+        0.01,
+        0.012,
+        0.028,
+        0.029,
+        0.03,
+    ], "lbfgs is slower"
 
 
 def test_twenty_options_are_told_apart_by_colour_mark_and_dashes():
     styles = curve_styles(f"option {number}" for number in range(20))
     looks = list(styles.values())
-    assert len({(look.color, *look.dash) for look in looks}) == 20, "lines alone, between their marks"
+    assert len({(look.color, *look.dash) for look in looks}) == 20, (
+        "lines alone, between their marks"
+    )
     triangles = {"triangle-up", "triangle-down", "triangle-left", "triangle-right"}
     for one, other in zip(looks, looks[11:], strict=False):
-        assert one.color == other.color and one.shape != other.shape and not {one.shape, other.shape} <= triangles
+        assert (
+            one.color == other.color
+            and one.shape != other.shape
+            and not {one.shape, other.shape} <= triangles
+        )
     rows = typed(
         row_of(label, cells=cells, error=error, time_frame=1, true_error=error)
         for label in styles for error in (1e-1, 1e-2, 1e-3, 1e-4) for cells in (1000, 2000)
@@ -147,12 +212,25 @@ def values(panel: Axes, column: str) -> list:
 
 def curves_in(chart: Chart) -> dict[str, set[str]]:
     """The curves of each panel, by its title."""
-    return {spaced(panel.title): {value["curve"] for value in values(panel, "curve")} for panel in chart.panels}
+    return {
+        spaced(panel.title): {value["curve"] for value in values(panel, "curve")}
+        for panel in chart.panels
+    }
 
 
 def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
-    rows = typed([*NOISY, *(repeated("cg", t / 2, t, 3 * t, cells=n, scene="s") for n, t in ((10, 0.1), (99, 1.0)))])
-    (pareto,), (growth,) = (draw(rows, curve_styles(rows["label"])) for draw in (pareto_charts, growth_charts))
+    rows = typed(
+        [
+            *NOISY,
+            *(
+                repeated("cg", t / 2, t, 3 * t, cells=n, scene="s")
+                for n, t in ((10, 0.1), (99, 1.0))
+            ),
+        ]
+    )
+    (pareto,), (growth,) = (
+        draw(rows, curve_styles(rows["label"])) for draw in (pareto_charts, growth_charts)
+    )
 
     def ends(panel: Axes) -> list:
         return sorted({(value["y"], value["high"]) for value in values(panel, "high")})
@@ -161,7 +239,9 @@ def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
     assert step == [(0.009, 0.021), (0.009, 0.022), (0.014, 0.037), (0.02, 0.037), (0.022, 0.031)]
     assert trajectory[0] == pytest.approx((0.9, 2.1))
     speed, cost = map(ends, growth.panels)
-    assert np.allclose(speed, [(1 / 3, 2), (1 / 0.3, 20)]) and np.allclose(cost, [(0.005, 0.03), (0.5 / 99, 3 / 99)])
+    assert np.allclose(speed, [(1 / 3, 2), (1 / 0.3, 20)]) and np.allclose(
+        cost, [(0.005, 0.03), (0.5 / 99, 3 / 99)]
+    )
     for panel in (*pareto.panels, *growth.panels):
         low, high = panel.y["scale"]["domain"]
         assert all(low <= a <= b <= high for a, b in ends(panel))
@@ -175,13 +255,22 @@ def test_only_equal_time_steps_are_compared_by_the_step_error():
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     shown = curves_in(chart)
     assert shown["over the step error, time step 10 ms"] == {"newton", "anderson"}
-    assert shown["over the trajectory error"] == {"newton", "anderson", "verlet", "lbfgs"}, "what failed is nowhere"
+    assert shown["over the trajectory error"] == {"newton", "anderson", "verlet", "lbfgs"}, (
+        "what failed is nowhere"
+    )
 
 
 def test_curves_of_one_label_are_told_apart_by_what_varies():
-    rows = typed(row_of("cg", cells=c, error=e, time_frame=1, true_error=e) for e in (1e-2, 1e-4) for c in (2000, 1000))
+    rows = typed(
+        row_of("cg", cells=c, error=e, time_frame=1, true_error=e)
+        for e in (1e-2, 1e-4)
+        for c in (2000, 1000)
+    )
     (chart,) = growth_charts(rows, curve_styles(["cg"]))
-    assert list(chart.styles) == ["cg, error 1e-2 (step error 1e-2)", "cg, error 1e-4 (step error 1e-4)"]
+    assert list(chart.styles) == [
+        "cg, error 1e-2 (step error 1e-2)",
+        "cg, error 1e-4 (step error 1e-4)",
+    ]
     first, second = chart.styles.values()
     assert first.color == second.color and first.shape != second.shape
 
@@ -192,7 +281,9 @@ def test_the_page_is_well_formed_and_png_files_stand_beside_it(study: Path, text
     assert {path.name for path in study.glob("*.png")} == names
     assert all((study / name).read_bytes().startswith(b"\x89PNG") for name in names)
     ids = re.findall(r"""\sid=["']([^"']+)["']""", text)
-    assert {"chart-pareto-block", "chart-growth-bunny-0-01"} <= set(ids) and len(set(ids)) == len(ids)
+    assert {"chart-pareto-block", "chart-growth-bunny-0-01"} <= set(ids) and len(set(ids)) == len(
+        ids
+    )
     assert "url(#" not in text and "xlink:href" not in text, "of another chart it may be"
 
 
@@ -232,7 +323,13 @@ def test_labels_are_escaped(tmp_path: Path):
         ([], 0),
         (ERRORS[:1], 1),
         (ERRORS[-1:] * 3, 0),
-        ([row_of("a", true_error=bad, time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
+        (
+            [
+                row_of("a", true_error=bad, time_frame=0.1)
+                for bad in ("nan", "inf", "0", "-1", "", "?")
+            ],
+            0,
+        ),
         ([row_of("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
     ],
     ids=["no case", "one case", "all failed", "no number", "no cells"],
@@ -249,11 +346,21 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
         for label, errors in (("whole", (0.3, 0.2, 0.1)), ("fill", (0.2, 0.05, 0.01)))
         for n, time, error in zip((250, 700, 2000), (0.01, 0.02, 0.08), errors, strict=True)
     ]
-    rows.append(row_of("fill", scene="heart", status="failed", reason="a pin holds no node", time_frame=1e-3))
+    rows.append(
+        row_of(
+            "fill", scene="heart", status="failed", reason="a pin holds no node", time_frame=1e-3
+        )
+    )
     text = write_report(write_rows(tmp_path, rows)).read_text()
     assert "Surface error over cost: heart" in text and (tmp_path / "size_heart.png").is_file()
-    assert len([title for title in tooltips(text) if "surface error " in title]) == 2 * 6  # over cost, over cells
-    assert "10%: whole 2,000" in text and "fill 418" in text and "1%: whole more than 2,000 cells" in text
+    assert (
+        len([title for title in tooltips(text) if "surface error " in title]) == 2 * 6
+    )  # over cost, over cells
+    assert (
+        "10%: whole 2,000" in text
+        and "fill 418" in text
+        and "1%: whole more than 2,000 cells" in text
+    )
     assert "a pin holds no node" in text
     table = read_table(tmp_path)
     (chart,) = size_charts(table, curve_styles(table["label"]))

@@ -21,7 +21,11 @@ from msmpetsc.study.table import COLUMNS, read_table, records, write_table
 
 
 def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
-    text = "repeats = 3\n" + ONE_SCENE + 'frame = 0.02\nreference = { integrator = "implicit-euler", step = 0.001 }\n'
+    text = (
+        "repeats = 3\n"
+        + ONE_SCENE
+        + 'frame = 0.02\nreference = { integrator = "implicit-euler", step = 0.001 }\n'
+    )
     text += '[[sweep]]\npresets = ["newton"]\nerrors = [0.1]\nranks = [2]'
     (row,) = carry_out(tmp_path, text)
     assert set(row) == set(COLUMNS)
@@ -35,7 +39,11 @@ def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     assert row["trajectory_error"] == pytest.approx(1.01 / 1.001 - 1)
     assert row["memory"] == 1000 - 4  # of the leanest run
     assert row["command"].startswith("mpiexec -n 2 msmpetsc run ")
-    left = [path.name for path in (tmp_path / "out").rglob("*") if path.is_file() and "references" not in str(path)]
+    left = [
+        path.name
+        for path in (tmp_path / "out").rglob("*")
+        if path.is_file() and "references" not in str(path)
+    ]
     assert sorted(left) == ["calls.txt", "study.toml", "table.csv"]
 
 
@@ -56,11 +64,19 @@ def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
     path, out = study_file(tmp_path, text), tmp_path / "out"
     found = {index: run_study(path, out, part=StudyPart(index, 2)) for index in (2, 1, 2)}
     assert [[row["error"] for row in found[index]] for index in (1, 2)] == [[0.3], [0.2, 0.1]]
-    assert not (out / "table.csv").exists() and [done for _, done in list_study(path, out)] == [True] * 3
-    assert [len(log.read_text().splitlines()) for log in sorted(out.glob("parts/*/calls.txt"))] == [1, 2]
+    assert (
+        not (out / "table.csv").exists()
+        and [done for _, done in list_study(path, out)] == [True] * 3
+    )
+    assert [len(log.read_text().splitlines()) for log in sorted(out.glob("parts/*/calls.txt"))] == [
+        1,
+        2,
+    ]
     rows = carry_out(tmp_path, text)
     assert [row["error"] for row in rows] == [0.3, 0.2, 0.1] and calls(tmp_path) == []
-    assert rows == [row for part in ("1-of-2", "2-of-2") for row in records(read_table(out / "parts" / part))]
+    assert rows == [
+        row for part in ("1-of-2", "2-of-2") for row in records(read_table(out / "parts" / part))
+    ]
 
 
 @pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3"])
@@ -73,15 +89,24 @@ def test_the_list_names_each_case_and_runs_none(tmp_path: Path, capsys, own_log)
     path = study_file(tmp_path, ONE_SCENE + '[[sweep]]\npresets = ["newton", "anderson"]')
     assert main(["study", str(path), "-o", str(tmp_path / "out"), "--list"]) == 0
     first, second, last = capsys.readouterr().out.splitlines()
-    assert first.startswith("   1 open  a: newton  msmpetsc run ") and second.startswith("   2 open  a: anderson  ")
+    assert first.startswith("   1 open  a: newton  msmpetsc run ") and second.startswith(
+        "   2 open  a: anderson  "
+    )
     assert last == "2 cases, 0 done" and not (tmp_path / "out").exists()
 
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):
     rows = carry_out(
-        tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_fail", ""]', jobs=2
+        tmp_path,
+        "repeats = 2\n"
+        + ONE_SCENE
+        + '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_fail", ""]',
+        jobs=2,
     )
-    assert [(row["status"], row["reason"]) for row in rows] == [("failed", "planted, with reason"), ("ok", "")]
+    assert [(row["status"], row["reason"]) for row in rows] == [
+        ("failed", "planted, with reason"),
+        ("ok", ""),
+    ]
     assert rows[0]["time_frame"] is None and rows[0]["options"] == "-ksp_fail"
     assert len(calls(tmp_path)) == 3  # what fails is not repeated
 
@@ -116,7 +141,10 @@ runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]))
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
 def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path):
-    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
+    text = (
+        ONE_SCENE
+        + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
+    )
     paths = (STAND_IN, study_file(tmp_path, text), tmp_path / "out")
     words = [sys.executable, "-c", STUDY_IN_ITS_OWN_PROCESS, *map(str, paths)]
     heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (what runs in the background ignores it)
@@ -132,7 +160,9 @@ def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path)
     assert len(calls(tmp_path)) == 2
 
 
-def test_a_package_that_is_missing_is_told_before_anything_is_run(tmp_path: Path, stand_in, monkeypatch):
+def test_a_package_that_is_missing_is_told_before_anything_is_run(
+    tmp_path: Path, stand_in, monkeypatch
+):
     monkeypatch.setattr(table, "find_spec", lambda name: None if name == "pandas" else name)
     with pytest.raises(InputError, match="pandas is not installed"):
         carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
@@ -140,7 +170,15 @@ def test_a_package_that_is_missing_is_told_before_anything_is_run(tmp_path: Path
 
 
 def test_a_table_read_and_written_again_is_the_same_text(tmp_path: Path):
-    row = {"case": "1", "cells": 1009, "steps": 8, "time_step": 1e-3, "fps": 121.25, "memory": 4e8, "error": None}
+    row = {
+        "case": "1",
+        "cells": 1009,
+        "steps": 8,
+        "time_step": 1e-3,
+        "fps": 121.25,
+        "memory": 4e8,
+        "error": None,
+    }
     row |= {"ranks": 1, "repeats": 1}
     write_table(tmp_path, [row])
     once = (tmp_path / "table.csv").read_text()

@@ -47,7 +47,11 @@ def test_three_sizes_tell_order_and_error(order: float, sizes: tuple):
     """The error is 0.03 size^order exactly."""
     e = [0.03 * size**order for size in sizes]
     law = error_law(sizes, [e[0] - e[1], e[1] - e[2]], ORDERS)
-    assert law.seen and law.order == pytest.approx(order) and law.error(0.5) == pytest.approx(0.03 * 0.5**order)
+    assert (
+        law.seen
+        and law.order == pytest.approx(order)
+        and law.error(0.5) == pytest.approx(0.03 * 0.5**order)
+    )
     assert law.size(law.error(0.7)) == pytest.approx(0.7)
 
 
@@ -82,7 +86,9 @@ def test_lattices_that_err_by_chance(order: float, cosine: float):
     assert cosine_of(first, second, across) == pytest.approx(cosine, abs=1e-6)
     law = error_law(sizes, [first, second], ORDERS, across, cosine)
     assert law.order == pytest.approx(order, abs=1e-6) and law.error(1) == pytest.approx(0.03)
-    assert law.measured(second, 1) == pytest.approx(e[1]) and law.measured_finer(second, 1, 2) == pytest.approx(0.03)
+    assert law.measured(second, 1) == pytest.approx(e[1]) and law.measured_finer(
+        second, 1, 2
+    ) == pytest.approx(0.03)
     assert error_law(sizes[1:], [second], (order, order)).error(1) > law.error(1)
     assert cosine_of(0, 1, 1) == 1
 
@@ -131,14 +137,18 @@ def test_explicit_substeps_shorten_with_the_cells():
     """Eight times the cells are twice the substeps; the costs known are of implicit steps, or of explicit ones."""
     for explicit, factor in ((False, 16), (True, 8)):
         model = replace(MODEL, steppings=[stepping("verlet", 0.01, 1e-4, 3.0)], explicit=explicit)
-        costs = [model.choice(model.steppings[0], SOLVINGS[2], cells).cost for cells in (1000, 8000)]
+        costs = [
+            model.choice(model.steppings[0], SOLVINGS[2], cells).cost for cells in (1000, 8000)
+        ]
         assert costs[1] / costs[0] == pytest.approx(factor)
 
 
 def test_cost_grows_with_cells_as_measured():
     """Read off the lattices; beyond them as between the last two, but in proportion to the cells at least."""
     model = replace(MODEL, costs=[(100, 1.0), (800, 2.0), (6400, 20.0)])
-    assert model.growth(800, 6400) == pytest.approx(10) and model.growth(800, 100) == pytest.approx(0.5)
+    assert model.growth(800, 6400) == pytest.approx(10) and model.growth(800, 100) == pytest.approx(
+        0.5
+    )
     assert model.growth(6400, 8 * 6400) == pytest.approx(10)
     assert replace(MODEL, costs=[(100, 1.0), (800, 1.1)]).growth(800, 8000) == pytest.approx(10)
     assert replace(MODEL, costs=[(100, 1.0)]).growth(100, 300) == pytest.approx(3)
@@ -155,7 +165,12 @@ class Bodies:
         self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0, most=math.inf,
         fails=lambda *_: False, slow=lambda substep: False, inverted=lambda cells: 0.0,
     ):  # fmt: skip
-        self.explicit, self.impacts, self.cell_error, self.fails = explicit, impacts, cell_error, fails
+        self.explicit, self.impacts, self.cell_error, self.fails = (
+            explicit,
+            impacts,
+            cell_error,
+            fails,
+        )
         self.most = most  # error of cells, out of step
         self.slow, self.inverted = slow, inverted
         self.errors: dict[Path, float] = {}  # by the result
@@ -165,24 +180,43 @@ class Bodies:
 
     def error_of(self, case: Case, cells: int) -> float:
         t, substep = case.time_step, min(case.time_step, 1e-3)
-        time = {"verlet": 1e4 * substep**2, "bdf2": 400 * t**2, "implicit-euler": 20 * t, "static": 0}[case.integrator]
+        time = {
+            "verlet": 1e4 * substep**2,
+            "bdf2": 400 * t**2,
+            "implicit-euler": 20 * t,
+            "static": 0,
+        }[case.integrator]
         stuck = 0.3 * (len(self.errors) % 2) if self.impacts else 0.0
-        return min(self.most, self.cell_error * cells**-0.5) + time + 0.1 * (case.error or 0) + stuck
+        return (
+            min(self.most, self.cell_error * cells**-0.5) + time + 0.1 * (case.error or 0) + stuck
+        )
 
     def measure(self, case: Case, keep: bool) -> Row:
         assert keep and case.stores_surface
         explicit = case.integrator == "verlet"
-        steps = 1 if case.integrator == "static" else max(0.01 / case.time_step, case.time_step / 0.01)
+        steps = (
+            1 if case.integrator == "static" else max(0.01 / case.time_step, case.time_step / 0.01)
+        )
         assert steps == pytest.approx(round(steps))  # so that frames come at the same times
         if explicit and (not self.explicit or self.slow(case.time_step)):
             return {"status": "timeout", "reason": "took longer than 1 s"}
-        (cells,) = (int(text.partition("count = ")[2].strip(" }")) for text in case.set if text.startswith("cages="))
+        (cells,) = (
+            int(text.partition("count = ")[2].strip(" }"))
+            for text in case.set
+            if text.startswith("cages=")
+        )
         if self.fails(case.integrator, cells):
             return {"status": "failed", "reason": "planted"}
         self.errors[self.result_of(case)] = self.error_of(case, cells)
         substeps = math.ceil(case.time_step / 1e-3) if explicit else 3
         cost = 1e-6 * cells * (substeps if explicit else 5) / case.time_step
-        row = {"status": "ok", "reason": "", "cells": float(cells), "time_second": cost, "iterations": substeps - 0.3}
+        row = {
+            "status": "ok",
+            "reason": "",
+            "cells": float(cells),
+            "time_second": cost,
+            "iterations": substeps - 0.3,
+        }
         row["inverted"] = self.inverted(cells)
         return row
 
@@ -190,7 +224,9 @@ class Bodies:
 def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
     (tmp_path / "scene.toml").write_text(SCENE)
     bench, said = Bodies(**bodies), []
-    monkeypatch.setattr(trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b]))
+    monkeypatch.setattr(
+        trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b])
+    )
     sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 6400), said.append)
     return sizer.plan(), bench, said
 
@@ -204,12 +240,16 @@ def case_of(method: Candidate) -> Case:
 
 @pytest.mark.parametrize("explicit", [True, False])
 @pytest.mark.parametrize("target", [0.1, 0.03])
-def test_the_plan_meets_the_error_and_wastes_little(tmp_path: Path, monkeypatch, explicit: bool, target: float):
+def test_the_plan_meets_the_error_and_wastes_little(
+    tmp_path: Path, monkeypatch, explicit: bool, target: float
+):
     """The choice's own error, of the formula, is little less than what was asked for."""
     plan, bench, _ = sized(tmp_path, monkeypatch, target, explicit=explicit)
     method, cells = plan.choice.method, plan.choice.cells
     assert plan.met and not plan.bounds and (explicit or method.integrator != "verlet")
-    assert 0.7 * target < bench.error_of(case_of(method), cells) <= 1.01 * target  # what is measured is off by a little
+    assert (
+        0.7 * target < bench.error_of(case_of(method), cells) <= 1.01 * target
+    )  # what is measured is off by a little
     assert plan.choice.budget.total <= target and len(plan.tried) >= 6
 
 
@@ -222,7 +262,9 @@ def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell
 
 
 @pytest.mark.parametrize("target", [0.1, 0.05])
-def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(tmp_path: Path, monkeypatch, target):
+def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
+    tmp_path: Path, monkeypatch, target
+):
     """What parts two runs is at right angles to the finer one's error, of order 1; added up it was twice as much."""
 
     def apart(a: Path, b: Path) -> float:
@@ -238,16 +280,23 @@ def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(t
 
 def test_statics_are_planned_by_their_cells_alone(tmp_path: Path, monkeypatch):
     """Nor do they want a step and a duration."""
-    monkeypatch.setattr(sys.modules[__name__], "SCENE", SCENE.replace("step = 0.01, duration = 0.1", STATIC))
+    monkeypatch.setattr(
+        sys.modules[__name__], "SCENE", SCENE.replace("step = 0.01, duration = 0.1", STATIC)
+    )
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.1)
     assert (
-        plan.met and {each.method.integrator for each in plan.tried} == {"static"} and plan.choice.method.time_step == 1
+        plan.met
+        and {each.method.integrator for each in plan.tried} == {"static"}
+        and plan.choice.method.time_step == 1
     )
     assert 0.07 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) <= 0.1
     monkeypatch.setattr(plan_command, "size_all", lambda *_: plan)
     assert main(["plan", str(tmp_path / "scene.toml"), "--surface-error", "0.1", "--write"]) == 0
     written = load_scene(tmp_path / "scene.toml")
-    assert written.cages.count == plan.choice.cells and "step" not in tomllib.loads(written.text)["time"]
+    assert (
+        written.cages.count == plan.choice.cells
+        and "step" not in tomllib.loads(written.text)["time"]
+    )
 
 
 def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
@@ -264,7 +313,11 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
 
 def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path, monkeypatch):
     """At 300 cells, as where a foot folds one way or another: no lattice has the error asked for, or little less."""
-    monkeypatch.setattr(Bodies, "error_of", lambda self, case, cells: cells**-0.5 if cells > 300 else 2 * cells**-0.5)
+    monkeypatch.setattr(
+        Bodies,
+        "error_of",
+        lambda self, case, cells: cells**-0.5 if cells > 300 else 2 * cells**-0.5,
+    )
     plan, *_ = sized(tmp_path, monkeypatch, 0.1)
     assert plan.met and 300 < plan.choice.cells < 330
     assert plan.choice.budget.total == pytest.approx(plan.choice.cells**-0.5, rel=0.2)
@@ -282,8 +335,15 @@ def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
     first, *_ = sized(tmp_path, monkeypatch, 0.1)
     runs_away = lambda integrator, cells: integrator == "verlet" and cells == first.choice.cells  # noqa: E731
     plan, _, said = sized(tmp_path, monkeypatch, 0.1, fails=runs_away)
-    assert first.choice.method.integrator == "verlet" and plan.met and plan.choice.method.integrator != "verlet"
-    assert any("planted" in text for text in said if isinstance(text, str)) and "verlet" in plan.bounds[0]
+    assert (
+        first.choice.method.integrator == "verlet"
+        and plan.met
+        and plan.choice.method.integrator != "verlet"
+    )
+    assert (
+        any("planted" in text for text in said if isinstance(text, str))
+        and "verlet" in plan.bounds[0]
+    )
 
 
 def test_where_the_coarsest_lattice_fails_a_finer_one_stands_in(tmp_path: Path, monkeypatch):
@@ -300,7 +360,10 @@ def test_explicit_trials_that_get_too_slow_are_no_part_of_the_answer(tmp_path: P
 
 
 BOUNDS = {  # what bounds the error: error asked for, and the bodies
-    "the mesh's cells": (1e-2, {"cell_error": 4.0}),  # there may be 8 times the cells at most: 1.8e-2 is left
+    "the mesh's cells": (
+        1e-2,
+        {"cell_error": 4.0},
+    ),  # there may be 8 times the cells at most: 1.8e-2 is left
     "the step": (0.1, {"impacts": True}),  # shorter steps do not come nearer to each other
     "the cells: their distances show no order": (
         0.2,
@@ -321,10 +384,14 @@ def test_a_plan_says_what_bounds_the_error(tmp_path: Path, monkeypatch, bound: s
 
 def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
     """On the finest lattice that was tried: then order 1 is taken. Coarser ones do not matter."""
-    plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0)
+    plan, _, _ = sized(
+        tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0
+    )
     order, motion = plan.bounds
     assert "order 1 is taken" in order and motion.endswith('"neo-hookean" may help')
-    without, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells < 6400 else 0.0)
+    without, _, _ = sized(
+        tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells < 6400 else 0.0
+    )
     assert without.bounds == [] and plan.choice.cells >= without.choice.cells
 
 
@@ -337,7 +404,9 @@ def test_a_law_is_not_advised_to_a_scene_that_has_it(tmp_path: Path, monkeypatch
 def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monkeypatch):
     said: list = []
     bench = Bodies()
-    monkeypatch.setattr(bench, "measure", lambda case, keep: {"status": "failed", "reason": "planted"})
+    monkeypatch.setattr(
+        bench, "measure", lambda case, keep: {"status": "failed", "reason": "planted"}
+    )
     (tmp_path / "scene.toml").write_text(SCENE)
     sizer = Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10, None), said.append)
     with pytest.raises(InputError, match="the trials failed"):
@@ -374,7 +443,9 @@ def test_the_true_error_of_a_plan_is_what_was_asked_for(soft_beam: Path):
     every = max(1, round(1 / 60 / load_scene(soft_beam).time.step))
     tried = 20 / 60  # [s]
     fine = [f"time={{step = 0.016666666666666666, duration = {tried}, integrator = 'verlet'}}"]
-    error = true_error(soft_beam, choice=[f"output.every={every}", f"time.duration={tried}"], finer=fine)
+    error = true_error(
+        soft_beam, choice=[f"output.every={every}", f"time.duration={tried}"], finer=fine
+    )
     assert 0.6 * 0.1 < error < 1.1 * 0.1
 
 
@@ -385,7 +456,9 @@ def test_the_true_error_of_a_plan_of_statics_is_what_was_asked_for(soft_beam: Pa
     text = soft_beam.read_text()
     time = text[text.index("[time]") : text.index("[gravity]")]
     soft_beam.write_text(text.replace(time, f"[time]\n{STATIC}\n\n"))
-    assert main(["plan", str(soft_beam), "--surface-error", "0.05", "--cells", "1000", "--write"]) == 0
+    assert (
+        main(["plan", str(soft_beam), "--surface-error", "0.05", "--cells", "1000", "--write"]) == 0
+    )
     assert 0.6 * 0.05 < true_error(soft_beam, choice=[], finer=[]) < 1.1 * 0.05
 
 
@@ -403,10 +476,18 @@ def test_the_command_tells_the_answer_and_writes_it(tmp_path: Path, monkeypatch,
     out, written = capsys.readouterr().out, load_scene(path)
     assert "7.5 computing seconds a simulated second" in out and "the step: planted" in out
     assert written.cages.count == 4321 and written.cages.cell_size is None
-    assert (written.time.integrator, written.time.step, written.solver.error) == ("bdf2", 0.005, 0.01)
+    assert (written.time.integrator, written.time.step, written.solver.error) == (
+        "bdf2",
+        0.005,
+        0.01,
+    )
     assert main(["plan", str(path), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
-    assert answer["met"] and answer["choice"]["cells"] == 4321 and answer["error"] == pytest.approx(0.081)
+    assert (
+        answer["met"]
+        and answer["choice"]["cells"] == 4321
+        and answer["error"] == pytest.approx(0.081)
+    )
 
 
 COMMENTED = """# A scene of mine
@@ -447,7 +528,9 @@ BEFORE = {
     ids=["explicit", "implicit"],
 )
 @pytest.mark.parametrize("given", BEFORE)
-def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: str, method: Candidate):
+def test_the_command_of_a_plan_says_what_its_lines_say(
+    tmp_path: Path, given: str, method: Candidate
+):
     """Run with these changes the scene is the same as with the answer written into it."""
     mesh = 'mesh.source = "beam.obj"\ncages.count = 10\nmaterial = { density = 1, young_modulus = 1 }\n'
     path = tmp_path / "scene.toml"
@@ -459,7 +542,9 @@ def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: st
     assert changed.time.step == method.time_step and changed.time.integrator == method.integrator
 
 
-def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path, monkeypatch, capsys, own_log):
+def test_what_cannot_be_met_is_told_with_status_3_and_not_written(
+    tmp_path: Path, monkeypatch, capsys, own_log
+):
     monkeypatch.setattr(plan_command, "size_all", lambda *_: replace(PLAN, met=False))
     path = tmp_path / "scene.toml"
     path.write_text(SCENE)
@@ -474,5 +559,7 @@ def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path
         (["--surface-error", "0.1"], "no such scene"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(tmp_path: Path, own_log, options: list[str], words: str):
+def test_what_makes_no_sense_is_refused_in_one_line(
+    tmp_path: Path, own_log, options: list[str], words: str
+):
     assert words in command_error("plan", tmp_path / "gone.toml", *options)

@@ -44,7 +44,10 @@ NAMED = '[[map]]\nname = "n"\n[[map.case]]\nname = "a"\nfile = "scene.toml"\nste
 def test_a_map_is_each_method_at_each_place(tmp_path: Path):
     found = all_cases(tmp_path, METHODS + GRID + X + Y)
     assert [(one.label, one.point.x, one.point.y) for one in found] == [
-        (label, x, y) for y in (10.0, 20.0) for x in (0.001, 5.0) for label in ("newton", "explicit")
+        (label, x, y)
+        for y in (10.0, 20.0)
+        for x in (0.001, 5.0)
+        for label in ("newton", "explicit")
     ]
     assert len({one.id for one in found}) == 8
     long = shown_command(found[2])  # a step longer than the scene
@@ -52,7 +55,9 @@ def test_a_map_is_each_method_at_each_place(tmp_path: Path):
     assert "step = 5.0, duration = 20.0" in long and 'preset = "newton", error = 0.01' in long
     assert long.endswith("-pc_type icc")
     explicit = shown_command(found[1])
-    assert 'integrator = "verlet"' in explicit and "solver" not in explicit and "icc" not in explicit
+    assert (
+        'integrator = "verlet"' in explicit and "solver" not in explicit and "icc" not in explicit
+    )
 
 
 def test_a_method_may_change_every_scene(tmp_path: Path):
@@ -62,7 +67,9 @@ def test_a_method_may_change_every_scene(tmp_path: Path):
 
 
 def test_named_cases_have_their_own_options_for_what_solves(tmp_path: Path):
-    newton, explicit = all_cases(tmp_path, METHODS + NAMED + 'options = "-ksp_max_it 1"\nrecovers = true')
+    newton, explicit = all_cases(
+        tmp_path, METHODS + NAMED + 'options = "-ksp_max_it 1"\nrecovers = true'
+    )
     assert newton.options == "-pc_type icc -ksp_max_it 1" and explicit.options == ""
     assert (newton.point.x, newton.point.y, newton.point.recovers) == ("newton", "a", True)
 
@@ -84,7 +91,13 @@ def test_a_mistake_in_a_map_is_told(tmp_path: Path, text: str, words: list[str])
 
 # How a run is judged
 
-FINE = {"frames": 3, "shape_error": 0.0, "iterations": 30.0, "inverted": 0.0, "integrator": "implicit-euler"}
+FINE = {
+    "frames": 3,
+    "shape_error": 0.0,
+    "iterations": 30.0,
+    "inverted": 0.0,
+    "integrator": "implicit-euler",
+}
 
 
 @pytest.mark.parametrize(
@@ -121,7 +134,12 @@ def method(label: str, options: str = "") -> str:
 
 
 def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in):
-    methods = {"good": "", "bad": "-ksp_exit 3 -ksp_kind energy", "worse": "-ksp_exit 2", "worst": "-ksp_fail"}
+    methods = {
+        "good": "",
+        "bad": "-ksp_exit 3 -ksp_kind energy",
+        "worse": "-ksp_exit 2",
+        "worst": "-ksp_fail",
+    }
     text = "".join(method(*one) for one in methods.items()) + NAMED
     rows = carry_out(tmp_path, text, jobs=2)
     assert [row["outcome"] for row in rows] == ["ok", "energy", "refused", "crashed"]
@@ -134,7 +152,9 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in):
 
 def place(label: str, x: float, y: float, outcome: str, **given) -> dict:
     status = "ok" if outcome in OUTCOMES[-4:] else "failed"
-    return row_of(label, map="g", x=float(x), y=float(y), outcome=outcome, status=status, scene="g", **given)
+    return row_of(
+        label, map="g", x=float(x), y=float(y), outcome=outcome, status=status, scene="g", **given
+    )
 
 
 STUDY = """
@@ -145,7 +165,9 @@ x = { name = "time step", key = "time.step", unit = "s", values = [1e-4, 1e-2, 1
 y = { name = "modulus", key = "m", unit = "Pa", values = [1e3, 1e5] }
 """
 PLACES = [
-    place("newton", x, y, "ok" if x < 1 else "slow", iterations=4.2) for y in (1e3, 1e5) for x in (1e-4, 1e-2, 1)
+    place("newton", x, y, "ok" if x < 1 else "slow", iterations=4.2)
+    for y in (1e3, 1e5)
+    for x in (1e-4, 1e-2, 1)
 ] + [
     place("verlet", x, y, "ok" if x < 1 else "diverged", reason="" if x < 1 else "ran away")
     for y in (1e3, 1e5)

@@ -29,11 +29,16 @@ def pictures_of(path: Path) -> list[np.ndarray]:
     """The pictures of a film as a player has them."""
     if path.suffix != ".mp4":
         with Image.open(path) as film:
-            return [np.array(picture.convert("RGB")).astype(int) for picture in ImageSequence.Iterator(film)]
+            return [
+                np.array(picture.convert("RGB")).astype(int)
+                for picture in ImageSequence.Iterator(film)
+            ]
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     frames = imageio_ffmpeg.read_frames(str(path))
     width, height = next(frames)["size"]
-    return [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in frames]
+    return [
+        np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in frames
+    ]
 
 
 def middle_of_body(picture: np.ndarray) -> float:
@@ -57,7 +62,10 @@ def test_a_film_lasts_three_to_eight_seconds_where_nothing_is_said(span: float):
 
 def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
     playback = playback_of(np.arange(41) / 120)
-    assert 3 <= len(playback.numbers) / playback.fps <= 8 and playback.words == "10 times slower than real"
+    assert (
+        3 <= len(playback.numbers) / playback.fps <= 8
+        and playback.words == "10 times slower than real"
+    )
     assert playback_of(np.arange(61.0)).words == "10 times faster than real"
 
 
@@ -78,7 +86,9 @@ def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplo
 def test_slow_motion_shows_all_frames_for_longer(falling_ball, tmp_path):
     slow = playback_of(TIMES, speed=0.1)
     assert slow.fps == pytest.approx(1) and len(slow.numbers) == 11
-    slower = playback_of(TIMES, speed=0.02)  # a picture a second at the least, so five pictures a frame
+    slower = playback_of(
+        TIMES, speed=0.02
+    )  # a picture a second at the least, so five pictures a frame
     assert len(slower.numbers) == 51 and (abs(np.bincount(slower.numbers)[1:-1] - 5) <= 1).all()
     render(falling_ball, "-o", tmp_path / "x.gif", "--frames", "0:3", "--speed", 0.05)
     with Image.open(tmp_path / "x.gif") as film:
@@ -96,7 +106,19 @@ def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, ca
     if ending == "mp4":
         pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "new" / f"x.{ending}"
-    render(falling_ball, "-o", path, "--size", "320x480", "--eye", "0,-1,0", "--speed", 0.5, "--frames", "0:11")
+    render(
+        falling_ball,
+        "-o",
+        path,
+        "--size",
+        "320x480",
+        "--eye",
+        "0,-1,0",
+        "--speed",
+        0.5,
+        "--frames",
+        "0:11",
+    )
     assert capsys.readouterr().out.strip() == str(path)
     pictures = pictures_of(path)
     assert len(pictures) == len(HEIGHTS) and pictures[0].shape == (480, 320, 3)
@@ -112,7 +134,9 @@ def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
     """The bar of colours goes from the neutral grey to the darkest, and without colours there is none."""
     for name, words in {"plain": [], "coloured": ["--colour", "displacement"]}.items():
         render(falling_ball, "-o", tmp_path / f"{name}.png", "--frames", "0,5", *words)
-    plain, coloured = (np.array(Image.open(tmp_path / f"{name}.png")).astype(int) for name in ("plain", "coloured"))
+    plain, coloured = (
+        np.array(Image.open(tmp_path / f"{name}.png")).astype(int) for name in ("plain", "coloured")
+    )
     assert len(coloured) == len(plain) + 34
     for end in ([0xDC, 0xDC, 0xDC], [8, 0x1D, 0x58]):
         assert (abs(coloured[-24] - end).max(axis=1) < 12).any()
@@ -136,14 +160,19 @@ def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
         (["-o", "x.mp4", "--count", "3"], r"--count is for \*.png"),
         (["-o", "x.html", "--size", "100x100"], r"--size is for \*.png"),
         (["-o", "x.html", "--cells"], r"--cells is for \*.png"),
-        (["-o", "x.gif", "--size", "64x64", "--colour", "speed"], "too small for caption and legend"),
+        (
+            ["-o", "x.gif", "--size", "64x64", "--colour", "speed"],
+            "too small for caption and legend",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_ends_in_one_line(falling_ball, words, line):
     assert re.search(line, input_error(lambda: render(falling_ball, *words)))
 
 
-@pytest.mark.parametrize("sides", [(1.0, 0.1, 0.1), (0.1, 0.1, 1.0), (0.3, 0.3, 0.3)], ids=["long", "high", "cube"])
+@pytest.mark.parametrize(
+    "sides", [(1.0, 0.1, 0.1), (0.1, 0.1, 1.0), (0.3, 0.3, 0.3)], ids=["long", "high", "cube"]
+)
 def test_no_third_of_a_film_is_empty(sides, tmp_path):
     """A box that sways by a tenth of its longest side: in each third of the picture it is seen at some time."""
     box = trimesh.creation.box(sides).subdivide().subdivide()
@@ -151,10 +180,17 @@ def test_no_third_of_a_film_is_empty(sides, tmp_path):
     points = np.array(box.vertices)
     subject = drawable_of(points, np.array(box.faces))
     swaying = replace(subject, times=np.arange(3.0), nodes=lambda index: points + index % 2 * sway)
-    write_film(swaying, tmp_path / "x.gif", [0, 1, 2], Style(eye=(0, -1, 0)), playback_of(swaying.times))
+    write_film(
+        swaying, tmp_path / "x.gif", [0, 1, 2], Style(eye=(0, -1, 0)), playback_of(swaying.times)
+    )
     pictures = np.array(pictures_of(tmp_path / "x.gif"))
     body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
-    height = np.flatnonzero(body.any(axis=1))[-1] + np.flatnonzero(body.any(axis=1))[0]  # without the caption
-    for thirds in (np.array_split(body[:height], 3, axis=0), np.array_split(body[:height], 3, axis=1)):
+    height = (
+        np.flatnonzero(body.any(axis=1))[-1] + np.flatnonzero(body.any(axis=1))[0]
+    )  # without the caption
+    for thirds in (
+        np.array_split(body[:height], 3, axis=0),
+        np.array_split(body[:height], 3, axis=1),
+    ):
         assert all(third.any() for third in thirds)
     assert body[:height].mean() > 0.25

@@ -27,7 +27,9 @@ def written_page(folder: Path, *words: str, scene: str | None = None) -> Path:
 
 def data_of(path: Path) -> dict:
     text = path.read_text(encoding="utf-8")
-    return json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)[1])
+    return json.loads(
+        re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)[1]
+    )
 
 
 def stream(data: dict, name: str) -> np.ndarray:
@@ -46,7 +48,13 @@ def restored(raw: np.ndarray, frames: int) -> np.ndarray:
     return np.array(restored)
 
 
-@given(arrays(np.int64, (4, 6), elements=st.sampled_from([0, 1, 2, 255, 256, 32767, 32768, 40000, 65534, 65535])))
+@given(
+    arrays(
+        np.int64,
+        (4, 6),
+        elements=st.sampled_from([0, 1, 2, 255, 256, 32767, 32768, 40000, 65534, 65535]),
+    )
+)
 def test_any_frames_come_out_of_their_residuals(frames):
     raw = np.frombuffer(b"".join(page.residuals(frames)), np.uint8)
     assert (restored(raw, len(frames)) == frames).all()
@@ -59,15 +67,21 @@ def test_the_page_holds_every_frame_to_its_levels(tmp_path):
     numbers = restored(stream(data, "positions"), len(HEIGHTS)).reshape(len(HEIGHTS), -1, 3)
     with Result(tmp_path / "x.h5") as run:
         for index, frame in enumerate(numbers):
-            error = abs(low + frame / 65535 * (high - low) - run.frames.position[index])  # of the nodes, its points
+            error = abs(
+                low + frame / 65535 * (high - low) - run.frames.position[index]
+            )  # of the nodes, its points
             assert (error <= 0.5001 * (high - low) / 65535).all()
-        assert (stream(data, "triangles").view("<u2").reshape(-1, 3) == run.surface.triangles[:]).all()
+        assert (
+            stream(data, "triangles").view("<u2").reshape(-1, 3) == run.surface.triangles[:]
+        ).all()
     assert data["times"] == pytest.approx([index / 10 for index in range(11)])
 
 
 def test_the_page_loads_nothing(tmp_path):
     text = written_page(tmp_path).read_text(encoding="utf-8")
-    assert not re.search(r"""(src|href)\s*=|@import|https?://(?!www\.w3\.org/2000/svg)|\{\{""", text)
+    assert not re.search(
+        r"""(src|href)\s*=|@import|https?://(?!www\.w3\.org/2000/svg)|\{\{""", text
+    )
 
 
 def test_a_title_cannot_end_the_script(tmp_path):
@@ -82,7 +96,14 @@ def test_colours_come_out_as_shares_of_the_scale(tmp_path):
     shares = np.cumsum(stream(data, "colours").reshape(len(HEIGHTS), -1).astype(int), axis=0) % 256
     assert (shares[0] == 0).all() and shares.max() == 255
     assert data["legend"][0]["kind"] == "bar" and data["legend"][0]["text"] == "displacement [mm]"
-    assert [number for _, number in data["legend"][0]["ticks"]] == ["0", "100", "200", "300", "400", "500"]
+    assert [number for _, number in data["legend"][0]["ticks"]] == [
+        "0",
+        "100",
+        "200",
+        "300",
+        "400",
+        "500",
+    ]
 
 
 def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, caplog):

@@ -54,7 +54,9 @@ def test_dragging_turns_the_body(browser: Browser):
     assert abs(browser.value("view.yaw")) == pytest.approx(180) and before > 1000
     assert dark(browser) < 0.05 * before
     browser.drag((left[0] + 450, left[1]), (-450, 0))
-    assert browser.value("view.yaw") == pytest.approx(0) and dark(browser) == pytest.approx(before, rel=0.01)
+    assert browser.value("view.yaw") == pytest.approx(0) and dark(browser) == pytest.approx(
+        before, rel=0.01
+    )
     browser.drag(middle, (0, 100))
     assert browser.value("view.pitch") == pytest.approx(40)  # 0.4 degrees a pixel
 
@@ -71,7 +73,9 @@ def test_the_wheel_comes_nearer_and_goes_away(browser: Browser):
     browser.wheel(browser.middle("#view"), -300)
     browser.until("view.zoom > 1")
     zoom = browser.value("view.zoom")
-    assert np.ptp(seen(browser), axis=0) == pytest.approx(zoom * first, rel=0.03) and zoom == pytest.approx(np.exp(0.3))
+    assert np.ptp(seen(browser), axis=0) == pytest.approx(
+        zoom * first, rel=0.03
+    ) and zoom == pytest.approx(np.exp(0.3))
     browser.wheel(browser.middle("#view"), 600)
     browser.until("view.zoom < 1")
     assert np.ptp(seen(browser), axis=0) == pytest.approx(first * np.exp(-0.3), rel=0.03)
@@ -81,7 +85,9 @@ def test_dragging_with_shift_moves_the_body(browser: Browser):
     browser.value("goTo(2)")
     first = seen(browser).mean(axis=0)
     browser.drag(browser.middle("#view"), (60, -40), shift=True)
-    assert seen(browser).mean(axis=0) - first == pytest.approx([-40, 60], abs=2)  # rows go downwards
+    assert seen(browser).mean(axis=0) - first == pytest.approx(
+        [-40, 60], abs=2
+    )  # rows go downwards
     assert browser.value("[view.yaw, view.pitch]") == [0, 0]
 
 
@@ -110,4 +116,6 @@ def test_the_slider_goes_to_a_frame(browser: Browser):
     browser.click((x + (0.3 - 0.5) * (width - 16), y))  # the thumb is 16 pixels wide
     assert browser.value("[view.frame, location.hash.split('&')[0]]") == [3, "#frame=3"]
     assert "0.300 s" in browser.value("byId('time').textContent")
-    assert (seen(browser).mean(axis=0) - first.mean(axis=0))[0] == pytest.approx(0.4 * metre, rel=0.05)
+    assert (seen(browser).mean(axis=0) - first.mean(axis=0))[0] == pytest.approx(
+        0.4 * metre, rel=0.05
+    )

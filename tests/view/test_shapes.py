@@ -30,7 +30,10 @@ mesh.source = "statue.ply"
 path = [{ time = 1.0, by = [0, 0, -0.4] }]
 stop = 0.95
 """
-LOW, HIGH = np.array([0.15, -0.05, 0.45]), np.array([0.25, 0.05, 0.55])  # to the right of the ball [m]
+LOW, HIGH = (
+    np.array([0.15, -0.05, 0.45]),
+    np.array([0.25, 0.05, 0.55]),
+)  # to the right of the ball [m]
 
 
 BAR = np.array([[0.15, -0.05, 0.49], [0.25, 0.05, 0.51]])
@@ -40,7 +43,12 @@ path = [{ time = 1.0, turn = [0, 90, 0] }]
 center = [0.2, 0, 0.5]
 response = "barrier"
 """
-TWO_BARS = TURNING + f'shape = "box"\nbox = {BAR.tolist()}' + TURNING + 'shape = "mesh"\nmesh.source = "bar.ply"'
+TWO_BARS = (
+    TURNING
+    + f'shape = "box"\nbox = {BAR.tolist()}'
+    + TURNING
+    + 'shape = "mesh"\nmesh.source = "bar.ply"'
+)
 
 
 @pytest.fixture
@@ -102,7 +110,9 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
 @in_browser
 def test_a_bar_that_turns_is_drawn_as_it_has_turned(tmp_path: Path):
     """Lying at first, upright at the end; a box and a mesh alike."""
-    path = with_mesh(write_ball(tmp_path / "x.h5", scene=BARE + "picture.eye = [0, -1, 0]" + TWO_BARS), BAR)
+    path = with_mesh(
+        write_ball(tmp_path / "x.h5", scene=BARE + "picture.eye = [0, -1, 0]" + TWO_BARS), BAR
+    )
     with Result(path) as run:
         (still,) = composition_of(drawable_of_result(run), [0, 10], Style()).stills([10])
         solid = solids_of(run)[1]

@@ -30,7 +30,14 @@ def test_moments_tell_the_story(falling_ball):
         assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
         assert list(sheet.choose_moments(run, 3)) == [0, 5, 10]
         assert list(sheet.choose_moments(run, 1)) == [0]
-        assert list(sheet.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
+        assert list(sheet.choose_moments(run, 6)) == [
+            0,
+            1,
+            3,
+            5,
+            8,
+            10,
+        ]  # the first of the longest gaps is halved
         assert list(sheet.choose_moments(run, 99)) == list(range(11))
 
 
@@ -38,7 +45,9 @@ def test_moments_tell_the_story(falling_ball):
 def stills(tmp_path):
     """stills(scene tables, frames, eye) of a sheet that is not drawn."""
 
-    def stills_of(tables: str, frames: list[int], eye: tuple[float, ...] | None = None) -> list[Still]:
+    def stills_of(
+        tables: str, frames: list[int], eye: tuple[float, ...] | None = None
+    ) -> list[Still]:
         path = write_ball(tmp_path / "x.h5", scene=BARE + tables)
         with Result(path) as run:
             return composition_of(drawable_of_result(run), frames, Style(eye=eye)).stills(frames)
@@ -50,7 +59,9 @@ def test_moments_of_the_scene(tmp_path):
     path = write_ball(tmp_path / "x.h5", scene=f"{BARE}picture.times = [0.72, 99.0, 0.26, 0.3]")
     sheet.contact_sheet(path, tmp_path / "x.png")
     sheet.contact_sheet(path, tmp_path / "y.png", frames=[0, 3, 7, 10])
-    one, other = (np.array(Image.open(tmp_path / name))[: -sheet.CAPTION] for name in ("x.png", "y.png"))
+    one, other = (
+        np.array(Image.open(tmp_path / name))[: -sheet.CAPTION] for name in ("x.png", "y.png")
+    )
     np.testing.assert_array_equal(one, other)
 
 
@@ -65,7 +76,9 @@ def test_camera_stands_upright_and_at_the_eye(gravity, eye):
     axes = np.array([camera.right, camera.away, camera.up])
     assert axes @ axes.T == pytest.approx(np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
     assert axes @ gravity == pytest.approx([0, 0, -np.linalg.norm(gravity)])
-    assert np.cross(camera.right, camera.upward) == pytest.approx(camera.to_eye)  # the picture is no mirror image
+    assert np.cross(camera.right, camera.upward) == pytest.approx(
+        camera.to_eye
+    )  # the picture is no mirror image
     assert camera.upward @ camera.up > -1e-9
     if eye is not None:
         assert camera.to_eye @ eye == pytest.approx(np.linalg.norm(eye))
@@ -93,7 +106,9 @@ def test_held_parts(tmp_path):
             subject = drawable_of_result(run)
             fixed[name] = [subject.fixed(index) for index in (0, 4, 5)]
             points = subject.surface(0)
-    assert ((fixed["east"][0] == 1) == (points[:, 0] >= 0.02)).all() and 0 < fixed["east"][0].mean() < 0.5
+    assert ((fixed["east"][0] == 1) == (points[:, 0] >= 0.02)).all() and 0 < fixed["east"][
+        0
+    ].mean() < 0.5
     assert ((fixed["led"][0] == 1) == (points[:, 2] <= 0.48)).all()
     assert (fixed["led"][1] == fixed["led"][0]).all() and not fixed["led"][2].any()
 
@@ -159,16 +174,24 @@ def plane(height: float, normal: str) -> str:
 
 def test_what_would_hide_the_body_is_glass(stills):
     above = stills(plane(0.7, "[0, 0, -1]"), frames=[0])[0].overlays
-    assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))  # its face
+    assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(
+        np.full(4, 0.7)
+    )  # its face
     assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
     ground = plane(0.4, "[0, 0, 1]")
     below = stills(ground, frames=[0])[0].overlays
     assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
     turned = stills(ground, frames=[0], eye=(3, -1, 2))[0].overlays
-    assert turned.grounds[0].corners == pytest.approx(below.grounds[0].corners), "it is of the scene, not of the view"
-    assert np.ptp(below.grounds[0].corners, axis=0)[:2] == pytest.approx([0.64, 0.64])  # of a ball of 0.2 m
+    assert turned.grounds[0].corners == pytest.approx(below.grounds[0].corners), (
+        "it is of the scene, not of the view"
+    )
+    assert np.ptp(below.grounds[0].corners, axis=0)[:2] == pytest.approx(
+        [0.64, 0.64]
+    )  # of a ball of 0.2 m
     assert stills(ground, frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
-    assert len(stills(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.grounds) == 0  # over half a ball away
+    assert (
+        len(stills(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.grounds) == 0
+    )  # over half a ball away
 
 
 def test_an_enormous_box_is_cut_and_a_far_one_left_out(stills):
@@ -182,23 +205,37 @@ def test_an_enormous_box_is_cut_and_a_far_one_left_out(stills):
 def test_spheres_are_shown_where_they_are_and_large_ones_cut(stills):
     ball = '[[obstacle]]\nshape = "sphere"\ncenter = [0, 0, {}]\nradius = {}\n'
     path = "path = [{ time = 1.0, by = [0, 0, -0.1] }]\n"
-    start, end = (still.overlays.balls for still in stills(ball.format(0.8, 0.05) + path, frames=[0, 10]))
-    assert start[0].center == pytest.approx([0, 0, 0.8]) and end[0].center[2] < 0.8 and start[0].radius == 0.05
+    start, end = (
+        still.overlays.balls for still in stills(ball.format(0.8, 0.05) + path, frames=[0, 10])
+    )
+    assert (
+        start[0].center == pytest.approx([0, 0, 0.8])
+        and end[0].center[2] < 0.8
+        and start[0].radius == 0.05
+    )
     (large,) = stills(ball.format(-49.61, 50), frames=[0])[0].overlays.balls
-    assert large.radius == 50 and np.ptp(large.seen, axis=0)[:2] == pytest.approx(1.3 * np.array([0.2, 0.2]))
+    assert large.radius == 50 and np.ptp(large.seen, axis=0)[:2] == pytest.approx(
+        1.3 * np.array([0.2, 0.2])
+    )
     assert stills(ball.format(3, 0.1), frames=[0])[0].overlays.balls == []
 
 
 def test_glass_is_seen_at_its_place_and_through(tmp_path):
     level = "picture.eye = [0, -1, 0]"
     path = write_ball(tmp_path / "x.h5", scene=BARE + level + PLATE)
-    picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0, 1, 8])))[: -sheet.CAPTION]
+    picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0, 1, 8])))[
+        : -sheet.CAPTION
+    ]
     panels = np.split(picture, 3, axis=1)
     across = np.flatnonzero(is_body(panels[2]).any(axis=0))
     left, ball = across[0] - 2, slice(across[0], across[-1] + 1)
     _, through, alone = [is_body(panel[:, ball]).sum() for panel in panels]
-    assert through == pytest.approx(alone, rel=0.03)  # at 0.1 s the plate stands before a thirteenth of the ball
-    above, before, gone = [np.flatnonzero((panel[:, :left] < 250).any(axis=(1, 2))) for panel in panels]
+    assert through == pytest.approx(
+        alone, rel=0.03
+    )  # at 0.1 s the plate stands before a thirteenth of the ball
+    above, before, gone = [
+        np.flatnonzero((panel[:, :left] < 250).any(axis=(1, 2))) for panel in panels
+    ]
     metre = np.ptp(across) / 0.2
     assert before[0] - above[0] == pytest.approx(0.1 * metre, abs=3)
     assert np.ptp(before) == pytest.approx(0.02 * metre, abs=3)
@@ -213,7 +250,9 @@ def is_body(picture: np.ndarray) -> np.ndarray:
 def body_rows(picture: np.ndarray) -> tuple[int, int]:
     """First and last row of pixels that show the body; it must not reach the picture's edges."""
     blue = is_body(picture)
-    assert not blue[:, 0].any() and not blue[:, -1].any() and not blue[0].any() and not blue[-1].any()
+    assert (
+        not blue[:, 0].any() and not blue[:, -1].any() and not blue[0].any() and not blue[-1].any()
+    )
     rows = np.flatnonzero(blue.any(axis=1))
     return rows[0], rows[-1]
 
@@ -225,13 +264,17 @@ def test_heights_sizes_and_captions_are_seen(falling_ball, tmp_path, capfd):
     panels = np.split(picture, 5, axis=1)
     (top, bottom), fallen, squashed, leapt, _ = [body_rows(panel) for panel in panels]
     metre = (bottom - top) / 0.2  # the ball is 0.2 m high
-    assert metre * 0.4 == pytest.approx(fallen[0] - top, rel=0.05)  # less the cosine of the elevation
+    assert metre * 0.4 == pytest.approx(
+        fallen[0] - top, rel=0.05
+    )  # less the cosine of the elevation
     assert metre * 0.15 == pytest.approx(leapt[0] - top, rel=0.06)
     assert squashed[1] - squashed[0] < 0.75 * (bottom - top)
     ground = (abs(picture[..., :3].astype(int) - [239, 236, 230]).max(axis=2) < 3).any(axis=1)
     last_ground = np.flatnonzero(ground)[-1]
     ink = bottom + 9 + np.flatnonzero((panels[0][bottom + 9 :, :, :3] < 90).all(axis=2).any(axis=1))
-    assert fallen[1] < last_ground < ink.min()  # whole ball, ground, then captions (below the ball, dark itself)
+    assert (
+        fallen[1] < last_ground < ink.min()
+    )  # whole ball, ground, then captions (below the ball, dark itself)
 
 
 def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
@@ -250,7 +293,9 @@ def test_without_opengl_one_line_names_the_package(falling_ball, tmp_path):
     environment |= {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "PYTHONPATH": str(ROOT)}
     done = python("-c", draw, falling_ball, tmp_path / "x.png", env=environment)
     assert done.returncode == 1
-    assert done.stderr.strip().endswith("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
+    assert done.stderr.strip().endswith(
+        "no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri"
+    )
     assert "WARN" not in done.stderr
 
 
@@ -273,13 +318,17 @@ def test_all_that_is_written_is_in_one_typeface(falling_ball, tmp_path, monkeypa
         draw(self, at, text, fill, font, **options)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", recorded)
-    sheet.contact_sheet(falling_ball, tmp_path / "x.png", frames=[0], style=Style(colour="displacement"))
+    sheet.contact_sheet(
+        falling_ball, tmp_path / "x.png", frames=[0], style=Style(colour="displacement")
+    )
     assert set(written.values()) == {"DejaVu Sans"}
     assert {"displacement", "t"} <= {text.partition(" ")[0] for text in written}
 
 
 def test_a_black_picture_is_no_picture(falling_ball, tmp_path, monkeypatch):
-    monkeypatch.setattr(renderer.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
+    monkeypatch.setattr(
+        renderer.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8)
+    )
     with pytest.raises(InputError, match="black picture"):
         sheet.contact_sheet(falling_ball, tmp_path / "y.png", frames=[0])
     assert not (tmp_path / "y.png").exists()
@@ -296,13 +345,20 @@ def test_a_part_that_flies_off_does_not_shrink_the_others(tmp_path, caplog):
     with caplog.at_level("INFO", logger="msmpetsc"):
         composition = composition_of(flying, list(range(11)), Style())
     assert "1 of 2 parts leave the picture" in caplog.text
-    assert [entry.text for entry in entries_of(composition, composition.stills([0]))] == [composition.note]
+    assert [entry.text for entry in entries_of(composition, composition.stills([0]))] == [
+        composition.note
+    ]
     sheet.draw_panels(composition, composition.stills([0, 10]), tmp_path / "x.png")
     first, last = np.split(np.array(Image.open(tmp_path / "x.png")), 2, axis=1)
-    for panel in (first, last):  # the ball that stays, of 0.6 m that both are wide at first: 4 px if 100 m were seen
+    for panel in (
+        first,
+        last,
+    ):  # the ball that stays, of 0.6 m that both are wide at first: 4 px if 100 m were seen
         assert np.ptp(np.flatnonzero(is_body(panel[:-100, : len(panel[0]) // 2]).any(axis=0))) > 100
     assert is_body(first[:-100, len(first[0]) // 2 :]).any(), "where both begin is in view"
-    assert composition.bounds[1, 0] == pytest.approx(100.5) and composition.box[1, 0] == pytest.approx(0.5)
+    assert composition.bounds[1, 0] == pytest.approx(100.5) and composition.box[
+        1, 0
+    ] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("way", [0.0, 0.5, 30.0])
@@ -310,6 +366,9 @@ def test_the_only_part_and_all_parts_that_go_together_stay_in_view(way):
     boxes = np.array([[[[0, 0, 0], [1, 1, 1]]]], float)
     falls = boxes + np.arange(5).reshape(-1, 1, 1, 1) * way
     assert staying(falls).tolist() == [True]
-    assert staying(np.concatenate([falls, falls + np.array([0, 2, 0])], axis=1)).tolist() == [True, True]
+    assert staying(np.concatenate([falls, falls + np.array([0, 2, 0])], axis=1)).tolist() == [
+        True,
+        True,
+    ]
     flies = np.concatenate([np.repeat(boxes, 5, axis=0), falls + np.array([2, 0, 0])], axis=1)
     assert staying(flies).tolist() == [True, way < 1]

@@ -27,8 +27,12 @@ def block() -> Drawable:
     """A block of 12 triangles and its 64 cells, at rest and bent."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], H * CELLS])
     points, triangles = np.array(box.vertices), np.array(box.faces)
-    nodes = np.stack(np.meshgrid(*(np.arange(n + 1) for n in CELLS), indexing="ij"), axis=-1).reshape(-1, 3)
-    low = np.stack(np.meshgrid(*(np.arange(n) for n in CELLS), indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    nodes = np.stack(
+        np.meshgrid(*(np.arange(n + 1) for n in CELLS), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
+    low = np.stack(np.meshgrid(*(np.arange(n) for n in CELLS), indexing="ij"), axis=-1).reshape(
+        -1, 1, 3
+    )
     cells = np.ravel_multi_index(np.moveaxis(low + CORNERS, -1, 0), tuple(CELLS + 1))
     nodes = H * nodes
     W = csr_array((np.linalg.norm(points[:, None] - nodes, axis=2) < 1e-9).astype(float))
@@ -46,7 +50,9 @@ def test_a_block_of_twelve_triangles_is_drawn_as_its_cells_bend():
     subject = drawn(block())
     rest, points = subject.rest.points, subject.surface(1)
     assert len(subject.triangles) > 12 and len(points) == len(rest)
-    longest = np.linalg.norm(rest[subject.triangles] - rest[np.roll(subject.triangles, 1, axis=1)], axis=2).max()
+    longest = np.linalg.norm(
+        rest[subject.triangles] - rest[np.roll(subject.triangles, 1, axis=1)], axis=2
+    ).max()
     assert longest <= H * (1 + 1e-9)
     # trilinear between nodes: 0.3 h^2 / 4 off the parabola in the middle of a cell, where 12 triangles are 0.075 off
     assert points == pytest.approx(bent(rest), abs=0.3 * H**2 / 4 + 1e-9)
@@ -70,7 +76,9 @@ def test_normals_are_split_at_sharp_edges_alone():
     for point in range(24):
         around = cube.face_normals[(triangles == point).any(axis=1)]
         assert around == pytest.approx(np.tile(around[0], (len(around), 1)))
-    assert len(split_at_edges(np.array(ball.vertices), np.array(ball.faces))[0]) == len(ball.vertices)
+    assert len(split_at_edges(np.array(ball.vertices), np.array(ball.faces))[0]) == len(
+        ball.vertices
+    )
 
 
 @pytest.mark.parametrize(("degrees", "points"), [(25, 6), (35, 8)])
@@ -94,7 +102,9 @@ def test_pins_are_coloured_up_to_where_half_of_a_point_is_held():
     """A flat strip from above, one end of which is held: two colours, and none between them."""
     x = np.arange(6.0)
     points = np.array([(a, b, 0) for a in x for b in (0, 1)])
-    triangles = np.array([t for k in range(0, 10, 2) for t in ((k, k + 2, k + 1), (k + 1, k + 2, k + 3))])
+    triangles = np.array(
+        [t for k in range(0, 10, 2) for t in ((k, k + 2, k + 1), (k + 1, k + 2, k + 3))]
+    )
     share = np.where(points[:, 0] < 1.5, 1.0, 0.3)
     subject = drawable_of(points, triangles)
     rest = replace(subject.rest, nodes=np.tile(points, (2, 1)), body_of_node=np.zeros(24, int))
@@ -110,7 +120,10 @@ def test_pins_are_coloured_up_to_where_half_of_a_point_is_held():
     steps = np.flatnonzero(np.abs(np.diff(colours, axis=0)).max(axis=1) > 2)
     assert len(steps) and np.ptp(steps) <= 2, "one edge, which antialiasing may widen by two pixels"
     border = (1 + (1.0 - 0.5) / (1.0 - 0.3)) / 5  # between the second and the third pair of points
-    assert steps[0] == pytest.approx(border * len(colours), abs=4) and colours[0, 0] < colours[-1, 0] - 30
+    assert (
+        steps[0] == pytest.approx(border * len(colours), abs=4)
+        and colours[0, 0] < colours[-1, 0] - 30
+    )
 
 
 def test_bodies_have_a_colour_each():
@@ -130,7 +143,9 @@ def test_a_clamp_ends_in_a_straight_line_whatever_the_triangles():
     rest = replace(whole.rest, points=points, body_of_point=np.zeros(len(points), int))
     W = trilinear(rest, points, rest.body_of_point)
     triangles = Delaunay(flat).simplices
-    clamped = replace(whole, rest=rest, embedding=W, triangles=triangles, pinned=rest.nodes[:, 0] < 4.1 * H)
+    clamped = replace(
+        whole, rest=rest, embedding=W, triangles=triangles, pinned=rest.nodes[:, 0] < 4.1 * H
+    )
     composition = composition_of(drawn(clamped), [0], Style(eye=(0, -1, 0)))
     stills = composition.stills([0])
     low, high, _ = composition.room(stills)
@@ -141,4 +156,6 @@ def test_a_clamp_ends_in_a_straight_line_whatever_the_triangles():
     rows = np.flatnonzero(dark.sum(axis=1) > 10)[5:-5]
     ends = np.array([np.flatnonzero(dark[row])[-1] for row in rows])
     assert len(rows) > 80 and np.ptp(ends) <= 4, "corners of triangles stand out by 38 pixels"
-    assert np.ptp(np.flatnonzero(dark.any(axis=0))) == pytest.approx(4.5 * H * scale, abs=2), "half a cell beyond"
+    assert np.ptp(np.flatnonzero(dark.any(axis=0))) == pytest.approx(4.5 * H * scale, abs=2), (
+        "half a cell beyond"
+    )

@@ -30,7 +30,10 @@ def check_random_grids(shapes: list[tuple[int, int, int]], seeds: int) -> None:
             ends = slab_edges(comm.size, shape[0])
             slab = Slab(*ends[comm.rank : comm.rank + 2])
             cells = np.argwhere(boundary)
-            assert (np.searchsorted(ends[1:], np.arange(slab.first, slab.last), side="right") == comm.rank).all()
+            assert (
+                np.searchsorted(ends[1:], np.arange(slab.first, slab.last), side="right")
+                == comm.rank
+            ).all()
             own = cells[(cells[:, 0] >= slab.first) & (cells[:, 0] < slab.last)]
             found = cells_of_gaps(enclosed_gaps(comm, own, slab))
             expected = np.argwhere(enclosed(boundary))
@@ -53,7 +56,9 @@ def fill_to_file(mesh: Path, cell_size: float) -> None:
     parts = comm.gather((cages.table.first, cages.ijk, cages.kind, cages.share))
     if comm.rank == 0:
         assert [part[0] for part in parts] == sorted(part[0] for part in parts)
-        ijk, kind, share = (np.concatenate([part[column] for part in parts]) for column in (1, 2, 3))
+        ijk, kind, share = (
+            np.concatenate([part[column] for part in parts]) for column in (1, 2, 3)
+        )
         np.savez(mesh.with_suffix(".cells.npz"), ijk=ijk, kind=kind, share=share)
 
 

@@ -10,7 +10,11 @@ comm = MPI.COMM_WORLD
 
 
 def same(found: np.ndarray, expected: np.ndarray) -> None:
-    assert found.dtype == expected.dtype and np.array_equal(found, expected), (comm.rank, found, expected)
+    assert found.dtype == expected.dtype and np.array_equal(found, expected), (
+        comm.rank,
+        found,
+        expected,
+    )
 
 
 def check_route(rng: np.random.Generator, rows: int, senders: int) -> None:
@@ -20,9 +24,17 @@ def check_route(rng: np.random.Generator, rows: int, senders: int) -> None:
     number = np.arange(rows)
     mine, here = holder == comm.rank, destination == comm.rank
     route = Route(comm, destination[mine])
-    for whole in (number, number > 3, number.astype(np.uint8), rng.random((rows, 3)), rng.random((rows, 2, 2))):
+    for whole in (
+        number,
+        number > 3,
+        number.astype(np.uint8),
+        rng.random((rows, 3)),
+        rng.random((rows, 2, 2)),
+    ):
         same(route.send(whole[mine]), whole[here])  # holders are sorted: by sender, then in order
-        same(route.answer(whole[here][..., None]), whole[mine][..., None])  # answers need not look like the rows
+        same(
+            route.answer(whole[here][..., None]), whole[mine][..., None]
+        )  # answers need not look like the rows
 
 
 def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit: int) -> None:
@@ -33,10 +45,16 @@ def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit:
     plain = np.unique(given)
     assert table.total == len(plain)
     same(table.keys, plain[table.first : table.first + len(table.keys)])
-    assert comm.allreduce(len(table.keys)) == table.total  # so no key is on two ranks, and none is lost
+    assert (
+        comm.allreduce(len(table.keys)) == table.total
+    )  # so no key is on two ranks, and none is lost
     asked = np.concatenate([given, rng.integers(-1, limit, count + 2)])
-    asked = asked[: len(asked) // 2 * 2].reshape(2, -1)[:, :: comm.rank + 1]  # ranks ask differently
-    expected = np.array([[np.searchsorted(plain, key) if key in plain else -1 for key in row] for row in asked])
+    asked = asked[: len(asked) // 2 * 2].reshape(2, -1)[
+        :, :: comm.rank + 1
+    ]  # ranks ask differently
+    expected = np.array(
+        [[np.searchsorted(plain, key) if key in plain else -1 for key in row] for row in asked]
+    )
     same(table.find(asked), expected.reshape(asked.shape).astype(np.int64))
     starts = np.array(comm.allgather(table.first))
     index = np.arange(table.total)

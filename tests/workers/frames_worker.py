@@ -24,8 +24,12 @@ def positions(index: int, rows: int) -> np.ndarray:
 def frame(index: int, nodes: slice = slice(None), points: slice | None = slice(None)) -> Frame:
     """Frame `index` of a body of NODES nodes and POINTS surface points, the rows of one rank."""
     surface = None if points is None else -positions(index, POINTS)[points]
-    numbers = dict(step_error=index / 7, iterations=index + 1, ksp_its=index + 2, wall_time=index / 3)
-    energies = dict(kinetic=index + 0.1, elastic=index + 0.2, potential=index + 0.3, contact=index + 0.4)
+    numbers = dict(
+        step_error=index / 7, iterations=index + 1, ksp_its=index + 2, wall_time=index / 3
+    )
+    energies = dict(
+        kinetic=index + 0.1, elastic=index + 0.2, potential=index + 0.3, contact=index + 0.4
+    )
     momentum = np.array([index, 1.0, 2.0])
     position = positions(index, NODES)[nodes]
     arrays = dict(position=position, surface=surface, momentum=momentum)
@@ -42,16 +46,24 @@ def share(rows: int) -> slice:
 def write_all(path: str, gathers: bool = False) -> None:
     layout.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
     nodes, points = share(NODES), share(POINTS)
-    with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}, gathers=gathers) as file:
+    with ResultFile(
+        path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}, gathers=gathers
+    ) as file:
         file.write("lattice/nodes", positions(0, NODES)[nodes])
         file.write("lattice/springs", np.arange(2 * NODES).reshape(-1, 2)[nodes])
         file.write("lattice/pinned", np.zeros(0, int))
-        file.start_frames(STEPS + 1, nodes.stop - nodes.start, {"surface": points.stop - points.start})
+        file.start_frames(
+            STEPS + 1, nodes.stop - nodes.start, {"surface": points.stop - points.start}
+        )
         for index in range(STEPS + 1):
             file.append(frame(index, nodes, points))
             file.write_checkpoint(
                 Checkpoint(
-                    index, {"q": positions(index, NODES)[nodes], "q_previous": positions(index - 1, NODES)[nodes]}
+                    index,
+                    {
+                        "q": positions(index, NODES)[nodes],
+                        "q_previous": positions(index - 1, NODES)[nodes],
+                    },
                 )
             )
 

@@ -22,15 +22,27 @@ def compare_hierarchies() -> None:
             lattice = build(comm, LATTICES[name], **more)
             with hierarchy(comm, lattice, SHAPES[shape], contact=contact, coarsest=10) as case:
                 levels = range(len(case.multigrid.levels))
-                keys = [np.concatenate(comm.allgather(level.grid.table.keys)) for level in case.multigrid.levels]
-                matrices = [matrix(i) for i in levels for matrix in (case.interpolation, case.level)]
-                found.append((keys, [*matrices, case.hessian(), case.dense(case.multigrid.pc.apply, every=7)]))
+                keys = [
+                    np.concatenate(comm.allgather(level.grid.table.keys))
+                    for level in case.multigrid.levels
+                ]
+                matrices = [
+                    matrix(i) for i in levels for matrix in (case.interpolation, case.level)
+                ]
+                found.append(
+                    (
+                        keys,
+                        [*matrices, case.hessian(), case.dense(case.multigrid.pc.apply, every=7)],
+                    )
+                )
         for one, several in zip(found[1][0], found[0][0], strict=True):
             np.testing.assert_array_equal(several, one)
         for one, several in zip(found[1][1], found[0][1], strict=True):
             *_, cycle = found[1][1]
             accuracy = 1e-4 if one is cycle else 1e-11
-            np.testing.assert_allclose(several, one, rtol=0, atol=accuracy * np.abs(one).max(), err_msg=name)
+            np.testing.assert_allclose(
+                several, one, rtol=0, atol=accuracy * np.abs(one).max(), err_msg=name
+            )
 
 
 if __name__ == "__main__":

@@ -82,11 +82,15 @@ def run(args: argparse.Namespace) -> int:
     """Run each scene, and compare or store its numbers; return the exit status."""
     asked = None
     if args.frames or args.cells or args.set:
-        asked = Recipe(cells=args.cells, steps=min(args.frames or STEPS, MOST_STEPS), changes=args.set)
+        asked = Recipe(
+            cells=args.cells, steps=min(args.frames or STEPS, MOST_STEPS), changes=args.set
+        )
     files = {scene: scene.with_suffix(".baseline.json") for scene in args.scenes}
     if not args.update:
         if asked:
-            raise InputError("--cells, --frames and --set are for --update: the numbers stored say how they were made")
+            raise InputError(
+                "--cells, --frames and --set are for --update: the numbers stored say how they were made"
+            )
         return int(any(check(files, args.ranks, args.json).values()))
     if args.json:
         raise InputError("--update checks nothing: --json is of no use")
@@ -117,7 +121,11 @@ def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
 def numbers_of(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
     """Run a scene by a recipe; return its numbers. Raises InputError where the run fails."""
     cells = [] if recipe.cells is None else [f"cages.count={recipe.cells}"]
-    words = [word for change in (*cells, "output.surface=false", *recipe.changes) for word in ("--set", change)]
+    words = [
+        word
+        for change in (*cells, "output.surface=false", *recipe.changes)
+        for word in ("--set", change)
+    ]
     with tempfile.TemporaryDirectory(prefix="msmpetsc-numbers-") as folder:
         path = Path(folder) / "run.h5"
         steps = ["--frames", str(recipe.steps), "--error", str(ERROR)]
@@ -132,14 +140,22 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, li
     """Compare scenes with their stored numbers; print and return the differences by scene."""
     for scene, file in files.items():
         if not file.is_file():
-            raise InputError(f"nothing is stored of {scene}: msmpetsc check --update {quote(str(scene))} stores {file}")
+            raise InputError(
+                f"nothing is stored of {scene}: msmpetsc check --update {quote(str(scene))} stores {file}"
+            )
     stored = {scene: read(file) for scene, file in files.items()}
-    for scene, numbers in stored.items():  # whose changes come with the scene, and name what lies beside it
+    for (
+        scene,
+        numbers,
+    ) in stored.items():  # whose changes come with the scene, and name what lies beside it
         load_scene(scene, numbers.run.changes, by_user=False)
     with redirect_stdout(None) if as_json else nullcontext():
         print(HEAD, flush=True)
         wrong = {str(scene): checked(scene, numbers, ranks) for scene, numbers in stored.items()}
-        print("".join(f"{scene}: {line}\n" for scene, lines in wrong.items() for line in lines), end="")
+        print(
+            "".join(f"{scene}: {line}\n" for scene, lines in wrong.items() for line in lines),
+            end="",
+        )
     if as_json:
         print(json.dumps({"same": not any(wrong.values()), "differences": wrong}, indent=1))
     return wrong
@@ -155,9 +171,14 @@ def checked(scene: Path, stored: Numbers, ranks: int) -> list[str]:
         return [str(error).removeprefix(f"{scene}: ")]
     wrong = judged(numbers, stored)
     verdict = "DIFFERS" if wrong else "same"
-    _, off, most = max(differences(numbers, stored), key=lambda row: row[1] / row[2] if row[2] else np.inf)
+    _, off, most = max(
+        differences(numbers, stored), key=lambda row: row[1] / row[2] if row[2] else np.inf
+    )
     sizes = "{cells:6} {nodes:6} {springs:8}".format_map(numbers.counts)
-    print(f"{scene.stem:20} {sizes} {off:9.1e} {most:9.1e} {perf_counter() - began:5.1f} s {verdict}", flush=True)
+    print(
+        f"{scene.stem:20} {sizes} {off:9.1e} {most:9.1e} {perf_counter() - began:5.1f} s {verdict}",
+        flush=True,
+    )
     return wrong
 
 
@@ -175,7 +196,9 @@ def summary(path: Path, recipe: Recipe) -> Numbers:
         counts["frames"] = len(frames.time)
         momentum = frames.momentum[-1]
     some = np.linspace(0, len(q) - 1, NODES).astype(int)
-    ends: dict[str, tuple[Unit, Any]] = {name: ("J", values[-1]) for name, values in energies.items()}
+    ends: dict[str, tuple[Unit, Any]] = {
+        name: ("J", values[-1]) for name, values in energies.items()
+    }
     ends |= {"momentum": ("kg m/s", momentum), "centre of mass": ("m", mass @ q / mass.sum())}
     ends |= {"lowest corner": ("m", q.min(axis=0)), "highest corner": ("m", q.max(axis=0))}
     ends |= {f"node {node}": ("m", q[node]) for node in some}
@@ -201,7 +224,12 @@ def differences(now: Numbers, stored: Numbers) -> Iterator[tuple[str, float, flo
     """Yield the name, the relative difference and the allowed one of each number."""
     for name in now.numbers.keys() | stored.numbers.keys():
         one, other = now.numbers.get(name), stored.numbers.get(name)
-        if one is None or other is None or one.unit != other.unit or np.shape(one.value) != np.shape(other.value):
+        if (
+            one is None
+            or other is None
+            or one.unit != other.unit
+            or np.shape(one.value) != np.shape(other.value)
+        ):
             yield name, np.inf, 0.0
             continue
         apart = np.abs(np.subtract(one.value, other.value, dtype=float)).max()
@@ -243,7 +271,9 @@ def read(path: Path) -> Numbers:
     except ValidationError as error:
         first = error.errors()[0]
         where = printable(".".join(map(str, first["loc"])) or "all", 60)
-        raise InputError(f"{path} is damaged, or has no numbers of a scene: {where}: {first['msg']}") from None
+        raise InputError(
+            f"{path} is damaged, or has no numbers of a scene: {where}: {first['msg']}"
+        ) from None
     except (ValueError, LookupError):
         raise InputError(f"{path} is damaged, or has no numbers of a scene") from None
     return stored

@@ -19,7 +19,9 @@ from msmpetsc.results.comparison import (
 )
 from msmpetsc.results.reader import Result, refuse_deadly
 
-HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
+HEAD = (
+    f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
+)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,8 +37,17 @@ def run(args: argparse.Namespace) -> int:
         apart = len(comparison.pairs) < most
         agree = not apart and all(field["first_above"] is None for field in fields.values())
         if args.json:
-            shown = {"agree": agree, "rtol": args.rtol, "frames": len(comparison.pairs), "fields": fields}
-            print(json.dumps(shown | {"left_out": list(comparison.left_out), "notes": notes}, indent=1))
+            shown = {
+                "agree": agree,
+                "rtol": args.rtol,
+                "frames": len(comparison.pairs),
+                "fields": fields,
+            }
+            print(
+                json.dumps(
+                    shown | {"left_out": list(comparison.left_out), "notes": notes}, indent=1
+                )
+            )
         else:
             print("\n".join([*notes, *not_shared(first, second, comparison), HEAD]))
             print("\n".join(row(name, field) for name, field in fields.items()))
@@ -97,7 +108,11 @@ def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterato
 
 def first_difference(result: Result, comparison: Comparison, rtol: float) -> Iterator[str]:
     """Yield the first frame that differs, and its node of the largest difference."""
-    firsts = {field.name: first for field in comparison.fields if (first := field.first_above(rtol)) is not None}
+    firsts = {
+        field.name: first
+        for field in comparison.fields
+        if (first := field.first_above(rtol)) is not None
+    }
     if not firsts:
         yield f"they agree to {rtol:g} at these {len(comparison.pairs)} frames"
         return

@@ -51,7 +51,10 @@ NOTHING = {  # what it means if they say nothing
     "PETSc": (BROKEN, "a PETSc of real double numbers is needed (--with-scalar-type=real)"),
     "MPI": (BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI"),
     "GPU": (MISSING, "no CUDA device on this machine"),
-    "kernels": (MISSING, "no folder can keep them: each process compiles them, a minute; NUMBA_CACHE_DIR names one"),
+    "kernels": (
+        MISSING,
+        "no folder can keep them: each process compiles them, a minute; NUMBA_CACHE_DIR names one",
+    ),
 }
 BRINGS = {  # of packages whose names alone do not say how to get them
     "petsc4py": "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'",
@@ -91,7 +94,12 @@ def probed(code: str, *launcher: str) -> tuple[str, str]:
     command = [*launcher, sys.executable, "-c", code]
     try:
         done = subprocess.run(
-            command, env=environment(), timeout=PATIENCE, stdin=subprocess.DEVNULL, capture_output=True, text=True
+            command,
+            env=environment(),
+            timeout=PATIENCE,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
         )
     except FileNotFoundError:
         remedy = "apt install openmpi-bin, or load the module of the cluster's MPI"

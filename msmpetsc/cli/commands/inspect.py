@@ -37,9 +37,16 @@ from msmpetsc.solve.petsc.initialise import initialise
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
-PROGRAM, FACTOR = 0.29e9, 2.1  # [byte] of a rank without arrays, and times those, as runs of newton show it
-BYTES = np.array([145, 41, 24])  # of a lattice's arrays for a cell, a node, ghosts too, and a spring
-BYTES_OF_POINT = 14 * 64 * 8  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
+PROGRAM, FACTOR = (
+    0.29e9,
+    2.1,
+)  # [byte] of a rank without arrays, and times those, as runs of newton show it
+BYTES = np.array(
+    [145, 41, 24]
+)  # of a lattice's arrays for a cell, a node, ghosts too, and a spring
+BYTES_OF_POINT = (
+    14 * 64 * 8
+)  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
 GB = 1e9
 SPRINGS = "springs; of a rank, shared ones too"
 WIDTH = 36  # of the first column
@@ -88,13 +95,23 @@ class Partition:
         grown = cells + (nodes - before) * f ** (2 / 3)
         springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * before) * f ** (2 / 3)
         side, side_before = np.cbrt(np.array([grown, nodes]) / len(self.nodes))
-        around = ((side + 2) ** 3 - side**3) / ((side_before + 2) ** 3 - side_before**3)  # nodes around a cube
+        around = ((side + 2) ** 3 - side**3) / (
+            (side_before + 2) ** 3 - side_before**3
+        )  # nodes around a cube
         nonzeros = self.nonzeros * (grown + 2 * springs) / self.nonzeros.sum()
-        held = self.cells * f, self.nodes * grown / nodes, self.ghosts * around, self.cut * around, nonzeros
+        held = (
+            self.cells * f,
+            self.nodes * grown / nodes,
+            self.ghosts * around,
+            self.cut * around,
+            nonzeros,
+        )
         return Partition(*held, self.neighbours)
 
 
-def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int) -> tuple[Partition, int]:
+def partition_of(
+    bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int
+) -> tuple[Partition, int]:
     """Return the partition among ``ranks`` ranks, and the cells of the lattice that it was counted on.
 
     That lattice has about MOST_BUILT cells where more are wanted, and its numbers are scaled.
@@ -113,13 +130,22 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int) 
 
 def count_partition(lattice: Topology, ranks: int) -> Partition:
     """Return the partition among ``ranks`` ranks of a lattice that is whole, built on one rank."""
-    cell_rank, rank = (np.arange(n) * ranks // n for n in (len(lattice.corners), len(lattice.octants)))
+    cell_rank, rank = (
+        np.arange(n) * ranks // n for n in (len(lattice.corners), len(lattice.octants))
+    )
     of_end = rank[lattice.springs]
     across = of_end[:, 0] != of_end[:, 1]
     to, node = of_end[across].ravel(), lattice.springs[across][:, ::-1].ravel()
     ghosts = np.unique(to * len(rank) + node)
     holder, owner = ghosts // len(rank), rank[ghosts % len(rank)]
-    holders = cell_rank, rank, holder, to, np.append(rank, of_end), np.unique(holder * ranks + owner) // ranks
+    holders = (
+        cell_rank,
+        rank,
+        holder,
+        to,
+        np.append(rank, of_end),
+        np.unique(holder * ranks + owner) // ranks,
+    )
     return Partition(*(np.bincount(rank_of, minlength=ranks) for rank_of in holders))
 
 
@@ -136,7 +162,11 @@ def run(args: argparse.Namespace) -> int:
     partition, counted = partition_of(bodies, scene.cages, args.ranks)
     cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
-        log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
+        log.warning(
+            "run refuses %d cells until cages.max_cells = %d is raised",
+            cells,
+            scene.cages.max_cells,
+        )
     surfaces = [body.surface for body in bodies if body.surface is not None]
     stored = surfaces if scene.output.surface else []
     groups = {
@@ -191,7 +221,9 @@ def print_counts(report: dict[str, Any]) -> None:
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
     for source, groups in report["groups"].items():
         if groups:
-            print(f"\ngroups of {source}: {listed([f'{name} ({count} triangles)' for name, count in groups.items()])}")
+            print(
+                f"\ngroups of {source}: {listed([f'{name} ({count} triangles)' for name, count in groups.items()])}"
+            )
 
 
 def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) -> Floats:

@@ -16,5 +16,9 @@ def run(args: argparse.Namespace) -> int:
     rows = [HEAD, *keys(args.table or "")]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
     for *columns, meaning in rows:
-        print("  ".join([*(f"{text:{width}}" for text, width in zip(columns, widths, strict=True)), meaning]).rstrip())
+        print(
+            "  ".join(
+                [*(f"{text:{width}}" for text, width in zip(columns, widths, strict=True)), meaning]
+            ).rstrip()
+        )
     return 0

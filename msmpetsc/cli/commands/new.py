@@ -31,7 +31,9 @@ from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
 
-SHIPPED = Path(msmpetsc.__file__).parent / "shipped"  # the scenes that a wheel holds, too; in a clone a link to scenes/
+SHIPPED = (
+    Path(msmpetsc.__file__).parent / "shipped"
+)  # the scenes that a wheel holds, too; in a clone a link to scenes/
 MILLIMETRE = 1e-3  # [m]
 Y_BY_DEFINITION = (".glb", ".gltf")  # points upwards in such files
 SOLE = 0.02  # of the height: what lies so near to the lowest point may stand on the ground
@@ -55,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
     """Write the scene, or list those that come with msmpetsc; return the exit status."""
     if args.list:
         titles = shipped_titles()
-        print("\n".join(f"{name:{max(map(len, titles))}}  {title}" for name, title in titles.items()))
+        print(
+            "\n".join(f"{name:{max(map(len, titles))}}  {title}" for name, title in titles.items())
+        )
         return 0
     if args.scene is None or (args.mesh is None) == (args.from_scene is None):
         raise InputError(
@@ -85,14 +89,19 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     report = examine(surface)
     warnings = check_encloses(surface, report)
     if up is None:
-        is_y = mesh.suffix.lower() in Y_BY_DEFINITION or uprightness(surface, 1) > uprightness(surface, 2) + SURER
+        is_y = (
+            mesh.suffix.lower() in Y_BY_DEFINITION
+            or uprightness(surface, 1) > uprightness(surface, 2) + SURER
+        )
         up = "y" if is_y else "z"
     measures = measured(surface, report, up)
     log.info("%s: %s", mesh, measures.words)
     for warning in warnings:
         log.warning("%s: %s", mesh, warning)
     log.info(
-        "%s, its longest side as %.4g m: mesh.size in the scene sets it", measures.unit_words, measures.sides.max()
+        "%s, its longest side as %.4g m: mesh.size in the scene sets it",
+        measures.unit_words,
+        measures.sides.max(),
     )
     log.info("%s is taken for upwards: --up says another axis", up)
     return draft(source, scene.stem, measures)
@@ -123,7 +132,9 @@ def shipped_text(name: str) -> str:
     """Return the text of a shipped scene. Raises InputError for an unknown name."""
     titles = shipped_titles()
     if name not in titles:
-        raise InputError(f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: msmpetsc new --list")
+        raise InputError(
+            f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: msmpetsc new --list"
+        )
     return (SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
 
 
@@ -147,7 +158,11 @@ class MeshMeasures:
     def beam_axis(self) -> int | None:
         """The horizontal axis along which the body is a beam; None for any other."""
         along = int(np.argmax(self.sides))
-        return along if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max() else None
+        return (
+            along
+            if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max()
+            else None
+        )
 
     @property
     def unit_words(self) -> str:
@@ -219,7 +234,9 @@ def stands(surface: Surface, axis: int, way: int) -> float:
         return 0.0
     lowest = surface.triangles[low[surface.triangles].all(axis=1)]
     flat = np.insert(plan, 2, 0.0, axis=1)
-    face = trimesh.Trimesh(flat, lowest, process=False).area / hull.volume  # in two dimensions the volume is an area
+    face = (
+        trimesh.Trimesh(flat, lowest, process=False).area / hull.volume
+    )  # in two dimensions the volume is an area
     return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
 
 
@@ -244,7 +261,9 @@ def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
     lines.append(f"# {mesh.up} is taken for upwards: msmpetsc new --up says another axis")
     steps = {}  # with the reason
     if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
-        steps['"largest_part"'] = f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area"
+        steps['"largest_part"'] = (
+            f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area"
+        )
     if report.inconsistent_edges or report.volume < 0:
         steps['"orient"'] = "faces are wound inwards, or against each other"
     if mesh.up == "y":
@@ -253,14 +272,23 @@ def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
         lines += [f"# {reason}" for reason in steps.values()]
         lines.append(f"prepare = [{', '.join(steps)}]")
     if not report.closed:
-        lines.append('# open: the winding number decides what is inside; prepare = ["repair"] would close it')
+        lines.append(
+            '# open: the winding number decides what is inside; prepare = ["repair"] would close it'
+        )
     if len(mesh.parts) > 1 and '"largest_part"' not in steps:
-        lines.append('# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap')
-    lines.append(line(f"size = {plain(mesh.sides.max(), 5)}", f"longest side [m]; {mesh.unit_words}"))
+        lines.append(
+            '# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap'
+        )
+    lines.append(
+        line(f"size = {plain(mesh.sides.max(), 5)}", f"longest side [m]; {mesh.unit_words}")
+    )
     if mesh.beam_axis is None:
         drop = plain(DROP * mesh.sides[2], 2)
         lines.append(
-            line(f"base = [0, 0, {drop}]", "middle of the bottom at the start [m]: it falls a fifth of its height")
+            line(
+                f"base = [0, 0, {drop}]",
+                "middle of the bottom at the start [m]: it falls a fifth of its height",
+            )
         )
     return lines
 
@@ -269,7 +297,13 @@ def _cages(body: MeshMeasures) -> list[str]:
     aim = body.volume * (ACROSS / body.thickness) ** 3
     count = int(float(plain(min(max(aim, CELLS[0]), CELLS[1]), 1)))
     across = body.thickness * (count / body.volume) ** (1 / 3)
-    return ["[cages]", line(f"count = {count}", f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}")]
+    return [
+        "[cages]",
+        line(
+            f"count = {count}",
+            f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}",
+        ),
+    ]
 
 
 def _falling(body: MeshMeasures) -> list[str]:
@@ -280,7 +314,10 @@ def _falling(body: MeshMeasures) -> list[str]:
     fall = math.sqrt(2 * DROP * height / G)
     ground = [
         "[[obstacle]]",
-        line('shape = "plane"', "the ground: the body is no beam that lies, so it falls rather than hangs"),
+        line(
+            'shape = "plane"',
+            "the ground: the body is no beam that lies, so it falls rather than hangs",
+        ),
         line("point = [0, 0, 0]", "[m]"),
         line("normal = [0, 0, 1]", "towards the free side"),
         line('response = "penalty"', 'or "reflect", with a restitution'),
@@ -293,13 +330,18 @@ def _falling(body: MeshMeasures) -> list[str]:
 def _clamped(body: MeshMeasures, axis: int) -> list[str]:
     """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
     length, thick = float(body.sides[axis]), float(body.sides[2])
-    young = 1.5 * DENSITY * G * length**3 / (thick**2 * SAG)  # q l^4 / 8 E I = SAG l under its weight
+    young = (
+        1.5 * DENSITY * G * length**3 / (thick**2 * SAG)
+    )  # q l^4 / 8 E I = SAG l under its weight
     period = bending_period(length, thick, young, DENSITY)
     along = np.eye(3, dtype=int)[axis]
     point = ", ".join(f"{CLAMPED * each:g}" for each in along)
     normal = ", ".join(str(-each) for each in along)
     region = f"half_space = {{ point = [{point}], normal = [{normal}] }}, relative = true"
-    pin = [line("[[pin]]", "the body is long and lies: one end does not move"), f"region = {{ {region} }}"]
+    pin = [
+        line("[[pin]]", "the body is long and lies: one end does not move"),
+        f"region = {{ {region} }}",
+    ]
     material = _material(young, f"its end would sink by about {100 * SAG:g}% of its length")
     return [*material, "", *_time(PERIODS * period, period), "", *GRAVITY, "", *pin]
 

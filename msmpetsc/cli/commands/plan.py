@@ -14,7 +14,15 @@ from msmpetsc.scene.time import STATIC
 from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.choice import Choice, SizePlan, SizeTrial, Tables, overrides, put_into, tables
+from msmpetsc.study.sizing.choice import (
+    Choice,
+    SizePlan,
+    SizeTrial,
+    Tables,
+    overrides,
+    put_into,
+    tables,
+)
 from msmpetsc.study.sizing.trials import Asked, Sizer
 
 NOTHING_MEETS = 3
@@ -31,7 +39,11 @@ def run(args: argparse.Namespace) -> int:
         print_size(plan, target)
         command = print_command(args, plan.choice) if plan.met else None
     if args.json:
-        record = asdict(plan) | {"target": target, "error": plan.choice.budget.total, "command": command}
+        record = asdict(plan) | {
+            "target": target,
+            "error": plan.choice.budget.total,
+            "command": command,
+        }
         print(json.dumps(record, indent=1, default=str))  # of paths the names
     return 0 if plan.met else NOTHING_MEETS
 
@@ -51,7 +63,10 @@ def print_command(args: argparse.Namespace, choice: Choice) -> str:
 def size_all(args: argparse.Namespace, target: float) -> SizePlan:
     """Run the trials in a temporary folder and print each."""
     asked = Asked(target, args.frames, args.cells, args.ranks)
-    with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder, closing(Processes()) as processes:
+    with (
+        tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder,
+        closing(Processes()) as processes,
+    ):
         runs = Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
         sizer = Sizer(args.scene, runs, asked, print_size_trial)
         print(HEAD, flush=True)
@@ -66,14 +81,19 @@ def print_size_trial(trial: SizeTrial | str) -> None:
     method = trial.method
     goal = "" if method.step_error is None else f"{method.step_error:.1e}"
     print(
-        f"{method.integrator:16} {method.time_step:13.4g} {goal:>10} {trial.cells:8.0f} {trial.cost:10.3g}", flush=True
+        f"{method.integrator:16} {method.time_step:13.4g} {goal:>10} {trial.cells:8.0f} {trial.cost:10.3g}",
+        flush=True,
     )
 
 
 def print_size(plan: SizePlan, target: float) -> None:
     """Print the choice with the parts of its error, and what bounds it."""
     choice = plan.choice
-    print("\ncheapest:" if plan.met else f"\nnothing meets {target:g}; the smallest error within reach:")
+    print(
+        "\ncheapest:"
+        if plan.met
+        else f"\nnothing meets {target:g}; the smallest error within reach:"
+    )
     cost = f"{choice.cost:.3g} computing seconds a simulated second"
     if choice.method.integrator == STATIC:
         cost = f"{choice.cost * choice.method.time_step:.3g} computing seconds a state"

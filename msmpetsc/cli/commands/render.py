@@ -7,7 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES, RESULT_NAMES, SCENE_NAMES, refuse_other_format
+from msmpetsc.app.checks import (
+    MOVIE_NAMES,
+    PAGE_NAMES,
+    PICTURE_NAMES,
+    RESULT_NAMES,
+    SCENE_NAMES,
+    refuse_other_format,
+)
 from msmpetsc.errors import InputError
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
@@ -36,7 +43,9 @@ def run(args: argparse.Namespace) -> int:
     ending = path.suffix.lower()
     for option, endings in ONLY.items():
         if getattr(args, option) and ending not in endings:
-            raise InputError(f"--{option} is for {', '.join(f'*{end}' for end in endings)}, not for {path}")
+            raise InputError(
+                f"--{option} is for {', '.join(f'*{end}' for end in endings)}, not for {path}"
+            )
     style = style_of(args)
     if args.subject.suffix.lower() in RESULT_NAMES:
         refuse_deadly(args.subject)
@@ -112,7 +121,9 @@ def _size(text: str | None) -> tuple[int, int] | None:
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text, re.ASCII)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SIZES[0] <= side <= SIZES[1] and side % 2 == 0 for side in size):
-        raise InputError(f"--size takes two even numbers from {SIZES[0]} to {SIZES[1]}, like 960x720, not {text!r}")
+        raise InputError(
+            f"--size takes two even numbers from {SIZES[0]} to {SIZES[1]}, like 960x720, not {text!r}"
+        )
     return size
 
 

@@ -51,7 +51,9 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
         array = run.frames[name]
         of_rows = names.get(name, [""])
         if array.ndim == 3 and array.shape[1] != len(of_rows):
-            raise InputError(f"{run.path} is damaged: {array.name} has {array.shape[1]} rows for {len(of_rows)} tables")
+            raise InputError(
+                f"{run.path} is damaged: {array.name} has {array.shape[1]} rows for {len(of_rows)} tables"
+            )
         axes = ("x", "y", "z") if array.ndim > 1 else ("",)
         values = array[:].reshape(len(array), len(of_rows), len(axes))
         for row, whose in enumerate(of_rows):

@@ -18,18 +18,24 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
         listed = list_study(args.study, folder, args.full)
-        for number, (case, done) in enumerate(listed, 1):  # the I of --part I/N, where N is the number of cases
+        for number, (case, done) in enumerate(
+            listed, 1
+        ):  # the I of --part I/N, where N is the number of cases
             state = "done" if done else "open"
             print(f"{number:4} {state}  {case.scene}: {case.label}  {shown_command(case)}")
         print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
         return 0
-    rows = run_study(args.study, folder, full=args.full, jobs=args.jobs, restart=args.restart, part=part)
+    rows = run_study(
+        args.study, folder, full=args.full, jobs=args.jobs, restart=args.restart, part=part
+    )
     if lost := len(failed(swept(as_table(rows)))):  # in maps failing is an answer
         log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
     if part:
         print(part.folder(folder) / "table.csv")  # the study that joins the parts writes the report
         return 0
-    from msmpetsc.study.report import write_report  # loads the charts: a second that refused files need not wait
+    from msmpetsc.study.report import (
+        write_report,
+    )  # loads the charts: a second that refused files need not wait
 
     print(write_report(folder))
     return 0

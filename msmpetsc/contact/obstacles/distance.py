@@ -43,7 +43,9 @@ class DistanceSolid(Solid):
         surface bends by 1 / r.
         """
         face, way = to_host(face), to_host(moved)
-        (depth, normal), (depth_before, normal_before) = (self._behind(to_host(x), face) for x in (q, q - moved))
+        (depth, normal), (depth_before, normal_before) = (
+            self._behind(to_host(x), face) for x in (q, q - moved)
+        )
         near = np.linalg.norm(way, axis=1) < NEAR * np.maximum(depth, depth_before)
         near &= (normal * normal_before).sum(axis=1) > 0
         slope = -0.5 * (way * (normal + normal_before)).sum(axis=1)
@@ -83,7 +85,10 @@ class FunctionSolid(DistanceSolid):
             answer = self.function(q.copy())
         try:
             distance, gradient = (np.asarray(part, float) for part in answer)
-            distance, gradient = np.broadcast_to(distance, len(q)), np.broadcast_to(gradient, q.shape)
+            distance, gradient = (
+                np.broadcast_to(distance, len(q)),
+                np.broadcast_to(gradient, q.shape),
+            )
         except (TypeError, ValueError):
             raise InputError(
                 f"{self.key}.function: returned no distances of shape {(len(q),)} and gradients of shape {q.shape}"
@@ -97,8 +102,14 @@ class FunctionSolid(DistanceSolid):
         import igl
 
         margin = BEYOND * (high - low).max()
-        axes = [np.linspace(*ends, POINTS) for ends in zip(low - margin, high + margin, strict=True)]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)  # x runs first
+        axes = [
+            np.linspace(*ends, POINTS) for ends in zip(low - margin, high + margin, strict=True)
+        ]
+        grid = (
+            np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+            .transpose(2, 1, 0, 3)
+            .reshape(-1, 3)
+        )  # x runs first
         distance = np.ascontiguousarray(self.distances(grid)[0])
         points, triangles, _ = igl.marching_cubes(distance, grid, POINTS, POINTS, POINTS)
         return Surface(points.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
@@ -127,14 +138,20 @@ class MeshSolid(DistanceSolid):
         self.triangles = np.ascontiguousarray(mesh.faces, np.int64)
         self._normals, self._of_corners = np.array(mesh.face_normals), np.array(mesh.vertex_normals)
         normals, _, of_edge = igl.per_edge_normals(
-            self.points, self.triangles, igl.PerEdgeNormalsWeightingType.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM
+            self.points,
+            self.triangles,
+            igl.PerEdgeNormalsWeightingType.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM,
         )
-        self._of_edges = normals[of_edge].reshape(3, -1, 3).swapaxes(0, 1)  # of each triangle, facing its corners
+        self._of_edges = (
+            normals[of_edge].reshape(3, -1, 3).swapaxes(0, 1)
+        )  # of each triangle, facing its corners
         self._bounds = np.array(mesh.bounds)
         tree = igl.AABB()
         tree.init(self.points, self.triangles)
         self._trees = [tree]
-        finalize(self, self._trees.clear)  # at the end of Python, too, where igl's binding complains of what is left
+        finalize(
+            self, self._trees.clear
+        )  # at the end of Python, too, where igl's binding complains of what is left
 
     def surface(self, low: Positions, high: Positions) -> Surface:
         """Return the whole mesh, each triangle wound outwards."""
@@ -146,7 +163,9 @@ class MeshSolid(DistanceSolid):
         rows = np.flatnonzero(beyond == 0)
         if len(rows):
             x = np.ascontiguousarray(q[rows])
-            squares, face[rows], nearest = self._trees[0].squared_distance(self.points, self.triangles, x)
+            squares, face[rows], nearest = self._trees[0].squared_distance(
+                self.points, self.triangles, x
+            )
             within = ((nearest - x) * self._pseudonormals(nearest, face[rows])).sum(axis=1) > 0
             depths[rows] = np.where(within, 1, -1) * np.sqrt(squares)
         return depths, face
@@ -166,5 +185,7 @@ class MeshSolid(DistanceSolid):
         count, normals = zero.sum(axis=1), self._normals[face]
         edge, corner = count == 1, count > 1
         normals[edge] = self._of_edges[face[edge], zero[edge].argmax(axis=1)]
-        normals[corner] = self._of_corners[self.triangles[face[corner], weights[corner].argmax(axis=1)]]
+        normals[corner] = self._of_corners[
+            self.triangles[face[corner], weights[corner].argmax(axis=1)]
+        ]
         return normals

@@ -25,7 +25,9 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.obstacles.solids import TINY
 
 STICK = 1e-2  # of the smallest body, longest sides a second: what friction holds gives way so far in a step
-WEAK = 1e-100  # f' below which it is as good as none; the square of what is divided by it has a number
+WEAK = (
+    1e-100  # f' below which it is as good as none; the square of what is divided by it has a number
+)
 
 Pressed = tuple[Indices, Floats, Rows]
 
@@ -58,18 +60,26 @@ class Friction:
         """
         (u, length), (u_0, length_0), e = self.slip(q), self.slip(base), self.stick
         moved = self.along(q - base if moved is None else moved)
-        longer = (moved * (u + u_0)).sum(axis=1) / np.maximum(length + length_0, np.finfo(float).tiny)
+        longer = (moved * (u + u_0)).sum(axis=1) / np.maximum(
+            length + length_0, np.finfo(float).tiny
+        )
         low, low_0 = np.minimum(length, e), np.minimum(length_0, e)
         beyond = np.maximum(length, e) - np.maximum(length_0, e)
         within = np.where(np.maximum(length, length_0) < e, longer, low - low_0)
         beyond = np.where(np.minimum(length, length_0) >= e, longer, beyond)
         return float(
-            self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
+            self.limit
+            @ (
+                within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2))
+                + beyond
+            )
         )
 
     def slope(self, u: Floats) -> Floats:
         """Return f'(u) / u, (a,) [1/m]."""
-        return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
+        return np.where(
+            u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick)
+        )
 
     def held(self, q: Positions, stick: float) -> Rows:
         """Return the elastic slips (a, 3) [m] that a step from positions q (n, 3) begins with, whose e is ``stick``."""

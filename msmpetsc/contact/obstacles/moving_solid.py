@@ -46,7 +46,9 @@ class Obstacle(Timed):
         """Return where positions (n, 3) [m] at a time [s] are as seen from the solid."""
         return q - like(q, self.path.displacement_at(time)) if self.path.leads_away else q
 
-    def depths(self, q: Positions, time: float, sides: Indices | None = None) -> tuple[Floats, Indices]:
+    def depths(
+        self, q: Positions, time: float, sides: Indices | None = None
+    ) -> tuple[Floats, Indices]:
         """Return how deep the surface at nodes (n, 3) lies in the obstacle at a time [s], (n,) [m], and faces (n,).
 
         sides : (n or more,) by which face each node came in; None: the nearest counts
@@ -59,7 +61,12 @@ class Obstacle(Timed):
         return self.solid.normals(self.seen_from(q, time), face)
 
     def sides(
-        self, q: Positions, end: Positions, time: float, time_step: float, before: Indices | None = None
+        self,
+        q: Positions,
+        end: Positions,
+        time: float,
+        time_step: float,
+        before: Indices | None = None,
     ) -> Indices:
         """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3) [m] in a step ending at ``time``.
 
@@ -79,7 +86,9 @@ class Obstacle(Timed):
         return replace(self, solid=self.solid.sent(send), outside=outside)
 
 
-def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Floats | None) -> list[Obstacle]:
+def build_obstacles(
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Floats | None
+) -> list[Obstacle]:
     """Return the obstacles of a scene, for nodes (l,) that stick ``outside`` [m] so far (collective).
 
     Raises InputError on all ranks for a mesh that is not closed, and for a function that is no signed distance.
@@ -147,6 +156,4 @@ def describe_overlap(
     deepest = comm.allreduce(greatest(inside[rows]), MPI.MAX)
     nodes = f"{count} node{'s' if count > 1 else ''}"
     worst = node_of_greatest(comm, lattice, rows, inside[rows])
-    return (
-        f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({deepest / lattice.cell_size:.2g} cells) deep: {worst}"
-    )
+    return f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({deepest / lattice.cell_size:.2g} cells) deep: {worst}"

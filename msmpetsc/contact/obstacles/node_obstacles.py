@@ -24,18 +24,29 @@ class NodeObstacles:
     in contact (faces.side_of): the penalties' first, then the exchanges'.
     """
 
-    def __init__(self, lattice: Lattice, penalties: Sequence[Penalty], exchanges: Sequence[Exchange]):
+    def __init__(
+        self, lattice: Lattice, penalties: Sequence[Penalty], exchanges: Sequence[Exchange]
+    ):
         self.lattice, self.penalties, self.exchanges = lattice, penalties, exchanges
         self.all = [p.obstacle for p in penalties] + [e.obstacle for e in exchanges]
         self.has_sides = any(obstacle.solid.has_sides for obstacle in self.all)
-        self.pressing, self.exchanging = slice(len(penalties)), slice(len(penalties), None)  # rows of sides
+        self.pressing, self.exchanging = (
+            slice(len(penalties)),
+            slice(len(penalties), None),
+        )  # rows of sides
         self.strikes = bool(exchanges) or any(p.restitution is not None for p in penalties)
         self.has_friction = any(p.friction > 0 for p in penalties)
         nodes = lattice.nodes
         self.no_sides: Indices = np.zeros((len(self.all), len(nodes)), np.int8, like=nodes)
 
     def contact_faces(
-        self, q: Positions, end: Positions, time: float, time_step: float, before: Indices | None, held: Mask
+        self,
+        q: Positions,
+        end: Positions,
+        time: float,
+        time_step: float,
+        before: Indices | None,
+        held: Mask,
     ) -> Indices:
         """Return the sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step.
 
@@ -60,7 +71,9 @@ class NodeObstacles:
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
         """Return the contact with penalties at a time, without friction; None if no penalty acts."""
-        states = [p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
+        states = [
+            p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)
+        ]
         return Contact(states, self.lattice.owned) if states else None
 
     def during(
@@ -81,11 +94,20 @@ class NodeObstacles:
         held = before.states if before else []
         ended = None if end is None else end[:owned]
         for p, side in self._pressing(time, sides):
-            states.append(p.during(q[:owned], time, time_step, side[:owned], last, ended).after(held, q[:owned]))
+            states.append(
+                p.during(q[:owned], time, time_step, side[:owned], last, ended).after(
+                    held, q[:owned]
+                )
+            )
         return states
 
     def apply_friction(
-        self, nodes: Movers, time: float, duration: float, substep: tuple[float, float], sides: Indices
+        self,
+        nodes: Movers,
+        time: float,
+        duration: float,
+        substep: tuple[float, float],
+        sides: Indices,
     ) -> None:
         """Apply friction of obstacles at a time, for a ``duration`` [s], to this rank's nodes.
 
@@ -94,11 +116,15 @@ class NodeObstacles:
         begin, end = substep
         for p, side in self._pressing(time, sides):
             if p.friction > 0:
-                carried = like(nodes.q, p.obstacle.path.displacement_between(begin, end) / (end - begin))
+                carried = like(
+                    nodes.q, p.obstacle.path.displacement_between(begin, end) / (end - begin)
+                )
                 pressed = p.state_at(time, side).pressed(nodes.q)
                 apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
 
-    def contact_stiffness_bound(self, q: Positions, speed: float, start: float, time: float, sides: Indices) -> Floats:
+    def contact_stiffness_bound(
+        self, q: Positions, speed: float, start: float, time: float, sides: Indices
+    ) -> Floats:
         """Bound the stiffness (owned,) [N/m] that obstacles add to each node from start to ``time``.
 
         q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
@@ -126,22 +152,34 @@ class NodeObstacles:
                 power += p.stiffness / (end - begin) * float(depth @ (normal @ like(q, way)))
         return power
 
-    def energy_of_new_obstacles(self, q: Positions, begin: float, end: float, sides: Indices) -> float:
+    def energy_of_new_obstacles(
+        self, q: Positions, begin: float, end: float, sides: Indices
+    ) -> float:
         """Return the energy [J], at a substep's end, of the push of penalties that were not there when it began."""
-        new = [p.state_at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
+        new = [
+            p.state_at(end, side)
+            for p, side in self._pressing(end, sides)
+            if not p.obstacle.acts_at(begin)
+        ]
         return Contact(new, self.lattice.owned).energy(q) if new else 0.0
 
-    def friction_work_bound(self, before: Placed, after: Placed, time: float, time_step: float, frame: Floats) -> float:
+    def friction_work_bound(
+        self, before: Placed, after: Placed, time: float, time_step: float, frame: Floats
+    ) -> float:
         """Return no less than the work [J] that friction of moving obstacles does on this rank's nodes in a step.
 
         It is mu N times how far they go, seen from a frame that goes by ``frame`` (3,) [m] itself.
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
-            way = float(np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time) - frame))
+            way = float(
+                np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time) - frame)
+            )
             if p.obstacle.acts_at(time) and p.friction > 0 and way > 0:
                 for state, when in ((before, time - time_step), (after, time)):
-                    work += p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
+                    work += (
+                        p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
+                    )
         return work
 
     def way_of_pressing(self, state: Placed, time: float, time_step: float) -> tuple[float, Floats]:
@@ -150,10 +188,15 @@ class NodeObstacles:
         for row, p in enumerate(self.penalties):
             if p.obstacle.acts_at(time):
                 share = p.stiffness * float(self._pushed(row, state, time).sum())
-                push, led = push + share, led + share * p.obstacle.path.displacement_between(time - time_step, time)
+                push, led = (
+                    push + share,
+                    led + share * p.obstacle.path.displacement_between(time - time_step, time),
+                )
         return push, led
 
-    def change_of_push(self, before: Placed, after: Placed, time: float, time_step: float) -> Floats:
+    def change_of_push(
+        self, before: Placed, after: Placed, time: float, time_step: float
+    ) -> Floats:
         """Return how much penalties' push on this rank's nodes changes in a step, (owned,) [N]."""
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
@@ -172,7 +215,11 @@ class NodeObstacles:
 
     def _pressing(self, time: float, sides: Indices | None) -> list[tuple[Penalty, Indices]]:
         sides = (self.no_sides if sides is None else sides)[self.pressing]
-        return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]
+        return [
+            (p, side)
+            for p, side in zip(self.penalties, sides, strict=True)
+            if p.obstacle.acts_at(time)
+        ]
 
     def strike(
         self, q: Positions, q_previous: Positions, step: StepTaken, held: Mask
@@ -190,7 +237,9 @@ class NodeObstacles:
             after, before = exchange.exchanged(q, q_previous, replace(step, sides=side))
             if after is not q:
                 after, before = np.where(free, after, q), np.where(free, before, q_previous)
-                work += self._impulse_work(exchange.obstacle, (after - before) - (q - q_previous), step)
+                work += self._impulse_work(
+                    exchange.obstacle, (after - before) - (q - q_previous), step
+                )
                 q, q_previous = after, before
         for p, side in zip(self.penalties, sides[self.pressing], strict=True):
             if p.restitution is not None:

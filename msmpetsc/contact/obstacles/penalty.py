@@ -20,7 +20,9 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
 SHALLOW = 1e-3  # of the depth that a node would come to, where it is stopped
-Duals = list[Rows | None]  # (a, 3) of each obstacle's friction and of the surface's; None: the slips' own forces
+Duals = list[
+    Rows | None
+]  # (a, 3) of each obstacle's friction and of the surface's; None: the slips' own forces
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,15 @@ class Penalty:
         if self.friction == 0:
             return state
         start, path = time - time_step, self.obstacle.path
-        nodes, depth, normal = self.state_at(start, sides).pressed(q) if end is None else state.pressed(end)
+        nodes, depth, normal = (
+            self.state_at(start, sides).pressed(q) if end is None else state.pressed(end)
+        )
         way, stick = like(q, path.displacement_between(start, time)), self.stick * time_step
         carried = q[nodes] + way
         if last is not None:
-            carried += (q[nodes] - last[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
+            carried += (
+                q[nodes] - last[nodes] - way
+            ) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
             stick *= 2 / 3
         if last is not None and end is None:
             coming, _ = self.obstacle.depths(2 * q - last[: len(q)], time, sides)
@@ -131,7 +137,9 @@ class ContactState:
         deeper = depths - base_depths
         if len(within):
             obstacle, moved = self.penalty.obstacle, (q - base)[within]
-            deeper[within] = obstacle.solid.deeper(obstacle.seen_from(q[within], self.time), moved, face[within])
+            deeper[within] = obstacle.solid.deeper(
+                obstacle.seen_from(q[within], self.time), moved, face[within]
+            )
         return 0.5 * self.penalty.stiffness * float(deeper @ (depths + base_depths))
 
 
@@ -144,7 +152,9 @@ class Contact:
     surface : self-contact, if the scene has it; all that asks it is collective
     """
 
-    def __init__(self, states: list[ContactState], owned: int, surface: SurfaceContact | None = None):
+    def __init__(
+        self, states: list[ContactState], owned: int, surface: SurfaceContact | None = None
+    ):
         self.states, self.owned, self.surface = states, owned, surface
 
     def energy(self, q: Positions) -> float:
@@ -157,7 +167,9 @@ class Contact:
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy at q less that at base, friction included [J]."""
-        return self.change_at_nodes(q, base) + (self.surface.change(q, base) if self.surface else 0.0)
+        return self.change_at_nodes(q, base) + (
+            self.surface.change(q, base) if self.surface else 0.0
+        )
 
     def change_at_nodes(self, q: Positions, base: Positions) -> float:
         """Return the energy of obstacles alone at q less that at base, friction included [J]."""
@@ -187,12 +199,16 @@ class Contact:
 
     def friction_limits(self, q: Positions) -> Floats:
         """Return the sums (2,) of mu N [N] that this rank's friction goes by, and with the push at q."""
-        of_nodes = sum((state.friction_limits(q[: self.owned]) for state in self.states), np.zeros(2))
+        of_nodes = sum(
+            (state.friction_limits(q[: self.owned]) for state in self.states), np.zeros(2)
+        )
         return of_nodes + self.surface.friction_limits(q) if self.surface else of_nodes
 
     def released(self, q: Positions) -> float:
         """Return how much less energy [J] elastic slips of friction store at q than where the step begins."""
-        of_nodes = sum(state.friction.released(q[: self.owned]) for state in self.states if state.friction)
+        of_nodes = sum(
+            state.friction.released(q[: self.owned]) for state in self.states if state.friction
+        )
         return of_nodes + (self.surface.released(q) if self.surface else 0.0)
 
     def no_duals(self) -> Duals:
@@ -200,7 +216,10 @@ class Contact:
 
         With A, friction's true Hessian, nothing along a slip, would let nodes run to and fro.
         """
-        return [*(state.friction.no_duals() if state.friction else None for state in self.states), None]
+        return [
+            *(state.friction.no_duals() if state.friction else None for state in self.states),
+            None,
+        ]
 
     def duals_after(self, q: Positions, base: Positions, duals: Duals) -> Duals:
         """Return the duals of friction that the full step from base to q leads to."""

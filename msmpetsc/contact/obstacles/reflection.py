@@ -34,7 +34,9 @@ class Exchange:
     obstacle: Obstacle
     restitution: float
 
-    def exchanged(self, q: Positions, q_previous: Positions, step: StepTaken) -> tuple[Positions, Positions]:
+    def exchanged(
+        self, q: Positions, q_previous: Positions, step: StepTaken
+    ) -> tuple[Positions, Positions]:
         """Return q_n and q_(n-1) after contact; (n, 3) [m] each.
 
         Where a node, on its way, has come to lie on or behind a face and its v_n = q_n - q_(n-1), as seen from
@@ -50,7 +52,9 @@ class Exchange:
         return q, q_previous
 
 
-def slowed(obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken) -> Positions:
+def slowed(
+    obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken
+) -> Positions:
     """Return q_(n-1) (n, 3) [m] by which nodes that came to a face in this step have e times their velocity into it."""
     rows, into = striking(obstacle, q, q_previous, step)
     before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]
@@ -62,7 +66,9 @@ def slowed(obstacle: Obstacle, restitution: float, q: Positions, q_previous: Pos
     return q_previous
 
 
-def striking(obstacle: Obstacle, q: Positions, q_previous: Positions, step: StepTaken) -> tuple[Indices, Rows]:
+def striking(
+    obstacle: Obstacle, q: Positions, q_previous: Positions, step: StepTaken
+) -> tuple[Indices, Rows]:
     """Return the nodes (k,) on or behind the faces of their sides, and the part (k, 3) [m] of their way in the step
     that goes on into it, as seen from the obstacle; nothing where that is not there."""
     time, path = step.time, obstacle.path

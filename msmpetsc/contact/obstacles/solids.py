@@ -168,7 +168,9 @@ class Faces(Solid):
     @classmethod
     def of_box(cls, low: Positions, high: Positions) -> "Faces":
         """Return the box between two corners (3,) [m]."""
-        points = np.repeat(np.array([low, high], float), 3, axis=0)  # the faces that meet at each of the two corners
+        points = np.repeat(
+            np.array([low, high], float), 3, axis=0
+        )  # the faces that meet at each of the two corners
         return cls(Planes(points, np.concatenate([-np.eye(3), np.eye(3)])))
 
     @property
@@ -206,7 +208,9 @@ class BallSolid(Solid):
     radius: float
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        return self.radius - np.linalg.norm(q - self.center, axis=1), np.zeros(len(q), np.int64, like=q)
+        return self.radius - np.linalg.norm(q - self.center, axis=1), np.zeros(
+            len(q), np.int64, like=q
+        )
 
     def normals(self, q: Positions, face: Indices) -> Rows:
         out = q - self.center

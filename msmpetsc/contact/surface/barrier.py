@@ -34,7 +34,9 @@ ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # likewise
 KEPT = 0.9  # of the way to where surfaces meet
 PIECE = 2.0  # edges that points move in one piece of a way
 PIECES = 200  # of a way; what is longer is shortened
-STRETCHED = 0.2  # what is linear in a way: with more, boxes were larger for what they must allow for it
+STRETCHED = (
+    0.2  # what is linear in a way: with more, boxes were larger for what they must allow for it
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,9 @@ class Barrier:
         self.mesh = ipctk.CollisionMesh(np.asfortranarray(surface.points), edges, triangles)
         obstacles = len(surface.points) - bodies
         if not meets_itself:
-            self.mesh.can_collide = ipctk.make_vertex_patches_filter(np.repeat([0, 1], [bodies, obstacles]))
+            self.mesh.can_collide = ipctk.make_vertex_patches_filter(
+                np.repeat([0, 1], [bodies, obstacles])
+            )
         elif obstacles:
             self.mesh.can_collide = ipctk.make_static_obstacle_filter(bodies)
         ends = surface.points[edges[edges.max(axis=1) < bodies]]
@@ -80,25 +84,37 @@ class Barrier:
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
         self.creases: PairSets = (ipctk.Candidates(),)  # no pairs of the first distance
-        self._creased: list[list[tuple[list[Any], Indices]]] = []  # these by kind, each kind with its points (k, 4)
+        self._creased: list[
+            list[tuple[list[Any], Indices]]
+        ] = []  # these by kind, each kind with its points (k, 4)
         self.rubbed: tuple[Positions, RubbingPairs] | None = None
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
         """Return a barrier from ``distance`` [m] on, as stiff over a depth as the law's own."""
         stiffness = self.law.stiffness * (distance / self.law.distance) ** 2
-        return self.ipctk.BarrierPotential(self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness)
+        return self.ipctk.BarrierPotential(
+            self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness
+        )
 
     def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
         """Let pairs that are near at rest for being neighbours on the surface push from smaller distances only, points
         (p, 3) [m] at rest; how many these are, and how many do not push at all."""
         pairs = neighbours(self.candidates(points, 0.0)[0], self.mesh, points, self.law.distance)
         if pairs:
-            self.mesh.can_collide = self.mesh.can_collide & self.ipctk.make_sparse_filter(pairs, True)
+            self.mesh.can_collide = self.mesh.can_collide & self.ipctk.make_sparse_filter(
+                pairs, True
+            )
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
         self.creases += tuple(sets.values())
         for crease in sets.values():
-            kinds, parts = (crease.fv_candidates, crease.ee_candidates), (self.mesh.edges, self.mesh.faces)
-            of = [np.array([pair.vertex_ids(*parts) for pair in kind], int).reshape(-1, 4) for kind in kinds]
+            kinds, parts = (
+                (crease.fv_candidates, crease.ee_candidates),
+                (self.mesh.edges, self.mesh.faces),
+            )
+            of = [
+                np.array([pair.vertex_ids(*parts) for pair in kind], int).reshape(-1, 4)
+                for kind in kinds
+            ]
             self._creased.append(list(zip(kinds, of, strict=True)))
         self.distances += sets
         self.potentials += [self._potential(distance) for distance in sets]
@@ -113,10 +129,14 @@ class Barrier:
         cut, crossing = set(), set()
         for pair in phase.detect_edge_face_candidates():
             edge, face = mesh.edges[pair.edge_id], mesh.faces[pair.face_id]
-            if not set(edge) & set(face) and ipctk.is_edge_intersecting_triangle(*points[edge], *points[face]):
+            if not set(edge) & set(face) and ipctk.is_edge_intersecting_triangle(
+                *points[edge], *points[face]
+            ):
                 crossing.add(pair.edge_id)
                 cut.add(pair.face_id)
-        cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
+        cut |= set(
+            np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist()
+        )
         return np.array(sorted(cut), np.int64)
 
     def touching(self, owner: Indices) -> list[tuple[int, int]]:
@@ -138,13 +158,20 @@ class Barrier:
         pair is nearer than d on its way, |x - x' + t (r - r')| is less than d + |G| |x - x'|, and
         |x - x'| less than (d + 2 max |r|) / (1 - |G|).
         """
-        candidates, ends, near = self.ipctk.Candidates(), [np.asfortranarray(points)], self.law.distance + 2 * reach
+        candidates, ends, near = (
+            self.ipctk.Candidates(),
+            [np.asfortranarray(points)],
+            self.law.distance + 2 * reach,
+        )
         if moved is not None:
             rest, linear = _without_linear_part(points, moved)
             ends += [np.asfortranarray(points + rest)]
             near += linear / (1 - linear) * (near + 2 * float(np.linalg.norm(rest, axis=1).max()))
         candidates.build(self.mesh, *ends, 0.5 * near, self.ipctk.LBVH())
-        cushions = (self._cushion(points, distance + 2 * reach) for distance in self.distances[len(self.creases) :])
+        cushions = (
+            self._cushion(points, distance + 2 * reach)
+            for distance in self.distances[len(self.creases) :]
+        )
         return candidates, *self.creases[1:], *cushions
 
     @contextmanager
@@ -175,7 +202,10 @@ class Barrier:
         edges, faces = (np.flatnonzero(near[of].any(axis=1)) for of in corners)
         phase, found = ipctk.LBVH(), ipctk.Candidates()
         phase.can_vertices_collide = self.mesh.can_collide
-        parts = (np.asfortranarray(of[chosen]) for of, chosen in zip(corners, (edges, faces), strict=True))
+        parts = (
+            np.asfortranarray(of[chosen])
+            for of, chosen in zip(corners, (edges, faces), strict=True)
+        )
         phase.build(np.asfortranarray(points), *parts, 0.5 * self.law.distance + reach)
         ends = [(pair.edge0_id, pair.edge1_id) for pair in phase.detect_edge_edge_candidates()]
         found.ee_candidates = [ipctk.EdgeEdgeCandidate(edges[i], edges[j]) for i, j in ends]
@@ -203,13 +233,17 @@ class Barrier:
         kinds = zip(sets, self.distances, strict=True)
         return tuple(self._pairs(pairs, points, distance) for pairs, distance in kinds)
 
-    def _pairs(self, candidates: Any, points: Positions, distance: float) -> "ipctk.NormalCollisions":
+    def _pairs(
+        self, candidates: Any, points: Positions, distance: float
+    ) -> "ipctk.NormalCollisions":
         pairs = self.ipctk.NormalCollisions()
         pairs.use_area_weighting = True
         pairs.build(candidates, self.mesh, np.asfortranarray(points), distance)
         return pairs
 
-    def _pushing(self, contacts: ContactSets) -> "list[tuple[ipctk.BarrierPotential, ipctk.NormalCollisions]]":
+    def _pushing(
+        self, contacts: ContactSets
+    ) -> "list[tuple[ipctk.BarrierPotential, ipctk.NormalCollisions]]":
         """Return the sets that are not empty, each with its barrier."""
         kinds = zip(self.potentials, contacts, strict=False)  # of none there are no sets
         return [(potential, pairs) for potential, pairs in kinds if not pairs.empty()]
@@ -217,7 +251,9 @@ class Barrier:
     def energy(self, contacts: ContactSets, points: Positions) -> float:
         """Return the energy [J] of contacts at points S (p, 3) [m]."""
         at = np.asfortranarray(points)
-        return float(sum(potential(pairs, self.mesh, at) for potential, pairs in self._pushing(contacts)))
+        return float(
+            sum(potential(pairs, self.mesh, at) for potential, pairs in self._pushing(contacts))
+        )
 
     def gradient(self, contacts: ContactSets, points: Positions) -> Rows:
         """Return its gradient (p, 3) [N]."""
@@ -226,11 +262,16 @@ class Barrier:
             gradient += potential.gradient(pairs, self.mesh, at)
         return gradient.reshape(-1, 3)
 
-    def hessian(self, contacts: ContactSets, points: Positions, projected: bool) -> "list[csc_matrix]":
+    def hessian(
+        self, contacts: ContactSets, points: Positions, projected: bool
+    ) -> "list[csc_matrix]":
         """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
         kinds, at = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
         kind = kinds.CLAMP if projected else kinds.NONE
-        return [potential.hessian(pairs, self.mesh, at, kind) for potential, pairs in self._pushing(contacts)]
+        return [
+            potential.hessian(pairs, self.mesh, at, kind)
+            for potential, pairs in self._pushing(contacts)
+        ]
 
     def friction(
         self, contacts: ContactSets, points: Positions, start: Positions, stick: float
@@ -257,13 +298,17 @@ class Barrier:
             found = []
             for potential, pairs in self._pushing(contacts):
                 found.append(self.ipctk.TangentialCollisions())
-                found[-1].build(self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction)
+                found[-1].build(
+                    self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction
+                )
             self.rubbed = points, rubbing_pairs(found, self.mesh)
         return self.rubbed[1]
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite where there are no contacts."""
-        return min((self._least(pairs, points) for _, pairs in self._pushing(contacts)), default=np.inf)
+        return min(
+            (self._least(pairs, points) for _, pairs in self._pushing(contacts)), default=np.inf
+        )
 
     def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
@@ -280,7 +325,9 @@ class Barrier:
         """Return no more than the least distance [m] of these pairs, of which contacts are all at points S (p, 3)."""
         known = zip(contacts, sets, self.distances, strict=False)  # a cushion has the same pairs
         least = (
-            self._least(near, points) if len(near) else far for near, pairs, far in known if len(near) + len(pairs)
+            self._least(near, points) if len(near) else far
+            for near, pairs, far in known
+            if len(near) + len(pairs)
         )
         return min(least, default=self.law.distance)
 
@@ -293,7 +340,9 @@ class Barrier:
     def sweep(self, start: Positions, moved: Rows) -> float:
         """Return the free share of any way, as ``free_share`` does, from the pairs that it passes."""
         moved = moved - moved.mean(axis=0)
-        whole = max(int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * self.edge))), 1)
+        whole = max(
+            int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * self.edge))), 1
+        )
         for piece in range(min(whole, PIECES)):
             begin, end = (start + i / whole * moved for i in (piece, piece + 1))
             share = self._share(begin, end, self.candidates(begin, 0.0, end - begin))

@@ -36,7 +36,11 @@ PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (lattice.material)
 
 
 def collision_surface(
-    scene: Scene, bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice, obstacles: list[Obstacle]
+    scene: Scene,
+    bodies: Sequence[BodySurface],
+    cages: Cages,
+    lattice: Lattice,
+    obstacles: list[Obstacle],
 ) -> CollisionSurface | None:
     """Return the surface of all bodies that meets itself or obstacles; None where neither is asked for (collective).
 
@@ -58,7 +62,9 @@ def collision_surface(
     joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))
     least, bodies_end = NEAR * float(np.linalg.norm(sides)), sum(map(len, points))
     widest = min(SHARE * lattice.cell_size, edge / 2)
-    distance = table.distance or max(least, off, _gap(comm, joint, widest, bodies_end, meets_itself))
+    distance = table.distance or max(
+        least, off, _gap(comm, joint, widest, bodies_end, meets_itself)
+    )
     # kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells, E / h, and what its
     # inertia adds in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness)
     # takes both of each contact; with those of the stiffest cell it, and the energy of a state, is always the same.
@@ -88,21 +94,27 @@ def _prepared(
     off = 0.0
     if table.surface is not None:
         share = table.surface / sum(len(body.triangles) for body in bodies)
-        coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
+        coarser = [
+            _coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies
+        ]
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
         longest = max(float(np.linalg.norm(np.ptp(body.points, axis=0))) for body in bodies)
         # Points nearer to a plane of the grid than SAME are on it: a lesser gap would be none.
         gap = max(NEAREST * (table.distance or NEAR * longest), 2 * SAME * longest)
         bodies = _without_cut(_parted(bodies, gap))
-    ends = np.concatenate([b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies])
+    ends = np.concatenate(
+        [b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies]
+    )
     edges = np.linalg.norm(ends, axis=2)
     if table.surface is None:
         _warn_of_long_triangles(edges.max(), max(cell_size, 2 * (table.distance or 0.0)))
     return bodies, off, float(edges.mean())
 
 
-def _gap(comm: MPI.Comm, surface: Surface | None, widest: float, bodies: int, meets_itself: bool) -> float:
+def _gap(
+    comm: MPI.Comm, surface: Surface | None, widest: float, bodies: int, meets_itself: bool
+) -> float:
     """Return the least distance [m] at rest of parts that push each other, at most ``widest`` [m] (collective).
 
     A wider barrier would throw apart bodies that a scene puts side by side.
@@ -130,10 +142,14 @@ def _refuse_touching(surface: CollisionSurface) -> None:
     barrier = Barrier(whole, law, surface.points.bodies, meets_itself=False)
     cut = barrier.crossings()
     if len(cut):
-        raise InputError(f"obstacle: one of the barrier cuts a body at rest, at {_place(whole, cut[0])} m")
+        raise InputError(
+            f"obstacle: one of the barrier cuts a body at rest, at {_place(whole, cut[0])} m"
+        )
     near = barrier.contacts(barrier.candidates(whole.points, 0.0), whole.points)
     if (least := barrier.least(near, whole.points)) < NEAREST * law.distance:
-        raise InputError(f"obstacle: one of the barrier is but {least:.2g} m from a body at rest: leave a gap")
+        raise InputError(
+            f"obstacle: one of the barrier is but {least:.2g} m from a body at rest: leave a gap"
+        )
 
 
 def _place(surface: Surface, triangle: int) -> str:
@@ -152,7 +168,9 @@ def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
     if not touching:
         return bodies
     names = ", ".join(f"body.{i} and body.{j}" for i, j in touching)
-    log.info("self_contact: %s touch at rest: all surfaces that meet are drawn in by %.2g m", names, gap)
+    log.info(
+        "self_contact: %s touch at rest: all surfaces that meet are drawn in by %.2g m", names, gap
+    )
     return [Surface(body.points - gap * outward(body), body.triangles) for body in bodies]
 
 
@@ -169,7 +187,9 @@ def _without_cut(bodies: list[Surface]) -> list[Surface]:
     if len(of := np.unique(np.searchsorted(ends, cut, side="right"))) > 1:
         what += f" (of {', '.join(f'body.{number}' for number in of)}, which must be parted if they overlap)"
     if len(cut) > MOST_CUT * len(whole.triangles):
-        raise InputError(f'{what}, too many to leave out: mesh.prepare = ["union"] or ["repair"] may mend the mesh')
+        raise InputError(
+            f'{what}, too many to leave out: mesh.prepare = ["union"] or ["repair"] may mend the mesh'
+        )
     log.warning("%s: they are left out, and may be crossed", what)
     of_body = np.split(~np.isin(np.arange(len(whole.triangles)), cut), ends)
     return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)]
@@ -212,5 +232,7 @@ def _coarser(surface: Surface, triangles: int) -> Surface:
     import igl
 
     reduced = simplify(surface, triangles, HASTE)
-    _, _, nearest = igl.point_mesh_squared_distance(reduced.points, surface.points, surface.triangles)
+    _, _, nearest = igl.point_mesh_squared_distance(
+        reduced.points, surface.points, surface.triangles
+    )
     return compact(np.ascontiguousarray(nearest), reduced.triangles)

@@ -27,12 +27,18 @@ def neighbours(
 ) -> Mapping[tuple[int, int], bool]:
     """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than
     ``distance`` [m] at rest."""
-    of_points = _cross_pairs(candidates.fv_candidates, mesh, points, distance, [(0, 1), (0, 2), (0, 3), (0, 3)])
-    of_edges = _cross_pairs(candidates.ee_candidates, mesh, points, distance, [(0, 2), (0, 3), (1, 2), (1, 3)])
+    of_points = _cross_pairs(
+        candidates.fv_candidates, mesh, points, distance, [(0, 1), (0, 2), (0, 3), (0, 3)]
+    )
+    of_edges = _cross_pairs(
+        candidates.ee_candidates, mesh, points, distance, [(0, 2), (0, 3), (1, 2), (1, 3)]
+    )
     groups = np.concatenate([of_points, of_edges])
     if len(groups) == 0:
         return {}
-    edges = np.concatenate([mesh.edges, mesh.edges[:, ::-1], np.repeat(np.arange(len(points))[:, None], 2, axis=1)])
+    edges = np.concatenate(
+        [mesh.edges, mesh.edges[:, ::-1], np.repeat(np.arange(len(points))[:, None], 2, axis=1)]
+    )
     ring = coo_array((np.ones(len(edges)), edges.T), shape=(len(points),) * 2).tocsr()
     within = ring
     for _ in range(RINGS - 1):
@@ -43,16 +49,25 @@ def neighbours(
     return {(int(i), int(j)): False for i, j in np.unique(local, axis=0) if i < j}
 
 
-def _cross_pairs(kind: list[Any], mesh: Any, points: Positions, distance: float, cross: list[Any]) -> Indices:
+def _cross_pairs(
+    kind: list[Any], mesh: Any, points: Positions, distance: float, cross: list[Any]
+) -> Indices:
     """Return of each near candidate the pairs (k, 4, 2) of a point of the first and one of the
     second part, by their places in ``cross``: of a point and a triangle there are three, one twice."""
     points, edges, faces = np.asfortranarray(points), mesh.edges, mesh.faces
-    near = [c.vertex_ids(edges, faces) for c in kind if c.compute_distance(points, edges, faces) < distance**2]
+    near = [
+        c.vertex_ids(edges, faces)
+        for c in kind
+        if c.compute_distance(points, edges, faces) < distance**2
+    ]
     return np.array(near, np.int64).reshape(-1, 4)[:, cross]
 
 
 def creases(
-    apart: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: Positions, distance: float
+    apart: Mapping[tuple[int, int], bool],
+    mesh: "ipctk.CollisionMesh",
+    points: Positions,
+    distance: float,
 ) -> tuple[dict[float, "ipctk.Candidates"], int]:
     """Return by distance [m], the greatest first, the pairs that are left out, and how many are too near for any.
 
@@ -71,8 +86,12 @@ def creases(
     for level in np.unique(finer[finer >= 0]):
         candidates = sets[distance / FINER ** int(level)] = ipctk.Candidates()
         chosen = [pairs[i] for i in np.flatnonzero(finer == level)]
-        candidates.fv_candidates = [pair for pair in chosen if isinstance(pair, ipctk.FaceVertexCandidate)]
-        candidates.ee_candidates = [pair for pair in chosen if isinstance(pair, ipctk.EdgeEdgeCandidate)]
+        candidates.fv_candidates = [
+            pair for pair in chosen if isinstance(pair, ipctk.FaceVertexCandidate)
+        ]
+        candidates.ee_candidates = [
+            pair for pair in chosen if isinstance(pair, ipctk.EdgeEdgeCandidate)
+        ]
     return sets, int((finer < 0).sum())
 
 
@@ -86,13 +105,26 @@ def _left_out(
     if not apart:
         return []
     ends = np.array(list(apart)).T
-    met = coo_array((np.ones(2 * ends.shape[1]), np.hstack([ends, ends[::-1]])), shape=(points, points)).tocsr()
+    met = coo_array(
+        (np.ones(2 * ends.shape[1]), np.hstack([ends, ends[::-1]])), shape=(points, points)
+    ).tocsr()
     corners = []  # (k, points): which of the points are corners of triangles, and of edges
     for part in (mesh.faces, mesh.edges):
         rows = np.repeat(np.arange(len(part)), part.shape[1])
-        corners.append(coo_array((np.ones(part.size), (rows, part.ravel())), shape=(len(part), points)).tocsr())
+        corners.append(
+            coo_array((np.ones(part.size), (rows, part.ravel())), shape=(len(part), points)).tocsr()
+        )
     faces, edges = corners
     of_point, of_edge = (faces @ met).tocoo(), (edges @ met @ edges.T).tocoo()
     all_three, all_four = of_point.data == 3, (of_edge.data == 4) & (of_edge.row < of_edge.col)
-    of_points = map(ipctk.FaceVertexCandidate, of_point.row[all_three].tolist(), of_point.col[all_three].tolist())
-    return [*of_points, *map(ipctk.EdgeEdgeCandidate, of_edge.row[all_four].tolist(), of_edge.col[all_four].tolist())]
+    of_points = map(
+        ipctk.FaceVertexCandidate,
+        of_point.row[all_three].tolist(),
+        of_point.col[all_three].tolist(),
+    )
+    return [
+        *of_points,
+        *map(
+            ipctk.EdgeEdgeCandidate, of_edge.row[all_four].tolist(), of_edge.col[all_four].tolist()
+        ),
+    ]

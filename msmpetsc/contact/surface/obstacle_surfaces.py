@@ -56,11 +56,17 @@ class ObstacleSurfaces:
 
     def _on_path(self, time: float) -> Positions:
         paths = zip((obstacle.path for obstacle in self.obstacles), self.solids, strict=True)
-        return np.concatenate([path.moved(solid.points, path.value_at(time)) for path, solid in paths])
+        return np.concatenate(
+            [path.moved(solid.points, path.value_at(time)) for path, solid in paths]
+        )
 
     def way(self, begin: float, end: float) -> Rows:
         """Return how far the points go from one time [s] to another, (o, 3) [m]; (1, 3), nowhere, if none moves."""
-        return self.points_at(end) - self.points_at(begin) if self.moves(begin, end) else np.zeros((1, 3))
+        return (
+            self.points_at(end) - self.points_at(begin)
+            if self.moves(begin, end)
+            else np.zeros((1, 3))
+        )
 
     def sums(self, forces: Rows) -> Rows:
         """Return the sums (k, 3) [N] of forces (o, 3) [N] on the points of each."""
@@ -72,7 +78,9 @@ class ObstacleSurfaces:
         seen = [(o.solid, o.path.unmoved(x, o.path.value_at(time))) for o in self.obstacles]
         return np.maximum(np.stack([-solid.depths(at)[0] for solid, at in seen], axis=1), 0.0)
 
-    def carried(self, q: Positions, moved: Rows, times: tuple[float, float], distances: Rows, cell: float) -> Rows:
+    def carried(
+        self, q: Positions, moved: Rows, times: tuple[float, float], distances: Rows, cell: float
+    ) -> Rows:
         """Return how far nodes q (n, 3) [m] go between two times [s], (n, 3) [m]: with obstacles or by ``moved``.
 
         Nodes at an obstacle keep their place beside it. Between obstacles the ways are interpolated by inverse
@@ -83,7 +91,9 @@ class ObstacleSurfaces:
         weights, near = np.zeros((len(q), 1)), np.zeros((len(q), 1))
         way = np.zeros_like(q)
         begin, end = times
-        for path, distance in zip((o.path for o in self.obstacles), distances.T[:, :, None], strict=True):
+        for path, distance in zip(
+            (o.path for o in self.obstacles), distances.T[:, :, None], strict=True
+        ):
             of_obstacle = path.moved(path.unmoved(q, path.value_at(begin)), path.value_at(end)) - q
             weight = 1 / np.maximum(distance, TOUCHING * cell)
             way, weights = way + weight * of_obstacle, weights + weight
@@ -127,5 +137,7 @@ def _split(surface: Surface, longest: float) -> Surface:
         points = np.concatenate([points, points[ends].mean(axis=0)])
         halves = np.transpose([[a, middle, c], [middle, b, c]], (0, 2, 1)).reshape(-1, 3)
         triangles = np.concatenate([triangles[~long], halves])
-    whole = trimesh.Trimesh(points, triangles)  # an edge halved twice, from either side, has one middle again
+    whole = trimesh.Trimesh(
+        points, triangles
+    )  # an edge halved twice, from either side, has one middle again
     return Surface(np.array(whole.vertices, float), np.array(whole.faces, np.int64))

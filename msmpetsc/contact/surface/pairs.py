@@ -116,7 +116,9 @@ class NearPairs:
         self.comm, self.points, self.law = comm, collision.points, collision.law
         self.name_of = collision.name_of
         self.owned, surface = collision.points.weights.shape[1], collision.surface
-        self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, collision) if surface else None)
+        self.barrier: Barrier | None = on_root(
+            comm, lambda: _barrier(surface, collision) if surface else None
+        )
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self._known: list[Pairs] = []  # the newest first
 
@@ -127,7 +129,9 @@ class NearPairs:
     def serving(self, *places: Positions) -> Pairs | None:
         """Return the newest pairs within whose reach all of these places of points S (p, 3) are, by their own moves."""
         known = enumerate(self._known if self.barrier else ())
-        number: int | None = self.comm.bcast(next((i for i, pairs in known if all(map(pairs.serve, places))), None))
+        number: int | None = self.comm.bcast(
+            next((i for i, pairs in known if all(map(pairs.serve, places))), None)
+        )
         if number is None:
             return None
         self._known.insert(0, self._known.pop(number))
@@ -135,12 +139,17 @@ class NearPairs:
 
     def look(self, q: Positions, time: float, reach: float, moved: Rows | None = None) -> Pairs:
         """Look for pairs at q, or on the way of the points from there by ``moved`` (p, 3) [m]."""
-        points, reach = self.points(q, time), min(max(reach, LEAST * self.edge), FARTHEST * self.edge)
+        points, reach = (
+            self.points(q, time),
+            min(max(reach, LEAST * self.edge), FARTHEST * self.edge),
+        )
         sets, clear = (), 0.0
         if self.barrier:
             sets = self.barrier.candidates(points, reach, moved)
             clear = self.barrier.clear_reach(sets, points, reach) if moved is None else 0.0
-        newest = Pairs(q[: self.owned].copy(), time, reach, self.comm.bcast(clear), points, sets, moved)
+        newest = Pairs(
+            q[: self.owned].copy(), time, reach, self.comm.bcast(clear), points, sets, moved
+        )
         self._known = [newest, *self._known[: REMEMBERED - 1]]
         return newest
 
@@ -149,10 +158,17 @@ class NearPairs:
         moved = end[: self.owned] - start[: self.owned]
         if self.points.obstacles.total:
             moved = np.vstack([moved, self.points.obstacles.way(begin, time)])
-        along = np.ascontiguousarray(moved.T)  # along the last axis numpy takes a twentieth of the time
-        ends = [np.fmax.reduce(along, axis=1, initial=-np.inf), -np.fmin.reduce(along, axis=1, initial=np.inf)]
+        along = np.ascontiguousarray(
+            moved.T
+        )  # along the last axis numpy takes a twentieth of the time
+        ends = [
+            np.fmax.reduce(along, axis=1, initial=-np.inf),
+            -np.fmin.reduce(along, axis=1, initial=np.inf),
+        ]
         ends = np.concatenate(ends)
-        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)  # the greatest along the axes and against them
+        self.comm.Allreduce(
+            MPI.IN_PLACE, ends, MPI.MAX
+        )  # the greatest along the axes and against them
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
@@ -173,7 +189,9 @@ class Contacts:
     apart     : and there are no contacts: the surface need not be asked for
     """
 
-    def __init__(self, near: NearPairs, begin: float, time: float, before: "Contacts | None" = None):
+    def __init__(
+        self, near: NearPairs, begin: float, time: float, before: "Contacts | None" = None
+    ):
         self.begin, self.time = begin, time
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
@@ -185,7 +203,11 @@ class Contacts:
         self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
 
     def find(
-        self, q: Positions, time: float | None = None, with_points: bool = False, base: Positions | None = None
+        self,
+        q: Positions,
+        time: float | None = None,
+        with_points: bool = False,
+        base: Positions | None = None,
     ) -> ContactsAt:
         """Return the contacts at positions q, and a time [s] if not that of the step's end.
 
@@ -206,7 +228,10 @@ class Contacts:
         sets = self._around if self.is_narrow else pairs.sets
         contacts = self.barrier.contacts(sets, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
-        self._moments = [ContactsAt(q.copy(), time, count, points, contacts), *self._moments[: REMEMBERED - 1]]
+        self._moments = [
+            ContactsAt(q.copy(), time, count, points, contacts),
+            *self._moments[: REMEMBERED - 1],
+        ]
         return self._moments[0]
 
     def narrow(self, q: Positions, time: float) -> bool:
@@ -217,7 +242,11 @@ class Contacts:
             touched = self.barrier.gradient(moment.contacts, moment.points).any(axis=1)
             touched = touched if self._touched is None else touched | self._touched
         self.is_narrow = self.comm.bcast(touched is None or touched.mean() < FEW)
-        self._moments, self._touched, self.apart = [moment], touched, self.is_narrow and moment.count == 0
+        self._moments, self._touched, self.apart = (
+            [moment],
+            touched,
+            self.is_narrow and moment.count == 0,
+        )
         points = self.points_at(q, self.time) if self.is_narrow and not self.apart else None
         if self.barrier and points is not None and touched is not None:
             self._around = self.barrier.around(touched, points, FARTHEST * self.near.edge)
@@ -251,7 +280,9 @@ class Contacts:
         self.widen()
         pairs, bound = self._bound(q, self.begin, x)
         ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
-        if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:  # so that the next steps need no look
+        if (
+            bound > pairs.reach and ahead <= FARTHEST * self.near.edge
+        ):  # so that the next steps need no look
             self.near.look(x, self.time, ahead)
         self.find(x, base=q)
         found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
@@ -263,7 +294,9 @@ class Contacts:
     def _look(self, q: Positions, time: float, points: Positions, base: Positions | None) -> Pairs:
         """Look for pairs at q, whose points are S (p, 3) [m], and on the way there from base, if that is not long."""
         moved = None if base is None else self.points_at(base, time) - points
-        if self.comm.bcast(moved is not None and len(moved) > 0 and farthest(moved) > PIECE * self.near.edge):
+        if self.comm.bcast(
+            moved is not None and len(moved) > 0 and farthest(moved) > PIECE * self.near.edge
+        ):
             moved = None
         return self.near.look(q, time, LEAST * self.near.edge, moved)
 
@@ -301,7 +334,11 @@ class Contacts:
             points = self.barrier.nearest(moment.contacts, moment.points)
             names = dict.fromkeys(self.near.name_of(point) for point in points)
             place = ", ".join(f"{x:.4g}" for x in moment.points[points].mean(axis=0))
-            words = f"{' and '.join(names)} meet at ({place}) m" if len(points) else "parts of the surface meet"
+            words = (
+                f"{' and '.join(names)} meet at ({place}) m"
+                if len(points)
+                else "parts of the surface meet"
+            )
         in_words: str = self.comm.bcast(words)
         return in_words
 
@@ -330,9 +367,13 @@ class Contacts:
             # pairs that serve at its end alone say nothing of what is passed on the way there
             serving = self.near.serving(start, start + moved)
             if not serving and way > PIECE * self.near.edge:
-                return float(self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0))
+                return float(
+                    self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0)
+                )
             sets = (serving or self.near.look(q, begin, LEAST * self.near.edge, moved)).sets
-        return float(self.comm.bcast(self.barrier.free_share(start, moved, sets) if self.barrier else 1.0))
+        return float(
+            self.comm.bcast(self.barrier.free_share(start, moved, sets) if self.barrier else 1.0)
+        )
 
     def _clearance(self, q: Positions, time: float) -> float:
         """Return the least distance [m] of any pair at q and a time [s], but no more than dhat."""

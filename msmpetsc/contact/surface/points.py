@@ -23,7 +23,9 @@ class SurfacePoints:
     sums   : (total, s) on rank 0 sums what all send of these, in the order of the ranks
     """
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array, obstacles: ObstacleSurfaces):
+    def __init__(
+        self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array, obstacles: ObstacleSurfaces
+    ):
         counts = comm.allgather(embedding.shape[0])
         self.comm, self.obstacles, self.bodies = comm, obstacles, sum(counts)
         self.total = self.bodies + obstacles.total
@@ -35,7 +37,9 @@ class SurfacePoints:
         nodes = to_owner.send(embedding.indices) - lattice.table.first
         self.rows, row = np.unique(points, return_inverse=True)
         shape = (len(self.rows), lattice.owned)
-        self.weights = coo_array((to_owner.send(embedding.data), (row.ravel(), nodes)), shape=shape).tocsr()
+        self.weights = coo_array(
+            (to_owner.send(embedding.data), (row.ravel(), nodes)), shape=shape
+        ).tocsr()
         self.to_root = Route(comm, np.zeros(len(self.rows), np.int64))
         sent = self.to_root.send(self.rows)
         sums = np.ones(len(sent)), (sent, np.arange(len(sent)))

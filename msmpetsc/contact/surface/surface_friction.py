@@ -65,7 +65,11 @@ class SurfaceFriction(Friction):
 
     def after(self, last: "SurfaceFriction | None", points: Positions) -> "SurfaceFriction":
         """Return friction of a step from points (p, 3) [m] where ``last`` was that of the step before, if any."""
-        return replace(self, begin=self.values_of(last.pairs, last.held(points, self.stick))) if last else self
+        return (
+            replace(self, begin=self.values_of(last.pairs, last.held(points, self.stick)))
+            if last
+            else self
+        )
 
     def values_of(self, pairs: Indices, values: Rows) -> Rows:
         """Return of values (k, 3) of other ``pairs`` (k, 4) those of these, (a, 3), 0 where there are none."""
@@ -85,7 +89,9 @@ class SurfaceFriction(Friction):
         return csr_array(self.slips.T @ (middle @ self.slips))
 
 
-def rubbing_pairs(found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh") -> RubbingPairs:
+def rubbing_pairs(
+    found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
+) -> RubbingPairs:
     """Return the pairs of some sets.
 
     Of two points or edges that one stands first whose first number is less, for ipctk has them as they were found.
@@ -103,13 +109,19 @@ def rubbing_pairs(found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.Collis
             if not pairs:
                 continue
             (first, of_first), (second, of_second) = (
-                (corners, corners[[getattr(pair, name) for pair in pairs]]) for name, corners in parts
+                (corners, corners[[getattr(pair, name) for pair in pairs]])
+                for name, corners in parts
             )
-            sides = np.split(np.array([pair.closest_point for pair in pairs]), [of_first.shape[1] - 1], axis=1)
+            sides = np.split(
+                np.array([pair.closest_point for pair in pairs]), [of_first.shape[1] - 1], axis=1
+            )
             one, other = (np.column_stack([1 - side.sum(axis=1), side]) for side in sides)
             if first is second:
                 turned = (of_first[:, 0] > of_second[:, 0])[:, None]
-                of_first, of_second = np.where(turned, of_second, of_first), np.where(turned, of_first, of_second)
+                of_first, of_second = (
+                    np.where(turned, of_second, of_first),
+                    np.where(turned, of_first, of_second),
+                )
                 one, other = np.where(turned, other, one), np.where(turned, one, other)
             missing = (0, 0), (0, 4 - of_first.shape[1] - of_second.shape[1])
             numbers.append(np.pad(np.hstack([of_first, of_second]), missing, constant_values=-1))

@@ -46,12 +46,16 @@ class SurfaceHessian:
             self.comm.Allreduce(MPI.IN_PLACE, moved)
         product[nodes] += back @ (self.points @ moved.ravel()).reshape(-1, 3)
 
-    def split(self, compliance: Floats, most: int) -> "tuple[SurfaceHessian | None, SurfaceHessian | None]":
+    def split(
+        self, compliance: Floats, most: int
+    ) -> "tuple[SurfaceHessian | None, SurfaceHessian | None]":
         """Return the part of the stiff points, of the stiffest so many, and that of the others; None for none.
 
         compliance : (n,) [m/N] of nodes of this rank: a point is stiff that gives way less than they let it
         """
-        given = self.comm.allreduce(self.weights.copy().power(2) @ compliance)  # power sorts its matrix
+        given = self.comm.allreduce(
+            self.weights.copy().power(2) @ compliance
+        )  # power sorts its matrix
         stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * given
         order = np.argsort(-stiffness, kind="stable")
         stiff = min(most, int((stiffness > 1).sum()))
@@ -61,15 +65,21 @@ class SurfaceHessian:
 
     def _part(self, numbers: Indices) -> "SurfaceHessian":
         rows = (3 * numbers[:, None] + np.arange(3)).ravel()
-        return SurfaceHessian(self.comm, self.weights[numbers], csr_array(self.points[rows][:, rows]))
+        return SurfaceHessian(
+            self.comm, self.weights[numbers], csr_array(self.points[rows][:, rows])
+        )
 
     @cached_property
     def blocks(self) -> Rows:
         """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
         nodes, weights, _ = self._carrying
         points, blocks = self.points.tobsr((3, 3)), np.zeros((self.weights.shape[1], 9))
-        first = np.repeat(np.arange(len(points.indptr) - 1), np.diff(points.indptr))  # point of each block, and
-        both = weights[first].multiply(weights[points.indices])  # second: w w' of all nodes that carry the two
+        first = np.repeat(
+            np.arange(len(points.indptr) - 1), np.diff(points.indptr)
+        )  # point of each block, and
+        both = weights[first].multiply(
+            weights[points.indices]
+        )  # second: w w' of all nodes that carry the two
         blocks[nodes] = both.T @ points.data.reshape(-1, 9)
         return blocks
 
@@ -97,7 +107,9 @@ class SurfaceContact:
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
         self.friction: SurfaceFriction | None = None
-        self._hessians: dict[bool, tuple[ContactsAt, Rows | None, SurfaceHessian]] = {}  # with and without negatives
+        self._hessians: dict[
+            bool, tuple[ContactsAt, Rows | None, SurfaceHessian]
+        ] = {}  # with and without negatives
         if contacts.law.friction > 0:
             moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
             self.rubs = moment.count > 0
@@ -105,23 +117,36 @@ class SurfaceContact:
                 points = contacts.points_at(start, contacts.begin)
                 came = None if last is None else contacts.points.moved(start - last[: len(start)])
                 friction = self._friction(moment, points, came, time_step, end is None)
-                self.friction = friction.after(before.friction, points) if friction and before else friction
+                self.friction = (
+                    friction.after(before.friction, points) if friction and before else friction
+                )
 
     def _friction(
-        self, moment: ContactsAt, points: Positions, came: Rows | None, time_step: float, extrapolates: bool
+        self,
+        moment: ContactsAt,
+        points: Positions,
+        came: Rows | None,
+        time_step: float,
+        extrapolates: bool,
     ) -> SurfaceFriction | None:
         """Return friction with the push of a moment, on rank 0.
 
         points, came : where points (p, 3) are when the step begins [m], and how far they came in the one before, of a
             step of BDF2, which ``extrapolates`` the push
         """
-        contacts, barrier, stick = self.contacts, self.contacts.barrier, self.contacts.law.stick * time_step
+        contacts, barrier, stick = (
+            self.contacts,
+            self.contacts.barrier,
+            self.contacts.law.stick * time_step,
+        )
         if barrier is None:
             return None
         if came is None:
             return barrier.friction(moment.contacts, moment.points, points, stick)
         came[contacts.points.bodies :] = contacts.obstacles.way(contacts.begin, contacts.time)
-        friction = barrier.friction(moment.contacts, moment.points, points + came / 3, 2 / 3 * stick)
+        friction = barrier.friction(
+            moment.contacts, moment.points, points + came / 3, 2 / 3 * stick
+        )
         if friction is None or not extrapolates:
             return friction
         before = friction.values_of(*barrier.friction_limits(moment.contacts, points - came))
@@ -157,7 +182,9 @@ class SurfaceContact:
         if self.friction and after and before:
             rubbed = self.friction.change(after.points, before.points, moved)
         if moved is not None:
-            return rubbed + sum(0.5 * float(np.vdot(self._pushes(m), moved)) for m in (before, after) if m)
+            return rubbed + sum(
+                0.5 * float(np.vdot(self._pushes(m), moved)) for m in (before, after) if m
+            )
         return rubbed + self._energy(after) - self._energy(before)
 
     def _is_small(self, q: Positions, base: Positions) -> bool:
@@ -195,7 +222,9 @@ class SurfaceContact:
         moved = np.zeros_like(moment.points)
         moved[self.contacts.points.bodies :] = way
         whole = self._whole_hessian(moment, True, None)
-        self._add_to_nodes(moved if whole is None else (whole @ moved.ravel()).reshape(-1, 3), gradient)
+        self._add_to_nodes(
+            moved if whole is None else (whole @ moved.ravel()).reshape(-1, 3), gradient
+        )
 
     def _gradient(self, moment: ContactsAt) -> Rows:
         """Return the gradient (total, 3) [N] on rank 0, friction included; (0, 3) on the others."""
@@ -204,7 +233,11 @@ class SurfaceContact:
 
     def _pushes(self, moment: ContactsAt) -> Rows:
         barrier = self.contacts.barrier
-        return barrier.gradient(moment.contacts, moment.points) if barrier else np.zeros_like(moment.points)
+        return (
+            barrier.gradient(moment.contacts, moment.points)
+            if barrier
+            else np.zeros_like(moment.points)
+        )
 
     def of_obstacles(self, q: Positions, frame: Floats | float = 0.0) -> tuple[Rows, float]:
         """Return the pushes of obstacles (k, 3) [N] on the bodies, and their work [J] in the step that ends at q.
@@ -239,7 +272,9 @@ class SurfaceContact:
         of_root: Rows | None = self.comm.bcast(duals)
         return of_root
 
-    def hessian(self, q: Positions, projected: bool, duals: Rows | None = None) -> SurfaceHessian | None:
+    def hessian(
+        self, q: Positions, projected: bool, duals: Rows | None = None
+    ) -> SurfaceHessian | None:
         """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts.
 
         duals : (a, 3) of friction; None: its true Hessian
@@ -250,7 +285,11 @@ class SurfaceContact:
         known = self._hessians.get(projected)
         if known is None or known[0] is not moment or known[1] is not duals:
             touched, points = self.comm.bcast(self._curvature(moment, projected, duals))
-            known = moment, duals, SurfaceHessian(self.comm, self.contacts.points.carried(touched), points)
+            known = (
+                moment,
+                duals,
+                SurfaceHessian(self.comm, self.contacts.points.carried(touched), points),
+            )
             self._hessians[projected] = known
         return known[2]
 
@@ -267,7 +306,9 @@ class SurfaceContact:
         bound: Floats = self.contacts.points.spread * (np.abs(kept.weights.copy()).T @ sums)
         return bound
 
-    def _curvature(self, moment: ContactsAt, projected: bool, duals: Rows | None) -> tuple[Indices, csr_array] | None:
+    def _curvature(
+        self, moment: ContactsAt, projected: bool, duals: Rows | None
+    ) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
         whole = self._whole_hessian(moment, projected, duals)
         if whole is None:
@@ -277,7 +318,9 @@ class SurfaceContact:
         numbers = (3 * touched[:, None] + np.arange(3)).ravel()
         return touched, csr_array(whole[numbers][:, numbers])
 
-    def _whole_hessian(self, moment: ContactsAt, projected: bool, duals: Rows | None) -> csr_array | None:
+    def _whole_hessian(
+        self, moment: ContactsAt, projected: bool, duals: Rows | None
+    ) -> csr_array | None:
         """Return on rank 0 the Hessian (3 total, 3 total) [N/m] of all points, obstacles' among them."""
         barrier = self.contacts.barrier
         if barrier is None:

@@ -78,10 +78,17 @@ class NeighbourMean:
         return like(vectors, means)
 
 
-def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
+def between(
+    q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float
+) -> tuple[Positions, Rows]:
     """Positions and velocities at a share s of a step, by Hermite's cubic between its ends; s may lie outside."""
     t, r = time_step, 1 - s
-    q = r * r * (1 + 2 * s) * q_0 + s * r * r * t * v_0 + s * s * (3 - 2 * s) * q_1 - s * s * r * t * v_1
+    q = (
+        r * r * (1 + 2 * s) * q_0
+        + s * r * r * t * v_0
+        + s * s * (3 - 2 * s) * q_1
+        - s * s * r * t * v_1
+    )
     v = 6 * s * r / t * (q_1 - q_0) + r * (1 - 3 * s) * v_0 + s * (3 * s - 2) * v_1
     return q, v
 
@@ -106,7 +113,9 @@ class StepControl:
     steps, time     : number of the steps that they are of, and their length [s]
     """
 
-    def __init__(self, order: int, error: float, step: float, duration: float, levels: tuple[int, int]):
+    def __init__(
+        self, order: int, error: float, step: float, duration: float, levels: tuple[int, int]
+    ):
         self.order, self.asked, self.step, self.duration = order, error, step, duration
         self.lowest, self.highest = levels
         self.level, self.calm = min(0, self.highest), 0
@@ -191,7 +200,9 @@ class Ticks:
     def fitting(self, tick: int, level: int) -> int:
         """The highest level, not above the one wanted, of a step that may start at a tick."""
         limit = next((event for event in self.events if event > tick), self.ticks)
-        while level > self.lowest and (tick % self.length(level) or tick + self.length(level) > limit):
+        while level > self.lowest and (
+            tick % self.length(level) or tick + self.length(level) > limit
+        ):
             level -= 1
         return level
 
@@ -210,15 +221,24 @@ class Adaptive(Integrator):
 
     looks_back = True
 
-    def __init__(self, scene: Scene, make: Callable[[Time, Solver], Integrator], balance: EnergyBalance):
+    def __init__(
+        self, scene: Scene, make: Callable[[Time, Solver], Integrator], balance: EnergyBalance
+    ):
         assert scene.time.error is not None
         self.balance, self.comm = balance, balance.comm
         self.lattice, self.environment = balance.lattice, balance.environment
-        self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
+        self.make, self.time, self.solver, self.time_step = (
+            make,
+            scene.time,
+            scene.solver,
+            scene.time.step,
+        )
         self.order = ORDERS[scene.time.integrator]
         steps = scene.time.steps
         self.levels = LOWEST, HIGHEST  # of its steps
-        self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
+        self.control = StepControl(
+            self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels
+        )
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.mean = NeighbourMean(self.comm, self.lattice)
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
@@ -229,7 +249,12 @@ class Adaptive(Integrator):
         """Make ready the integrator of the first step, and say what is to come."""
         self._integrator(self.control.level)
         shortest, longest = (self.time_step * 2.0**level for level in self.levels)
-        log.info("steps of %.3g to %.3g s, for an error of %.2g of the motion", shortest, longest, self.control.asked)
+        log.info(
+            "steps of %.3g to %.3g s, for an error of %.2g of the motion",
+            shortest,
+            longest,
+            self.control.asked,
+        )
 
     def _integrator(self, level: int) -> Integrator:
         """Return a level's integrator, which forgets earlier steps if another was used last."""
@@ -259,7 +284,9 @@ class Adaptive(Integrator):
             result, state = self._step(state)
             total = replace(result, cost=total.cost + result.cost)
         if self.tick > wanted or not total.cost.steps:
-            total = self._within(total, state, (self.tick - wanted) / self.ticks.length(self.last), time)
+            total = self._within(
+                total, state, (self.tick - wanted) / self.ticks.length(self.last), time
+            )
         return replace(total, time_error=self.control.estimate), state
 
     def _within(self, total: StepResult, state: State, share: float, time: float) -> StepResult:
@@ -281,7 +308,10 @@ class Adaptive(Integrator):
             if state.history is not None:  # the step needs it: no more than twice as long
                 longest = min(longest, self.last + 1)
             level = self.ticks.fitting(self.tick, longest)
-            before, end = self._begun(state, level, restarts), self._reached(self.tick + self.ticks.length(level))
+            before, end = (
+                self._begun(state, level, restarts),
+                self._reached(self.tick + self.ticks.length(level)),
+            )
             try:
                 result, after = self.balance.step(self._integrator(level), before, end)
                 measure = self._measure(before, result, after, level)
@@ -294,14 +324,18 @@ class Adaptive(Integrator):
                 cost += result.cost
             if stands:
                 self.control.pay(level, measure)
-                result = replace(result, cost=replace(cost, steps=1, step_error=result.cost.step_error))
+                result = replace(
+                    result, cost=replace(cost, steps=1, step_error=result.cost.step_error)
+                )
                 return self._taken(result, before, after, level)
 
     def _begun(self, state: State, level: int, restarts: bool) -> State:
         v = state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
-            history = between(*history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last))
+            history = between(
+                *history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last)
+            )
         return replace(state, q_previous=state.q - self._length(level) * v, history=history)
 
     def _reached(self, tick: int) -> float:
@@ -316,19 +350,30 @@ class Adaptive(Integrator):
         free = mass * ~self.environment.anchors.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
         local = self.mean(local_error(self.order, q, v, x, w, t) * (free > 0)[:, None])
-        sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
+        sums = [
+            mass @ (local**2).sum(axis=1),
+            mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1),
+        ]
         coming = t * v
-        if not self.control.motion:  # of a run that begins from rest: what will move until the next frame
+        if (
+            not self.control.motion
+        ):  # of a run that begins from rest: what will move until the next frame
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
         late = t * (free @ np.sqrt((struck**2).sum(axis=1)))
         if self.environment.obstacles.penalties:
             ends = (before.q[owned], before.sides), (x, after.sides)
             late += t**2 * ((free > 0) @ self.environment.obstacles.change_of_push(*ends, end, t))
         sums += [mass @ (coming**2).sum(axis=1), late]
-        error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
-        return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
+        error, motion, coming, late = (
+            self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
+        )
+        return Measure(
+            math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming))
+        )
 
-    def _taken(self, result: StepResult, before: State, after: State, level: int) -> tuple[StepResult, State]:
+    def _taken(
+        self, result: StepResult, before: State, after: State, level: int
+    ) -> tuple[StepResult, State]:
         t, T = self._length(level), self.time_step
         self.tick += self.ticks.length(level)
         self.last = level
@@ -357,7 +402,11 @@ class Adaptive(Integrator):
 
     def sum_up(self) -> None:
         """Say at the end of a run how far off the motion may be."""
-        log.info("the motion is some %.2g of its size off (time.error = %g)", self.control.estimate, self.control.asked)
+        log.info(
+            "the motion is some %.2g of its size off (time.error = %g)",
+            self.control.estimate,
+            self.control.asked,
+        )
 
     def destroy(self) -> None:
         for integrator in self.kept.values():

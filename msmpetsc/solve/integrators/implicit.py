@@ -73,7 +73,9 @@ class ContactFaces:
         self.is_settled = False
         self.contact: Contact | None = None  # of the problem solved last
         self.start: Positions | None = None  # of an earlier solve, that the next one may begin with
-        self.end: Positions | None = None  # of a solve whose friction went by a push far from the one there
+        self.end: Positions | None = (
+            None  # of a solve whose friction went by a push far from the one there
+        )
         self.sides = self._crossed(self.y)
         with CONTACT:
             self.environment.begin_contacts(self.q, self.time, self.time_step)
@@ -82,7 +84,9 @@ class ContactFaces:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
         with CONTACT:
             obstacles, held = self.environment.obstacles, self.fixed
-            return obstacles.contact_faces(self.q, end, self.time, self.time_step, self.before, held)
+            return obstacles.contact_faces(
+                self.q, end, self.time, self.time_step, self.before, held
+            )
 
     def problem(self) -> StepProblem:
         """Return the problem of the step with the faces as they are known now."""
@@ -114,7 +118,9 @@ class ContactFaces:
         self.solves += 1
         environment, contacts = self.environment, self.environment.contacts
         obstacles = environment.obstacles
-        self.is_settled = not obstacles.has_sides or obstacles.same_push(x, self.time, self.sides, sides)
+        self.is_settled = not obstacles.has_sides or obstacles.same_push(
+            x, self.time, self.sides, sides
+        )
         if not self.is_settled:
             self.sides = sides
             if self.solves == MOST_SOLVES:
@@ -156,7 +162,9 @@ class ImplicitEuler(Integrator):
     STATIC = False  # M is no part of F
     state: ClassVar[dict[str, Range]] = {}
 
-    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, prefix: str):
+    def __init__(
+        self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, prefix: str
+    ):
         self.comm, self.environment, self.solver, self.prefix = comm, environment, solver, prefix
         self.time_step = time.step
         self.damping, self.retardation = environment.damping, environment.retardation
@@ -172,7 +180,9 @@ class ImplicitEuler(Integrator):
         """Tau of the damped problem [s]; that without damping where there is none."""
         return self.tau / float(np.sqrt(1 + self.damping * self.tau))
 
-    def _rates(self, q: Positions, y: Positions, q_before: Positions | None) -> tuple[Positions, Positions] | None:
+    def _rates(
+        self, q: Positions, y: Positions, q_before: Positions | None
+    ) -> tuple[Positions, Positions] | None:
         """Return what a viscous solid's rates are of: x^, and positions that have turned as the rates have."""
         if not self.retardation:
             return None
@@ -195,23 +205,37 @@ class ImplicitEuler(Integrator):
             y = q + self._carried(time_step) / time_step * (q - state.q_previous)
         result, sides = self._solve(state, y, time, time_step)
         after, before, work = self.environment.obstacles.strike(
-            result.position, result.previous, StepTaken(time, time_step, sides), self.stepper.lattice.pinned
+            result.position,
+            result.previous,
+            StepTaken(time, time_step, sides),
+            self.stepper.lattice.pinned,
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
     def _solve(
-        self, state: State, y: Positions, time: float, time_step: float, q_before: Positions | None = None
+        self,
+        state: State,
+        y: Positions,
+        time: float,
+        time_step: float,
+        q_before: Positions | None = None,
     ) -> tuple[StepResult, Indices]:
         """Solve for the x that belongs to y at ``time``, and for its contact faces.
 
         q_before : (l, 3) [m] one step before the state, of a step that looks so far back
         """
         fixed = self.stepper.lattice.pinned
-        faces = ContactFaces(self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
+        faces = ContactFaces(
+            self.environment, state.q, y, time, time_step, state.sides, fixed, q_before
+        )
         begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
-        result = faces.solve(lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start))
+        result = faces.solve(
+            lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start)
+        )
         self.environment.end_step(result.position, faces.contact)
-        cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
+        cost = replace(
+            self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error
+        )
         result = replace(result, cost=cost, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides
 
@@ -227,7 +251,10 @@ class ImplicitEuler(Integrator):
 
     def _new_stepper(self, time: float) -> Stepper:
         """Make the solver for the nodes that are free at a time [s]."""
-        solver, lattice = self.solver, self.environment.lattice.pin(self.environment.anchors.fixed_at(time))
+        solver, lattice = (
+            self.solver,
+            self.environment.lattice.pin(self.environment.anchors.fixed_at(time)),
+        )
         if self.retardation:
             factor = self.retardation / self.tau
             lattice = replace(lattice, stiffness=(1 + factor) * lattice.stiffness, viscous=factor)
@@ -304,7 +331,10 @@ class Bdf2(ImplicitEuler):
         previous = result.position - self.time_step * v_1
         a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
         _, before, work = self.environment.obstacles.strike(
-            result.position, previous, StepTaken(time, self.time_step, sides), self.stepper.lattice.pinned
+            result.position,
+            previous,
+            StepTaken(time, self.time_step, sides),
+            self.stepper.lattice.pinned,
         )
         cost = replace(begun + result.cost, step_error=result.cost.step_error, steps=1)
         result = replace(result, previous=previous, cost=cost, work=work)

@@ -52,7 +52,9 @@ class State:
 
     def over(self, time_step: float, shorter: float) -> "State":
         """Return the same state for steps of another length, without history."""
-        return replace(self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None)
+        return replace(
+            self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None
+        )
 
     def save(self, checkpoint: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
         """Store the state.
@@ -71,7 +73,11 @@ class State:
     @staticmethod
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
         """Return the state that a checkpoint holds (collective)."""
-        names = ("q", "q_previous", *HISTORY) if checkpoint.number("history", 0, 0, 1) else ("q", "q_previous")
+        names = (
+            ("q", "q_previous", *HISTORY)
+            if checkpoint.number("history", 0, 0, 1)
+            else ("q", "q_previous")
+        )
         rows = [with_ghosts(comm, lattice, checkpoint.row(name)) for name in names]
         q, q_previous, *last = (like(lattice.nodes, each) for each in rows)
         history = (last[0], last[1]) if last else None

@@ -71,7 +71,9 @@ class LoadSteps:
         """Shorten the next step after a failure. Raises StepFailed after one of the smallest, or very many."""
         self.size, self.failures = 0.5 * (self.share - self.reached), self.failures + 1
         if self.size < SMALLEST or self.failures > MOST_FAILURES:
-            raise StepFailed(f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind) from None
+            raise StepFailed(
+                f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind
+            ) from None
 
 
 @dataclass
@@ -98,7 +100,9 @@ class LoadPath:
         at_rest = self.stepper.comm.allreduce(bool((self.base == lattice.nodes).all()), MPI.LAND)
         self.displaced = first and not at_rest
         self.inverted = 0 if first else worst_inverted(self.stepper.comm, lattice, self.base)[0]
-        self.holding: Rows | None = None  # r (owned, 3) [N], which keeps free nodes where they are; once asked for
+        self.holding: Rows | None = (
+            None  # r (owned, 3) [N], which keeps free nodes where they are; once asked for
+        )
         self.problem: StepProblem | None = None
 
     def try_share(self, steps: LoadSteps) -> StepResult:
@@ -106,14 +110,20 @@ class LoadPath:
         with cells turned inside out, which smaller steps may avoid."""
         share = steps.share
         q = self.known[-1][1]
-        time_step = 0.0 if len(self.known) > 1 else self.time_step  # obstacles move in the first load step alone
+        time_step = (
+            0.0 if len(self.known) > 1 else self.time_step
+        )  # obstacles move in the first load step alone
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(self.environment, q, q, self.time, time_step, self.sides, fixed)
         result = faces.solve(lambda whole: self._step(self._problem(whole, share), share))
         lattice = self.stepper.lattice
-        count, where = worst_inverted(self.stepper.comm, lattice, result.position, corners=self.displaced)
+        count, where = worst_inverted(
+            self.stepper.comm, lattice, result.position, corners=self.displaced
+        )
         if steps.may_be_refused and count > self.inverted:
-            raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
+            raise StepFailed(
+                f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted"
+            )
         self.known = [self.known[-1], (share, result.position)]
         self.problem, self.sides = result.problem, faces.sides
         return result
@@ -125,13 +135,21 @@ class LoadPath:
         load, prescribed = whole.load, self.target
         if share < 1:
             if self.holding is None:
-                stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
+                stepper, functional, lattice = (
+                    self.stepper,
+                    self.stepper.functional,
+                    self.stepper.lattice,
+                )
                 functional.begin(replace(whole, y=self.base, prescribed=None))
                 held = functional.at(self.base)
                 self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
-                self.holding[stepper.unknowns.free] = stepper.unknowns.columns(held.f).T / functional.t2
+                self.holding[stepper.unknowns.free] = (
+                    stepper.unknowns.columns(held.f).T / functional.t2
+                )
             load = load + (1 - share) * self.holding
-            prescribed = self.environment.anchors.prescribed(self.base, self.time, self.time - self.time_step, share)
+            prescribed = self.environment.anchors.prescribed(
+                self.base, self.time, self.time - self.time_step, share
+            )
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:
@@ -164,9 +182,13 @@ class Static(ImplicitEuler):
         """SLENDER times how long sound takes along the longest side of the lattice, roughly [s]."""
         lattice = self.environment.lattice
         low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
-        low, high = (np.array(self.comm.allgather([float(x) for x in corner])) for corner in (low, high))
+        low, high = (
+            np.array(self.comm.allgather([float(x) for x in corner])) for corner in (low, high)
+        )
         cells = (high.max(axis=0) - low.min(axis=0)).max() / lattice.cell_size
-        sums = np.array([float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())])
+        sums = np.array(
+            [float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())]
+        )
         mass, stiffness = self.comm.allreduce(sums)
         return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
@@ -176,7 +198,9 @@ class Static(ImplicitEuler):
         self.stepper.set_up()
         minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
         minimum.estimate.linearise(rest)
-        lowest = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[0]  # of M^(-1) tau^2 (Hessian of E), roughly
+        lowest = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[
+            0
+        ]  # of M^(-1) tau^2 (Hessian of E), roughly
         if lowest > 0 and not WILL_DO[0] <= lowest <= WILL_DO[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()
@@ -187,7 +211,9 @@ class Static(ImplicitEuler):
         self._let_go(time)
         before = time - self.time_step
         if before > 0.5 * self.time_step and self.environment.is_same(before, time):
-            return StepResult(state.q, state.q, Work(self.error, steps=1), static=True, problem=self.problem), state
+            return StepResult(
+                state.q, state.q, Work(self.error, steps=1), static=True, problem=self.problem
+            ), state
         stepper = self.stepper
         begun = stepper.work_so_far()
         path = LoadPath(stepper, self.environment, state, time, self.time_step)
@@ -201,7 +227,9 @@ class Static(ImplicitEuler):
         """Bring all of the load on in few load steps; return their path, too. Raises StepFailed."""
         steps, snes, rest = LoadSteps(), self.stepper.snes, self.stepper.lattice.nodes
         most = snes.getTolerances()[3]
-        hurries = not self.stepper.budget and self.stepper.options.is_default("snes_max_it")  # else the user has said
+        hurries = not self.stepper.budget and self.stepper.options.is_default(
+            "snes_max_it"
+        )  # else the user has said
         try:
             while steps.reached < 1.0:
                 if hurries:
@@ -238,7 +266,9 @@ def refuse_free_bodies(unknowns: Unknowns) -> None:
         rows = np.flatnonzero(bodies.number[: lattice.owned] == number)
         own = to_host(lattice.nodes[: lattice.owned])[rows]
         sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))
-        first = unknowns.comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
+        first = unknowns.comm.allreduce(
+            int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN
+        )
         place = ", ".join(f"{x:.4g}" for x in sums[:3] / sums[3])
         what = f"a part {of_body(lattice, first)}of {int(sums[3])} nodes about ({place}) m at rest"
     raise InputError(

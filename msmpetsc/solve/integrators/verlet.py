@@ -61,7 +61,9 @@ class Verlet(Integrator):
         "gained": FINITE,
     }
 
-    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, _prefix: str):
+    def __init__(
+        self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, _prefix: str
+    ):
         self.comm, self.lattice, self.environment = comm, environment.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(self.lattice)
@@ -79,7 +81,9 @@ class Verlet(Integrator):
         self.gained = 0.0  # [J] by the springs since the start, from nowhere and not lost since; negative: a credit
         self.halvings = 0  # of substeps, for what they gained
         self.end = 0.0  # of the step [s]
-        self.known: Floats | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
+        self.known: Floats | None = (
+            None  # positions (l, 3) that ``gradient`` and the highest frequency are of
+        )
         self.anchors: int | None = None  # how many hold
         self.fixed = environment.anchors.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
@@ -114,7 +118,11 @@ class Verlet(Integrator):
                 self._take(count, start, time)
             energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
             dt = self.time_step / count
-            after = pushed + self.highest.squared_at(self.position.values) if energy <= self.most else np.inf
+            after = (
+                pushed + self.highest.squared_at(self.position.values)
+                if energy <= self.most
+                else np.inf
+            )
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
                 return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
@@ -136,7 +144,9 @@ class Verlet(Integrator):
             before = state.sides
             if before is not None:
                 before = before[:, : self.lattice.owned]
-            self.sides = self.environment.obstacles.contact_faces(self.q, self.q, start, 0.0, before, self.fixed)
+            self.sides = self.environment.obstacles.contact_faces(
+                self.q, self.q, start, 0.0, before, self.fixed
+            )
             self._pull(start)
             self.highest.squared = 0.0
 
@@ -150,7 +160,9 @@ class Verlet(Integrator):
             self._drift(begin, end)
             moved, held = self.q - before, held | self.fixed
             self._count_work(moved, held)
-            self.work += self.environment.obstacles.energy_of_new_obstacles(self.q, begin, end, self.sides)
+            self.work += self.environment.obstacles.energy_of_new_obstacles(
+                self.q, begin, end, self.sides
+            )
             self._pull(end)
             self._count_work(moved, held)
             duration = end - begin
@@ -171,10 +183,16 @@ class Verlet(Integrator):
         nothing (collective). Where obstacles push, what springs seem to gain may be theirs."""
         own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
         mass = self.lattice.mass[: self.lattice.owned, None]
-        gain, kinetic = self.comm.allreduce(np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))]))
+        gain, kinetic = self.comm.allreduce(
+            np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))])
+        )
         most = energy + kinetic
         enough, gained = GAIN * most + ROUNDING * self.most, max(self.gained + gain, -CREDIT * most)
-        if min(gain, gained) > enough and self.halvings < HALVINGS and not self.environment.obstacles.penalties:
+        if (
+            min(gain, gained) > enough
+            and self.halvings < HALVINGS
+            and not self.environment.obstacles.penalties
+        ):
             self.halvings += 1
             return True
         self.gained = gained
@@ -211,11 +229,19 @@ class Verlet(Integrator):
         load = self.environment.forces.at(time)
         before = None if beyond is None else self.v.copy()
         kick(len(self.free), load, duration, self._movers())
-        if beyond is not None and before is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
-            self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
+        if (
+            beyond is not None and before is not None
+        ):  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
+            self.work += (
+                0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
+            )
         self._damp(0.5 * duration)
-        self.work += duration * self.environment.obstacles.power(self.q, time, begin, end, self.sides)
-        self.environment.obstacles.apply_friction(self._movers(), time, duration, (begin, end), self.sides)
+        self.work += duration * self.environment.obstacles.power(
+            self.q, time, begin, end, self.sides
+        )
+        self.environment.obstacles.apply_friction(
+            self._movers(), time, duration, (begin, end), self.sides
+        )
 
     def _movers(self) -> Movers:
         return Movers(self.q, self.v, self.free, self.per_mass, self.gradient)
@@ -248,7 +274,9 @@ class Verlet(Integrator):
     def _strike(self, begin: float, end: float) -> None:
         """Find faces of contact; the velocity of a node that bounces off is what then led it there."""
         start = self.q - (end - begin) * self.v
-        self.sides = self.environment.obstacles.contact_faces(start, self.q, end, end - begin, self.sides, self.fixed)
+        self.sides = self.environment.obstacles.contact_faces(
+            start, self.q, end, end - begin, self.sides, self.fixed
+        )
         step = StepTaken(end, end - begin, self.sides)
         after, before, work = self.environment.obstacles.strike(self.q, start, step, self.fixed)
         self.work += work
@@ -271,7 +299,9 @@ class Verlet(Integrator):
         fall = self.environment.forces.at(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
-        stiffness = self.environment.obstacles.contact_stiffness_bound(self.q, speed, start, time, self.sides)
+        stiffness = self.environment.obstacles.contact_stiffness_bound(
+            self.q, speed, start, time, self.sides
+        )
         squared = greatest(stiffness[self.free] * self.per_mass[self.free])
         return float(self.comm.allreduce(squared, MPI.MAX))
 
@@ -286,7 +316,10 @@ class Verlet(Integrator):
             self.substep = np.inf  # said once
         count = self.time_step / min(limit, self.substep)
         if not count < MOST_SUBSTEPS:
-            raise StepFailed(f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler", "unstable")
+            raise StepFailed(
+                f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler",
+                "unstable",
+            )
         return max(1, int(np.ceil(count * (1 - 1e-12))))
 
     def destroy(self) -> None:
@@ -335,7 +368,9 @@ class HighestMode:
     def _normalise(self) -> float:
         """Scale the mode x to |x|_M = 1, and return what that was (collective)."""
         x = self.mode.values[: self.lattice.owned]
-        size = float(np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x)))))
+        size = float(
+            np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
+        )
         if size > 0:
             x /= size
         self.mode.update()

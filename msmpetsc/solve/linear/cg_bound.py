@@ -40,7 +40,9 @@ class SolveBound:
             return np.inf
         squares = np.square(self.norms)
         bound = 1 / least
-        for gained, before, after in zip(np.diff(self.energies), squares, squares[1:], strict=False):
+        for gained, before, after in zip(
+            np.diff(self.energies), squares, squares[1:], strict=False
+        ):
             rest = bound - gained / before
             if not rest > 0:  # least is more than the least
                 return np.inf

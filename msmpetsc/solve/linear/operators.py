@@ -66,7 +66,12 @@ class ThreeColumns:
     """A (x) I_3 without forming it; ``contact`` is None where the scene has no penalty."""
 
     def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, contact: ContactBlocks | None = None):
-        self.matrix, self.unknowns, self.memory, self.contact = matrix, unknowns, unknowns.memory, contact
+        self.matrix, self.unknowns, self.memory, self.contact = (
+            matrix,
+            unknowns,
+            unknowns.memory,
+            contact,
+        )
         self.input = Block(matrix, self.memory)
         self.product = matrix.matMult(self.input.mat)
 
@@ -89,9 +94,18 @@ class TrueHessian:
     """
 
     def __init__(
-        self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, contact: ContactBlocks | None = None
+        self,
+        unknowns: Unknowns,
+        elasticity: Elasticity,
+        time_step: float,
+        contact: ContactBlocks | None = None,
     ):
-        self.unknowns, self.elasticity, self.t2, self.contact = unknowns, elasticity, time_step**2, contact
+        self.unknowns, self.elasticity, self.t2, self.contact = (
+            unknowns,
+            elasticity,
+            time_step**2,
+            contact,
+        )
         lattice = unknowns.lattice
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
@@ -100,7 +114,11 @@ class TrueHessian:
         self.products = 0
 
     def linearise(
-        self, q: Positions, contact: Contact | None, projected: bool = False, duals: Duals | None = None
+        self,
+        q: Positions,
+        contact: Contact | None,
+        projected: bool = False,
+        duals: Duals | None = None,
     ) -> None:
         """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (elasticity.springs),
         ``duals`` the true curvature of friction (contact.obstacles.friction)."""
@@ -109,7 +127,11 @@ class TrueHessian:
             if self.contact:
                 self.contact.linearise(contact, q, duals)
             of_surface = duals[-1] if duals else None
-            self.surface = contact.surface.hessian(q, projected, of_surface) if contact and contact.surface else None
+            self.surface = (
+                contact.surface.hessian(q, projected, of_surface)
+                if contact and contact.surface
+                else None
+            )
 
     def take_slopes(self, slopes: Array) -> None:
         """Take other V U' of a solid's cells (elasticity.solid.CellHessians) than those at q."""
@@ -168,11 +190,15 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str =
     if ("cusparse" in matrix.getType()) != on_gpu:
         computes = f"the run computes on the {'GPU' if on_gpu else 'CPU'}"
         raise InputError(f"-{prefix}mat_type {matrix.getType()}: {computes}")
-    matrix.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data))
+    matrix.setPreallocationCSR(
+        (csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data)
+    )
     return matrix
 
 
-def assembly_bytes(nodes: float | Array, springs: float | Array, nonzeros: float | Array) -> float | Array:
+def assembly_bytes(
+    nodes: float | Array, springs: float | Array, nonzeros: float | Array
+) -> float | Array:
     """Return the bytes that ``assemble`` has at once beside its arguments; numbers, or arrays of a number a rank.
 
     They are row of each node; weight, ends and kept of each spring; of each nonzero row, column and value,

@@ -20,7 +20,9 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.device import memory_of
 from msmpetsc.solve.petsc.events import GHOSTS
 
-LARGEST = int(np.iinfo(PETSc.IntType).max)  # of PETSc's integers: 32 bits, unless it was configured otherwise
+LARGEST = int(
+    np.iinfo(PETSc.IntType).max
+)  # of PETSc's integers: 32 bits, unless it was configured otherwise
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
 BALLAST = 1e-6  # of the mass
 BYTES_OF_NODE = 8  # of ``numbers``, for a forecast of memory
@@ -41,11 +43,18 @@ class Unknowns:
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, static: bool = False):
-        self.comm, self.lattice, self.memory, self.static = comm, lattice, memory_of(lattice.nodes), static
+        self.comm, self.lattice, self.memory, self.static = (
+            comm,
+            lattice,
+            memory_of(lattice.nodes),
+            static,
+        )
         self.inertia = np.zeros_like(lattice.mass) if static else lattice.mass
         self.ballast = BALLAST * lattice.mass if static else lattice.mass
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
-        self.rows = self.free.astype(np.uint32)  # for kernels, which need not look whether a number is negative
+        self.rows = self.free.astype(
+            np.uint32
+        )  # for kernels, which need not look whether a number is negative
         self.size = len(self.free)
         first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]  # an Intracomm
         self.total = comm.allreduce(self.size)
@@ -102,7 +111,9 @@ class Unknowns:
 
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
-        _scaled_sum(self.size, self.columns_to_write(vector), Terms(self.inertia, a, t2, b, self.rows))
+        _scaled_sum(
+            self.size, self.columns_to_write(vector), Terms(self.inertia, a, t2, b, self.rows)
+        )
 
     def destroy(self) -> None:
         """Collective."""
@@ -177,7 +188,9 @@ def refuse_unknowns(nodes: int) -> None:
     """Raise InputError for more ``nodes`` than PETSc can number three coordinates of."""
     if 3 * nodes > LARGEST:
         most = f"the {LARGEST} unknowns that PETSc can number here"
-        raise InputError(f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}")
+        raise InputError(
+            f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}"
+        )
 
 
 def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:

@@ -22,7 +22,9 @@ class BlockRows(NamedTuple):
     values: Array
 
     @classmethod
-    def chosen(cls, chosen: Mask, rows: int, row: Indices, columns: Indices, place: Indices) -> "BlockRows":
+    def chosen(
+        cls, chosen: Mask, rows: int, row: Indices, columns: Indices, place: Indices
+    ) -> "BlockRows":
         begin = np.searchsorted(row[chosen], np.arange(rows + 1))
         values = np.empty((chosen.sum(), 9), np.float32)
         return cls(begin, columns[chosen].astype(np.int32), place[chosen], values)
@@ -51,13 +53,18 @@ class CoarseOperator:
         columns = columns[place] // 3
         is_own = (columns >= first) & (columns < last)
         ghosts, number = np.unique(columns[~is_own], return_inverse=True)
-        self.own = BlockRows.chosen(is_own & (columns > first + row), last - first, row, columns - first, place)
+        self.own = BlockRows.chosen(
+            is_own & (columns > first + row), last - first, row, columns - first, place
+        )
         columns[~is_own] = number
         self.others = BlockRows.chosen(~is_own, last - first, row, columns, place)
         self.sums = np.empty((last - first, 9), np.float32)
         self.x, self.y = np.empty((2, last - first, 3), np.float32)
         self.ghosts = PETSc.Vec().createSeq(3 * len(ghosts))
-        whole, wanted = matrix.createVecRight(), PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType))
+        whole, wanted = (
+            matrix.createVecRight(),
+            PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType)),
+        )
         self.scatter = PETSc.Scatter().create(whole, wanted, self.ghosts, None)
         whole.destroy()
         wanted.destroy()
@@ -68,7 +75,9 @@ class CoarseOperator:
     def update(self) -> None:
         """Take the blocks as the matrix has them now."""
         begin, _, values = self.matrix.getValuesCSR()
-        self.sums[:] = np.add.reduceat(values.reshape(-1, 3), begin[:-1] // 3, axis=0).reshape(-1, 9)
+        self.sums[:] = np.add.reduceat(values.reshape(-1, 3), begin[:-1] // 3, axis=0).reshape(
+            -1, 9
+        )
         for part in (self.own, self.others):
             take_blocks(self.length, part, values)
         self.operator.assemble()
@@ -79,7 +88,9 @@ class CoarseOperator:
         multiply_upper(self.own, self.sums, self.x, self.y)
         if self.matrix.comm.size > 1:
             self.scatter.scatter(x, self.ghosts)
-            add_product(self.others, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y)
+            add_product(
+                self.others, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y
+            )
         y.array_w[:] = self.y.ravel()
 
     def destroy(self, _: PETSc.Mat) -> None:

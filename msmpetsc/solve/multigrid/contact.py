@@ -38,7 +38,10 @@ class ContactSmoother:
         self.comm = unknowns.comm
         weights = surface.weights[:, unknowns.free]
         self.nodes = np.unique(weights.indices)
-        self.weights, self.inverse = csr_array(weights[:, self.nodes]), inverse[self.nodes].reshape(-1, 3, 3)
+        self.weights, self.inverse = (
+            csr_array(weights[:, self.nodes]),
+            inverse[self.nodes].reshape(-1, 3, 3),
+        )
         self.back = csr_array(self.weights.T)
         size = surface.points.shape[0]
         compliance, scaled = np.zeros((size, size)), self.weights.copy()
@@ -81,7 +84,9 @@ class CoarseContact:
 
     def __init__(self, unknowns: Unknowns, interpolations: list[PETSc.Mat], t2: float):
         self.unknowns, self.interpolations, self.t2 = unknowns, interpolations, t2
-        self.scalar: list[csr_array] = []  # P of one coordinate, this rank's rows; until there is contact
+        self.scalar: list[
+            csr_array
+        ] = []  # P of one coordinate, this rank's rows; until there is contact
         self.coarsest: PETSc.Mat | None = None  # with contact
         self.nonzeros = csr_array((0, 0))  # ones where this rank's rows of it have room for contact
 
@@ -92,24 +97,34 @@ class CoarseContact:
         self.scalar = self.scalar or self._scalar()
         weights = surface.weights[:, self.unknowns.free]
         for matrix, p in zip(matrices, self.scalar, strict=True):
-            whole = sum(surface.comm.allgather(weights @ p))  # in the order of the ranks: the same sum each time
+            whole = sum(
+                surface.comm.allgather(weights @ p)
+            )  # in the order of the ranks: the same sum each time
             first, last = (bound // 3 for bound in matrix.getOwnershipRange())
             weights = csr_array(whole[:, first:last])
             if matrix is not matrices[-1]:
                 own = SurfaceHessian(surface.comm, weights, surface.points)
                 add_diagonal(matrix, self.t2 * own.blocks)
-        joined = kron(weights, eye_array(3), "csr").T @ (surface.points @ kron(whole, eye_array(3), "csr"))
+        joined = kron(weights, eye_array(3), "csr").T @ (
+            surface.points @ kron(whole, eye_array(3), "csr")
+        )
         return self._coarsest(matrices[-1], csr_array(joined))
 
     def _coarsest(self, without: PETSc.Mat, contact: csr_array) -> PETSc.Mat:
         """Return the coarsest matrix with this rank's rows of contact [kg], itself as it is ``without``."""
-        here = csr_array((np.ones_like(contact.data), contact.indices, contact.indptr), contact.shape)
+        here = csr_array(
+            (np.ones_like(contact.data), contact.indices, contact.indptr), contact.shape
+        )
         room = self.nonzeros + here if self.coarsest else here
-        if self.coarsest is None or without.comm.tompi4py().allreduce(room.nnz > self.nonzeros.nnz, MPI.LOR):
+        if self.coarsest is None or without.comm.tompi4py().allreduce(
+            room.nnz > self.nonzeros.nnz, MPI.LOR
+        ):
             self.destroy()
             self.nonzeros = room if room.nnz < SPARE * here.nnz else here
             self.coarsest = without.copy()
-            self._add(aij(0.0 * self.nonzeros, without), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            self._add(
+                aij(0.0 * self.nonzeros, without), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+            )
         self.coarsest.zeroEntries()
         self.coarsest.axpy(1.0, without, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         self._add(aij(self.t2 * contact, without), PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
@@ -139,7 +154,10 @@ class CoarseContact:
 def add_diagonal(matrix: PETSc.Mat, blocks: Rows) -> None:
     """Add 3 x 3 blocks (n, 9) to the diagonal of a matrix whose rows are this rank's."""
     first, last = (bound // 3 for bound in matrix.getOwnershipRange())
-    begin, columns = np.arange(len(blocks) + 1, dtype=PETSc.IntType), np.arange(first, last, dtype=PETSc.IntType)
+    begin, columns = (
+        np.arange(len(blocks) + 1, dtype=PETSc.IntType),
+        np.arange(first, last, dtype=PETSc.IntType),
+    )
     matrix.setValuesBlockedIJV(begin, columns, blocks.reshape(-1, 3, 3), addv=True)
     matrix.assemble()
 

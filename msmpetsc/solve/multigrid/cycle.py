@@ -75,7 +75,9 @@ class Multigrid:
         self.coarse: list[CoarseOperator] = []  # until ``update``
         self.sizes: list[tuple[int, int]] = []
         self.bounds = [0.0] * len(self.levels)
-        self.contact = CoarseContact(unknowns, [level.interpolation for level in self.levels], time_step**2)
+        self.contact = CoarseContact(
+            unknowns, [level.interpolation for level in self.levels], time_step**2
+        )
         self.owned.callback(self.contact.destroy)
         self.pc = PETSc.PC().create(unknowns.comm)
         self.owned.callback(self.pc.destroy)
@@ -88,7 +90,9 @@ class Multigrid:
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, max(asked - 1, 1) if asked else None)
         if asked and asked != len(coarse) + 1:
-            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {len(coarse) + 1}")
+            raise InputError(
+                f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {len(coarse) + 1}"
+            )
         galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, apart)
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
@@ -142,7 +146,10 @@ class Multigrid:
         is_free = unknowns.numbers[to_host(lattice.springs)[: lattice.springs_owned]] >= 0
         pairs = unknowns.comm.allreduce(int(is_free.all(axis=1).sum()))
         total = PETSc.Mat.InfoType.GLOBAL_SUM
-        coarse = [(level.grid.table.total, int(level.matrix.getInfo(total)["nz_used"])) for level in self.levels]
+        coarse = [
+            (level.grid.table.total, int(level.matrix.getInfo(total)["nz_used"]))
+            for level in self.levels
+        ]
         return [(unknowns.total, 9 * (unknowns.total + 2 * pairs)), *coarse]
 
     def __repr__(self) -> str:
@@ -150,10 +157,15 @@ class Multigrid:
         if not self.sizes:
             return f"multigrid of {1 + len(self.levels)} levels, not built yet"
         nonzeros = [number for _, number in self.sizes]
-        lines = [f"multigrid of {len(self.sizes)} levels, operator complexity {sum(nonzeros) / nonzeros[0]:.3f}"]
+        lines = [
+            f"multigrid of {len(self.sizes)} levels, operator complexity {sum(nonzeros) / nonzeros[0]:.3f}"
+        ]
         lines.append(f"{'level':>5} {'nodes':>10} {'nonzeros':>12}")
         numbers = range(len(self.sizes) - 1, -1, -1)
-        lines += [f"{n:>5} {nodes:>10} {nz:>12}" for n, (nodes, nz) in zip(numbers, self.sizes, strict=True)]
+        lines += [
+            f"{n:>5} {nodes:>10} {nz:>12}"
+            for n, (nodes, nz) in zip(numbers, self.sizes, strict=True)
+        ]
         return "\n".join(lines)
 
     def _finest_bound(self) -> float:
@@ -190,9 +202,15 @@ class Multigrid:
         """PETSc's options of the product P^T H P that are ours, where the user gives none."""
         given = PETSc.Options().getAll()
         if matrix.comm.size > 1 and "matptap_via" not in given:
-            yield "matptap_via", "allatonce"  # the default adds what other ranks send as it comes in: no two runs alike
+            yield (
+                "matptap_via",
+                "allatonce",
+            )  # the default adds what other ranks send as it comes in: no two runs alike
         if self.unknowns.memory is device.CUDA and "matptap_backend_cpu" not in given:
-            yield "matptap_backend_cpu", "true"  # on an H100 PETSc 3.26's own product of two sparse matrices was 0
+            yield (
+                "matptap_backend_cpu",
+                "true",
+            )  # on an H100 PETSc 3.26's own product of two sparse matrices was 0
 
     def _create_cycle(self) -> None:
         pc, top = self.pc, len(self.levels)
@@ -204,7 +222,9 @@ class Multigrid:
             pc.setMGInterpolation(top - i, level.interpolation)
             pc.setMGRestriction(top - i, self._restriction(level.interpolation))
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
-            ksp.setOperators(self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix)
+            ksp.setOperators(
+                self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix
+            )
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
         finest = pc.getMGSmoother(top)
         finest.setOperators(self.operator, self.operator)
@@ -219,7 +239,9 @@ class Multigrid:
         fine, coarse = interpolation.getSizes()
         is_transposed = fine[1] == coarse[1] and PETSc.Sys.getVersion() >= TRANSPOSES_SQUARE
         shape = (fine, coarse) if is_transposed else (coarse, fine)
-        restriction = PETSc.Mat().createPython(shape, Restriction(interpolation), comm=interpolation.comm)
+        restriction = PETSc.Mat().createPython(
+            shape, Restriction(interpolation), comm=interpolation.comm
+        )
         restriction.setVecType(self.unknowns.memory.vec_type)
         restriction.setUp()
         self.owned.callback(restriction.destroy)
@@ -242,7 +264,9 @@ class Multigrid:
         self.owned.close()
 
 
-def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlocks | None" = None) -> float:
+def greatest_eigenvalue(
+    matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlocks | None" = None
+) -> float:
     """Return about the greatest eigenvalue of D^-1 H of a level, D its 3 x 3 diagonal blocks (collective).
 
     noise  : (n,) of this rank, from 0 to 1
@@ -296,7 +320,9 @@ class ProjectedHessian:
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         elasticity.add_bound(lattice.nodes, blocks)
-        self.compliance = 1 / (unknowns.ballast / t2 + blocks[: lattice.owned, [0, 4, 8]].sum(axis=1) / 3)
+        self.compliance = 1 / (
+            unknowns.ballast / t2 + blocks[: lattice.owned, [0, 4, 8]].sum(axis=1) / 3
+        )
         self.joined: SurfaceHessian | None = None
         self.smoother: ContactSmoother | None = None
 
@@ -305,13 +331,18 @@ class ProjectedHessian:
 
         joined : of the surface's contact with itself
         """
-        self.elastic, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), contact
+        self.elastic, self.contact = (
+            self.elasticity.hessian_at(q, projected=True, dtype=np.float32),
+            contact,
+        )
         unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
         self.elasticity.add_bound(q, blocks)
         nodes = FreeNodes(unknowns.free, unknowns.ballast, contact, self.t2)
         invert_blocks(unknowns.size, self.inverse, blocks, nodes)
         self.joined = joined
-        self.smoother = ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
+        self.smoother = (
+            ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
+        )
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""
@@ -350,7 +381,9 @@ class DiagonalBlocks:
 
 
 @kernel
-def add_node_blocks(first: int, count: int, step: int, blocks: Rows, v: Array, product: Array) -> None:
+def add_node_blocks(
+    first: int, count: int, step: int, blocks: Rows, v: Array, product: Array
+) -> None:
     for i in range(first, count, step):
         for r in range(3):
             for c in range(3):
@@ -375,7 +408,9 @@ class FreeNodes(NamedTuple):
 
 
 @kernel
-def invert_blocks(first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes) -> None:
+def invert_blocks(
+    first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes
+) -> None:
     free, mass, contact, t2 = nodes
     for i in range(first, count, step):
         node = free[i]
@@ -384,10 +419,25 @@ def invert_blocks(first: int, count: int, step: int, inverse: Array, blocks: Row
         e, f, g = t2 * d[4], t2 * d[5], t2 * d[8]
         if len(contact):
             p = contact[node]
-            a, b, c, e, f, g = a + t2 * p[0], b + t2 * p[1], c + t2 * p[2], e + t2 * p[4], f + t2 * p[5], g + t2 * p[8]
+            a, b, c, e, f, g = (
+                a + t2 * p[0],
+                b + t2 * p[1],
+                c + t2 * p[2],
+                e + t2 * p[4],
+                f + t2 * p[5],
+                g + t2 * p[8],
+            )
         a, e, g = a + m, e + m, g + m
         u, v, w = e * g - f * f, c * f - b * g, b * f - c * e
         over = 1.0 / (a * u + b * v + c * w)
         inverse[i, 0], inverse[i, 1], inverse[i, 2] = over * u, over * v, over * w
-        inverse[i, 3], inverse[i, 4], inverse[i, 5] = over * v, over * (a * g - c * c), over * (b * c - a * f)
-        inverse[i, 6], inverse[i, 7], inverse[i, 8] = over * w, over * (b * c - a * f), over * (a * e - b * b)
+        inverse[i, 3], inverse[i, 4], inverse[i, 5] = (
+            over * v,
+            over * (a * g - c * c),
+            over * (b * c - a * f),
+        )
+        inverse[i, 6], inverse[i, 7], inverse[i, 8] = (
+            over * w,
+            over * (b * c - a * f),
+            over * (a * e - b * b),
+        )

@@ -34,7 +34,9 @@ class Bodies:
         ijk : (l, 3) grid indices of the local nodes
         """
         farthest = comm.allreduce(int(ijk.max(initial=0)), MPI.MAX)
-        room = 2 << farthest.bit_length()  # twice what they take, and a power of two, so on the coarser grids as well
+        room = (
+            2 << farthest.bit_length()
+        )  # twice what they take, and a power of two, so on the coarser grids as well
         return np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
 
 
@@ -44,7 +46,9 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
     moves, springs = ~to_host(lattice.pinned), lattice.springs
     both, either = moves[springs].all(axis=1), moves[springs].any(axis=1)
     joined = springs[both]
-    graph = coo_array((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2)
+    graph = coo_array(
+        (np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2
+    )
     part = connected_components(graph, directed=False)[1]
     name = _names(unknowns, part)
     table = SortedKeys(comm, name[: lattice.owned][moves[: lattice.owned]])
@@ -69,7 +73,9 @@ def _names(unknowns: Unknowns, part: Indices) -> Indices:
         least = np.full(part.max(initial=-1) + 1, np.iinfo(np.int64).max)
         np.minimum.at(least, part, name)
         lesser = least[part]
-        lesser[lattice.owned :] = np.minimum(lesser[lattice.owned :], to_owner.answer(lesser[asked]))
+        lesser[lattice.owned :] = np.minimum(
+            lesser[lattice.owned :], to_owner.answer(lesser[asked])
+        )
         is_new = comm.allreduce(bool((lesser < name).any()), MPI.LOR)
         name = lesser
     return name

@@ -28,7 +28,9 @@ from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
 HELD = 27  # code of an end that is no unknown; others are 9 i + 3 j + k of where they are in their coarse cell
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]  # of the nine numbers of a block, and of those six
-PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])  # of corners: the upper triangle of a cell's matrix
+PAIRS = np.array(
+    [(p, q) for p in range(8) for q in range(p, 8)]
+)  # of corners: the upper triangle of a cell's matrix
 
 
 def _weights() -> Rows:
@@ -55,7 +57,9 @@ class Products(NamedTuple):
 
 
 WEIGHTS = _weights()
-OF_SPRINGS = Products.of((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))  # by 28 times a code and another
+OF_SPRINGS = Products.of(
+    (WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8)
+)  # by 28 times a code and another
 OF_NODES = Products.of(WEIGHTS)
 
 
@@ -123,7 +127,8 @@ class GalerkinSum:
         self.weights, self.full = (like(lattice.nodes, a) for a in (t2**0.5 * WEIGHTS, SYMMETRIC))
         of_springs = OF_SPRINGS._replace(factor=t2 * OF_SPRINGS.factor)
         self.of_springs, self.of_nodes = (
-            Products(*(like(lattice.nodes, part) for part in products)) for products in (of_springs, OF_NODES)
+            Products(*(like(lattice.nodes, part) for part in products))
+            for products in (of_springs, OF_NODES)
         )
         first, second, places = self._pairs(grid, keys)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
@@ -136,14 +141,19 @@ class GalerkinSum:
         number = grid.table.find(encode_morton(decode_morton(keys)[:, None, :] + CORNERS))
         first, second = number[:, PAIRS[:, 0]], number[:, PAIRS[:, 1]]
         exists = (first >= 0) & (second >= 0)
-        pairs, places = (first * grid.table.total + second)[exists], np.full(exists.shape, -1, np.int32)
+        pairs, places = (
+            (first * grid.table.total + second)[exists],
+            np.full(exists.shape, -1, np.int32),
+        )
         places[exists] = np.arange(len(pairs))
         if on_host(self.unknowns.lattice.nodes):
             pairs, shared = np.unique(pairs, return_inverse=True)
             places[exists] = shared
         return pairs // grid.table.total, pairs % grid.table.total, places
 
-    def _create_matrix(self, grid: CoarseGrid, first: Indices, second: Indices, upper: Indices) -> PETSc.Mat:
+    def _create_matrix(
+        self, grid: CoarseGrid, first: Indices, second: Indices, upper: Indices
+    ) -> PETSc.Mat:
         comm = self.unknowns.comm
         refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
         matrix = PETSc.Mat().create(comm=comm)
@@ -151,7 +161,10 @@ class GalerkinSum:
         matrix.setBlockSize(3)
         matrix.setType(self.unknowns.memory.mat_type)
         matrix.setOption(PETSc.Mat.Option.SPD, True)
-        row, column = (3 * n[:, None] + c for n, c in ((first, np.repeat(range(3), 3)), (second, np.tile(range(3), 3))))
+        row, column = (
+            3 * n[:, None] + c
+            for n, c in ((first, np.repeat(range(3), 3)), (second, np.tile(range(3), 3)))
+        )
         rows = np.concatenate([row.ravel(), column[upper].ravel()])
         columns = np.concatenate([column.ravel(), row[upper].ravel()])
         preallocate_coo(matrix, rows, columns)
@@ -198,8 +211,13 @@ def _by_cell(
     corners = elasticity.corners
     ends = [springs[moving], free[:, None], corners]
     low = [ijk[nodes].min(axis=1) // 2 for nodes in ends]
-    along = [apart[nodes].max(axis=1) // 2 for nodes in ends]  # what is held is moved with what it holds
-    keys = [encode_morton(corner + [1, 0, 0] * by[:, None]) for corner, by in zip(low, along, strict=True)]
+    along = [
+        apart[nodes].max(axis=1) // 2 for nodes in ends
+    ]  # what is held is moved with what it holds
+    keys = [
+        encode_morton(corner + [1, 0, 0] * by[:, None])
+        for corner, by in zip(low, along, strict=True)
+    ]
     codes = [
         np.where(held[nodes], HELD, (ijk[nodes] - 2 * corner[:, None]) @ [9, 3, 1])
         for nodes, corner in zip(ends, low, strict=True)
@@ -213,7 +231,9 @@ def _by_cell(
 
 
 @kernel
-def add_springs(first: int, count: int, step: int, q: Positions, into: PairSum, springs: Springs) -> None:
+def add_springs(
+    first: int, count: int, step: int, q: Positions, into: PairSum, springs: Springs
+) -> None:
     values, places, (start, order, code), (begin, pair, factor) = into
     ends, rest, k = springs
     for i in range(first, count, step):
@@ -222,7 +242,14 @@ def add_springs(first: int, count: int, step: int, q: Positions, into: PairSum, 
             m, n = ends[s, 0], ends[s, 1]
             x, y, z = q[m, 0] - q[n, 0], q[m, 1] - q[n, 1], q[m, 2] - q[n, 2]
             c, ex, ey, ez = spring_block((x, y, z), rest[s], k[s], True)
-            xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
+            xx, xy, xz, yy, yz, zz = (
+                c + ex * ex,
+                ex * ey,
+                ex * ez,
+                c + ey * ey,
+                ey * ez,
+                c + ez * ez,
+            )
             for entry in range(begin[kind], begin[kind + 1]):
                 f, place = factor[entry], places[i, pair[entry]]
                 values[place, 0] += f * xx  # a view of the block would take as long again
@@ -247,7 +274,9 @@ def add_nodes(first: int, count: int, step: int, own: Rows, into: PairSum) -> No
 
 
 @kernel
-def add_solid(first: int, count: int, step: int, scratch: Array, into: CellSum, cells: CellRows) -> None:
+def add_solid(
+    first: int, count: int, step: int, scratch: Array, into: CellSum, cells: CellRows
+) -> None:
     """Add t^2 times the Hessians of cells, whose corners follow coarse cells.
 
     scratch : (s, 8, 14) of each coarse corner the strain of one component and what it does; cell i has row i % s

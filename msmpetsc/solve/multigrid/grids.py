@@ -51,7 +51,9 @@ def parents_of(ijk: Indices) -> tuple[Indices, Mask]:
     return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)), needed
 
 
-def grids(comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | None = None) -> list[CoarseGrid]:
+def grids(
+    comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | None = None
+) -> list[CoarseGrid]:
     """Return the grids above nodes at grid indices (n, 3), of ``total`` on all ranks, the finest first (collective).
 
     There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a
@@ -70,7 +72,12 @@ def grids(comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | 
 
 
 def interpolation(
-    comm: MPI.Comm, ijk: Indices, rows: Indices, row_sizes: tuple[int, int], grid: CoarseGrid, mat_type: str
+    comm: MPI.Comm,
+    ijk: Indices,
+    rows: Indices,
+    row_sizes: tuple[int, int],
+    grid: CoarseGrid,
+    mat_type: str,
 ) -> PETSc.Mat:
     """Return P (AIJ), from the values at a grid to those at finer nodes (collective).
 

@@ -30,14 +30,18 @@ from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 MOST = 100  # iterations of a long search
-SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
+SETTLED = (
+    0.95  # of the curvature when half as many iterations were done: there is no lower one to come
+)
 SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
 MORE = 1.25  # times the compression of the last long search, or its mode's curvature: another mode may be lowest
 ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none; a compression that is none
 
-Block = tuple[Rows, ...]  # directions (k, n), what H makes of them, and what M or the projected Hessian does
+Block = tuple[
+    Rows, ...
+]  # directions (k, n), what H makes of them, and what M or the projected Hessian does
 Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
 
 
@@ -103,11 +107,22 @@ class LowestCurvature:
     preconditioner : of the step's linear solves, or multigrid for a long search
     """
 
-    state: ClassVar[dict[str, Range]] = {"searched": ANY, "value": ANY, "knows_mode": (0, 1), "load": ANY}
+    state: ClassVar[dict[str, Range]] = {
+        "searched": ANY,
+        "value": ANY,
+        "knows_mode": (0, 1),
+        "load": ANY,
+    }
 
-    def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
+    def __init__(
+        self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner
+    ):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
-        self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
+        self.comm, self.unknowns, self.memory = (
+            functional.comm,
+            functional.unknowns,
+            functional.memory,
+        )
         self.its = 0  # of all searches so far
         self.products = 0  # of them with H, and at multigrid's finest level
         self.searched = Compressed()  # the compression that the last long search was at
@@ -115,7 +130,9 @@ class LowestCurvature:
         self.value = 0.0  # its curvature when it was found
         self.knows_mode = False  # in the last checkpoint
         self.load = np.inf  # load factor found last; infinite where none was
-        self.loads = np.zeros_like(functional.lattice.mass[self.unknowns.free])  # compression (m,) that it was found at
+        self.loads = np.zeros_like(
+            functional.lattice.mass[self.unknowns.free]
+        )  # compression (m,) that it was found at
         self.load_mode: Floats | None = None  # and its mode (n,)
         self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         self.rigid: Rows | None = None  # motions (6, n) that are left out
@@ -172,14 +189,20 @@ class LowestCurvature:
     ) -> tuple[Floats, Rows]:
         """The lowest curvatures (k,) and their modes (k, n), followed or searched for at length."""
         found, before = None, self.searched
-        more = compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
+        more = (
+            compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
+        )
         if not (alarm or more):  # in which case modes may have come
             found = self._followed()
         if found is None:
             # What was doubtful is so in the next step, too
-            self.searched = Compressed() if alarm else Compressed(compression.greatest, compression.total)
+            self.searched = (
+                Compressed() if alarm else Compressed(compression.greatest, compression.total)
+            )
             with self.preconditioner.searching(q, self.functional.problem.contact):
-                found = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
+                found = self._search_at_length(
+                    q, hint, EFFORT if alarm is Alarm.HERE else self.effort
+                )
         return found
 
     def _load(self, q: Positions, ratios: Floats) -> float:
@@ -188,7 +211,9 @@ class LowestCurvature:
         floor = NEGLIGIBLE * max(self.comm.allreduce(greatest(self.loads), MPI.MAX), DEPENDENT)
         growth = self.comm.allreduce(greatest(ratios / np.maximum(self.loads, floor)), MPI.MAX)
         load: float = UNSEEN * self.load * growth
-        is_heavy = MORE * UNSEEN * self.load > LIGHT  # so nearly that a search would soon be due again
+        is_heavy = (
+            MORE * UNSEEN * self.load > LIGHT
+        )  # so nearly that a search would soon be due again
         if not np.isfinite(load) or (not is_heavy and (growth > GROWN or load > LIGHT)):
             with self.preconditioner.searching(q, self.functional.problem.contact):
                 self.load = self._load_factor(q) if self.preconditioner.is_uniform else np.inf
@@ -198,11 +223,15 @@ class LowestCurvature:
     def _load_factor(self, q: Positions) -> float:
         """The greatest nu with H v = (1 - nu) H+ v, H+ the projected Hessian, found by a few iterations."""
         functional, hessian = self.functional, self.hessian
-        projected = TrueHessian(self.unknowns, functional.elasticity, functional.time_step, hessian.contact)
+        projected = TrueHessian(
+            self.unknowns, functional.elasticity, functional.time_step, hessian.contact
+        )
         projected.linearise(q, functional.problem.contact, True)
         known = [] if self.load_mode is None else [self.load_mode[None]]
         start = np.concatenate([*known, self._random(2 - len(known))])
-        values, modes = self._iterate(start, 2, MOST, UNIFORM_EFFORT.least - len(known), projected.mult)
+        values, modes = self._iterate(
+            start, 2, MOST, UNIFORM_EFFORT.least - len(known), projected.mult
+        )
         self.load_mode = modes[0].copy()
         hessian.products += projected.products
         return 1 - float(values[0])
@@ -217,10 +246,14 @@ class LowestCurvature:
         if abs(values[0] - self.value) <= UNCHANGED * self.value:
             # As it was, so that slow changes add up
             return np.array([self.value]), modes
-        values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
+        values, modes = self._iterate(
+            np.concatenate([self.mode[None], self._random(1)]), 2, its, its
+        )
         return None if values[0] > MORE * self.value else (values, modes)
 
-    def _search_at_length(self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort) -> tuple[Floats, Rows]:
+    def _search_at_length(
+        self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort
+    ) -> tuple[Floats, Rows]:
         """Search from something of each mode, for near a mode that is known a lower one comes up
         late, and without rigid motions, for their curvature mostly is about 1, which would hide a
         lower one as long; then from the best of all of them."""
@@ -234,13 +267,17 @@ class LowestCurvature:
             return self._iterate(np.concatenate([start, *known]), effort.block, MOST, effort.least)
         _, modes = self._iterate(self._without_rigid(start), effort.block, MOST, effort.least)
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
-        return self._iterate(np.concatenate([modes, *known, *rigid]), effort.block, MOST, effort.least // 2)
+        return self._iterate(
+            np.concatenate([modes, *known, *rigid]), effort.block, MOST, effort.least // 2
+        )
 
     def _random(self, count: int) -> Rows:
         """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
         return self._unit(self._of_each(self.preconditioner.apply, self.functional.noise(count)))
 
-    def _iterate(self, start: Rows, block: int, most: int, least: int, weigh: Act | None = None) -> tuple[Floats, Rows]:
+    def _iterate(
+        self, start: Rows, block: int, most: int, least: int, weigh: Act | None = None
+    ) -> tuple[Floats, Rows]:
         """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l,
         n), and theirs (k, n). They are of W^(-1) H, W what ``weigh`` applies, M if None."""
         size = min(block, len(start))
@@ -250,10 +287,14 @@ class LowestCurvature:
             residuals = x[1] - like(start, values)[:, None] * x[2]
             sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
             self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
-            residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])  # so that float32 holds them
+            residuals /= like(
+                residuals, np.maximum(sizes, TINY)[:, None]
+            )  # so that float32 holds them
             w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
             blocks = [x, self._block(w, weigh), *([] if last is None else [last])]
-            values, (x, last) = self._ritz(tuple(np.concatenate(parts) for parts in zip(*blocks, strict=True)), size)
+            values, (x, last) = self._ritz(
+                tuple(np.concatenate(parts) for parts in zip(*blocks, strict=True)), size
+            )
             lowest.append(values[0])
             self.its += len(w)
             if lowest[-1] < 0:
@@ -264,14 +305,18 @@ class LowestCurvature:
         return values, x[0]
 
     def _block(self, directions: Rows, weigh: Act | None) -> Block:
-        weighed = directions * self.functional.mass if weigh is None else self._of_each(weigh, directions)
+        weighed = (
+            directions * self.functional.mass if weigh is None else self._of_each(weigh, directions)
+        )
         return directions, self._of_each(self.hessian.mult, directions), weighed
 
     def _ritz(self, block: Block, size: int) -> tuple[Floats, tuple[Block, Block | None]]:
         """The lowest eigenvalues in the span of a block, ascending (size,); their directions, of unit length, and of
         each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products, weighed = block
-        grams = self.comm.allreduce(np.stack([to_host(span @ products.T), to_host(span @ weighed.T)]))
+        grams = self.comm.allreduce(
+            np.stack([to_host(span @ products.T), to_host(span @ weighed.T)])
+        )
         lengths = np.sqrt(np.maximum(grams[1].diagonal(), TINY))
         grams = grams / lengths / lengths[:, None]
         sizes, parts = np.linalg.eigh(0.5 * (grams[1] + grams[1].T))
@@ -295,10 +340,15 @@ class LowestCurvature:
         motions = np.zeros((6, *columns.shape), like=columns)
         for c in range(3):
             motions[c, c] = 1.0
-            motions[3 + c, (c + 1) % 3], motions[3 + c, (c + 2) % 3] = -columns[(c + 2) % 3], columns[(c + 1) % 3]
+            motions[3 + c, (c + 1) % 3], motions[3 + c, (c + 2) % 3] = (
+                -columns[(c + 2) % 3],
+                columns[(c + 1) % 3],
+            )
         motions = motions.reshape(6, -1)
         for _ in range(2):  # once more, for what the first left of rounding
-            sizes, parts = np.linalg.eigh(self.comm.allreduce(to_host((motions * self.functional.mass) @ motions.T)))
+            sizes, parts = np.linalg.eigh(
+                self.comm.allreduce(to_host((motions * self.functional.mass) @ motions.T))
+            )
             kept = sizes > DEPENDENT * sizes[-1]
             motions = like(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
         return motions

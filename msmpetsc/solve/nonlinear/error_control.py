@@ -43,8 +43,14 @@ KINDS = {
     NOT_FINITE: "not finite",
     -14: "not finite",  # from PETSc 3.25 on: DIVERGED_OBJECTIVE_NANORINF
 }
-REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
-KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
+REASON = {
+    value: name
+    for name, value in vars(PETSc.SNES.ConvergedReason).items()
+    if isinstance(value, int)
+}
+KSP_REASON = {
+    value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
+}
 
 
 @dataclass(frozen=True)
@@ -62,9 +68,13 @@ class Outcome:
     distance: float = 0.0  # |x - y|_M of it
     early: float = EARLY  # how many times the goal an error may be to be estimated
     corrected: bool = False
-    left: float = np.inf  # by the linear solve that led here, |r|_(P^-1); infinite where that says nothing
+    left: float = (
+        np.inf
+    )  # by the linear solve that led here, |r|_(P^-1); infinite where that says nothing
     solved: float = np.inf  # bound on what it left of |e|_H
-    beside: float = np.inf  # |F - r|_(M^-1), r what it left of F; infinite where g is no parabola there
+    beside: float = (
+        np.inf
+    )  # |F - r|_(M^-1), r what it left of F; infinite where g is no parabola there
     alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
     at_rounding: bool = False  # F is nothing but rounding
     doubts: int = 0
@@ -100,16 +110,27 @@ class ErrorControl:
     tightest: float  # ksp_rtol that no linear solve goes below
     ratio: float = FIRST_RATIO  # of bound to error in the last estimate
     solve_bound: SolveBound = field(default_factory=SolveBound)
-    has_residual: bool = False  # of the last linear solve, in estimate.residual until the iterate is judged
-    slack: float = 0.0  # bound on |e|_H over |r|_(P^-1) at the end of the last linear solve; 0: none
+    has_residual: bool = (
+        False  # of the last linear solve, in estimate.residual until the iterate is judged
+    )
+    slack: float = (
+        0.0  # bound on |e|_H over |r|_(P^-1) at the end of the last linear solve; 0: none
+    )
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """What is known at an iterate: its error, or a bound on it while that is far too large."""
-        residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
+        residual, distance = (
+            self.functional.dual_norm(iterate.f),
+            self.functional.distance(iterate.q),
+        )
         stays = residual > STAYS * before.residual
-        at_rounding = self.rounding.is_all_of(iterate, self.functional.problem.contact if stays else None)
+        at_rounding = self.rounding.is_all_of(
+            iterate, self.functional.problem.contact if stays else None
+        )
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
-        now = replace(before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm)
+        now = replace(
+            before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm
+        )
         now = replace(now, corrected=False, beside=np.inf, compression=None)
         if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
             return replace(now, error=0.0 if at_rounding else np.inf)
@@ -135,7 +156,9 @@ class ErrorControl:
         found = self.estimated(iterate, now, now.goal)
         if is_near or self.estimate.is_trusted:
             return found
-        return replace(found, error=now.bound)  # F is not what was left of it: g is no parabola here
+        return replace(
+            found, error=now.bound
+        )  # F is not what was left of it: g is no parabola here
 
     def _is_next_no_dearer(self, now: Outcome) -> bool:
         """Whether the next linear solve costs no more than an estimate, which is one itself, and leads on."""
@@ -159,20 +182,28 @@ class ErrorControl:
 
     def with_compression(self, iterate: Iterate, now: Outcome) -> Outcome:
         """Return the outcome of an iterate, with its compression."""
-        return now if now.compression else replace(now, compression=self.curvature.compression(iterate.q))
+        return (
+            now
+            if now.compression
+            else replace(now, compression=self.curvature.compression(iterate.q))
+        )
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
         distance = now.distance
         enough = EARLY * goal * distance if goal else np.inf
         trusted = LINEAR * now.left if self._is_smooth(now) else 0.0
-        length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance, trusted=trusted)
+        length = self.estimate(
+            iterate, now.residual, enough, KNOWN * goal * distance, trusted=trusted
+        )
         if not np.isfinite(length):
             return replace(now, error=now.bound, alarm=Alarm.HERE)
         is_known = now.bound <= self._farthest(now) or self.estimate.is_trusted
         if self.estimate.missing is None and is_known:
             self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
-        error = self.rounding.relative(length, self.functional.distance(iterate.q, self.estimate.correction))
+        error = self.rounding.relative(
+            length, self.functional.distance(iterate.q, self.estimate.correction)
+        )
         return replace(now, error=error, early=1.0, corrected=True)
 
     def _farthest(self, now: Outcome) -> float:
@@ -185,7 +216,9 @@ class ErrorControl:
 
     def led_by(self, ksp: PETSc.KSP, now: Outcome) -> Outcome:
         """What is known once a linear solve with the true Hessian has led to the next iterate."""
-        is_natural = ksp.getType() == PETSc.KSP.Type.CG and ksp.getNormType() == PETSc.KSP.NormType.NATURAL
+        is_natural = (
+            ksp.getType() == PETSc.KSP.Type.CG and ksp.getNormType() == PETSc.KSP.NormType.NATURAL
+        )
         now = replace(now, left=np.inf, solved=np.inf)
         if ksp.reason < 0 or not is_natural:
             return now
@@ -232,7 +265,15 @@ class ErrorControl:
         if not has_moved and goal < closest and not is_saddle:
             return None
         goal = max(goal, min(closest, now.goal)) if has_moved else goal
-        return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, left=np.inf, solved=np.inf, corrected=False)
+        return replace(
+            now,
+            goal=goal,
+            doubts=now.doubts + 1,
+            bound=np.inf,
+            left=np.inf,
+            solved=np.inf,
+            corrected=False,
+        )
 
     def forget(self, modes: bool) -> None:
         self.ratio = FIRST_RATIO
@@ -263,7 +304,11 @@ def not_converged(
 
 def no_minimum(now: Outcome, worst: str) -> StepFailed:
     """All that the step came to was no minimum, or farther from one than it seemed."""
-    seen = "a saddle or a fold" if np.isinf(now.error) else "a point farther from its solution than it seemed"
+    seen = (
+        "a saddle or a fold"
+        if np.isinf(now.error)
+        else "a point farther from its solution than it seemed"
+    )
     return StepFailed(
         f"did not come to a minimum: it came to {seen} {now.doubts} times, residual |F| = {now.residual:.2e}{worst}; "
         "try a smaller time.step, or another preset (newton)",

@@ -36,7 +36,9 @@ LOWER = 0.7  # of the least eigenvalue that some iterations of CG have come to
 GREATEST = 1.1  # eigenvalue of P^(-1) H, where P has all that H has: not contact that came up since
 FEW, MANY = 2, 4  # iterations: fewer have not come near the least eigenvalue; so many may have
 PROBED = 4  # iterations on noise, which an eigenvalue far below the others takes to show
-RISE = 2.0  # of it in a solve: where one had come to 5e-4, the next, of a few iterations, came to 0.38
+RISE = (
+    2.0  # of it in a solve: where one had come to 5e-4, the next, of a few iterations, came to 0.38
+)
 
 
 class ErrorEstimate:
@@ -45,7 +47,11 @@ class ErrorEstimate:
     state: ClassVar[dict[str, Range]] = {"floor": ANY}
 
     def __init__(
-        self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner, prefix: str
+        self,
+        functional: StepFunctional,
+        hessian: TrueHessian,
+        preconditioner: StepPreconditioner,
+        prefix: str,
     ):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.operator = python_matrix(functional.unknowns, hessian, functional.comm)
@@ -55,8 +61,12 @@ class ErrorEstimate:
         self.right_side: PETSc.Vec | None = None  # of the solve in progress, as the next four
         self.bound = self.enough = np.inf
         self.lowest, self.will_do = 1.0, 0.0
-        self.convexity = 1.0  # lowest eigenvalue of M^(-1) H that the step has come by, if it is below 1
-        self.trusted = self.begun = 0.0  # |F|_(P^-1) up to which that norm bounds errors, and as it was
+        self.convexity = (
+            1.0  # lowest eigenvalue of M^(-1) H that the step has come by, if it is below 1
+        )
+        self.trusted = self.begun = (
+            0.0  # |F|_(P^-1) up to which that norm bounds errors, and as it was
+        )
         self.missing: float | None = None  # of a length that will do
         self.least = 0.0  # eigenvalue of P^(-1) H that CG has come to; 0 where none is known
         self.floor = np.inf  # that it has come to on noise; infinite where that was not tried
@@ -150,7 +160,9 @@ class ErrorEstimate:
 
     def _will_do(self, length: float, residual: float) -> bool:
         """Whether |e_k|_M, here ``length``, and all that may be missing are together less than will do."""
-        if length + residual > self.will_do:  # as the preconditioner is no more than M^(-1), |r_k|_(M^-1) is no less
+        if (
+            length + residual > self.will_do
+        ):  # as the preconditioner is no more than M^(-1), |r_k|_(M^-1) is no less
             return False
         missing = self._missing(residual)
         is_unknown = missing > length and self.trusted >= self.begun > STRAIGHT * self.trusted
@@ -171,7 +183,9 @@ class ErrorEstimate:
         if not self.is_trusted:
             return missing
         least = LOWER * self._least(self.ksp)
-        if not least > 0 or self.preconditioner.least_norm(self.residual) > residual / np.sqrt(least):
+        if not least > 0 or self.preconditioner.least_norm(self.residual) > residual / np.sqrt(
+            least
+        ):
             return missing
         return min(missing, float(residual / np.sqrt(least * self.lowest)))
 
@@ -192,7 +206,9 @@ class ErrorEstimate:
     def _probe(self) -> None:
         """Look for an eigenvalue of P^(-1) H far below the others by CG on noise, which has something of each mode: the
         few iterations of a step's solve miss one of 2e-5, as a cell has that hangs by an edge."""
-        self.functional.memory.write(self.residual)[:] = self.functional.mass * self.functional.noise(1)[0]
+        self.functional.memory.write(self.residual)[:] = (
+            self.functional.mass * self.functional.noise(1)[0]
+        )
         self.is_probe = True
         self.ksp.solve(self.residual, self.correction)
         self.is_probe = False
@@ -210,7 +226,9 @@ class ErrorEstimate:
         """Whether e is near in the norm of H, as far as CG can show."""
         least = ksp.computeExtremeSingularValues()[1]
         energy = ksp.getSolution().dot(self.right_side)
-        if not (min(least, energy) > 0 and residual < CLOSE * np.sqrt(self.lowest * least * energy)):
+        if not (
+            min(least, energy) > 0 and residual < CLOSE * np.sqrt(self.lowest * least * energy)
+        ):
             return False
         if not self._left() < LEFT * self.lengths[ksp.its]:
             return False

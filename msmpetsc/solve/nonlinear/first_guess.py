@@ -14,8 +14,12 @@ class FirstGuess:
 
     def __init__(self, functional: StepFunctional, extrapolate: bool):
         self.functional, self.extrapolate = functional, extrapolate
-        self.holds = functional.unknowns.total < functional.lattice.table.total  # some nodes are no unknowns
-        self.corrections: list[Positions] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
+        self.holds = (
+            functional.unknowns.total < functional.lattice.table.total
+        )  # some nodes are no unknowns
+        self.corrections: list[
+            Positions
+        ] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
 
     def best(self) -> Positions:
         """The start (l, 3) [m] of the step that the functional has begun (collective).
@@ -70,7 +74,11 @@ class FirstGuess:
     def held(self, guess: Positions) -> Positions:
         """The guess, but with the held nodes where they will be."""
         lattice = self.functional.lattice
-        return np.where(lattice.pinned[:, None], self.functional.problem.fixed, guess) if self.holds else guess
+        return (
+            np.where(lattice.pinned[:, None], self.functional.problem.fixed, guess)
+            if self.holds
+            else guess
+        )
 
     def drift(self, moved: Rows) -> Floats | float:
         """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""

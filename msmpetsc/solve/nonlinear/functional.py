@@ -25,7 +25,9 @@ SINGLE_ROW = 10.0  # times as much in a single row
 NEGLIGIBLE = 1e-6  # of the body's size: rounding that moves it less is of no concern
 # Greatest coordinates of the body that a load may move a node by: beyond, no digits of its shape are left.
 FARTHEST = 1e6
-HOPELESS = 0.3  # of what its forces move a body: rounding that moves it more leaves no step to speak of
+HOPELESS = (
+    0.3  # of what its forces move a body: rounding that moves it more leaves no step to speak of
+)
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,9 @@ class StepFunctional:
     Positions are (l, 3) [m], ghosts included; vectors are of unknowns (solve.linear.unknowns).
     """
 
-    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):
+    def __init__(
+        self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float
+    ):
         self.comm, self.unknowns, self.elasticity = comm, unknowns, elasticity
         self.time_step, self.t2 = time_step, time_step**2
         self.lattice, self.memory = unknowns.lattice, unknowns.memory
@@ -146,7 +150,9 @@ class StepFunctional:
             if problem.contact:
                 with CONTACT:
                     elastic += problem.contact.change(q, base)
-            change, squared = self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))]))
+            change, squared = self.comm.allreduce(
+                np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])
+            )
         return change, squared
 
     @property
@@ -169,7 +175,9 @@ class StepFunctional:
         lattice, free = self.lattice, to_host(self.unknowns.free)
         numbers = lattice.global_numbers[: lattice.owned][free]
         seeds = lattice.table.total * np.arange(count)
-        return like(self.mass, np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds]))
+        return like(
+            self.mass, np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
+        )
 
     def _inner(self, a: Rows, b: Rows) -> float:
         """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""
@@ -177,7 +185,9 @@ class StepFunctional:
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """|v|_M = sqrt(v^T M v)."""
-        return float(np.sqrt(self.comm.allreduce(float(self.memory.read(displacement) ** 2 @ self.mass))))
+        return float(
+            np.sqrt(self.comm.allreduce(float(self.memory.read(displacement) ** 2 @ self.mass)))
+        )
 
     def dual_norm(self, f: PETSc.Vec) -> float:
         """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
@@ -209,7 +219,9 @@ class Rounding:
     def __init__(self, functional: StepFunctional, diagonal: Floats):
         self.functional, self.comm, self.diagonal = functional, functional.comm, diagonal
         self.rows = np.tile(ROUNDINGS * diagonal, 3)  # of F [kg m] for each metre of a coordinate
-        stiffness, mass = self.comm.allreduce(np.array([3 * float(diagonal.sum()), float(functional.mass.sum())]))
+        stiffness, mass = self.comm.allreduce(
+            np.array([3 * float(diagonal.sum()), float(functional.mass.sum())])
+        )
         # Springs or cells whose forces are k eps off move nodes by no more than sqrt(sum t^2 k) eps in the norm of H
         # where that is positive definite, and in that of M no farther; the diagonal is no less than the sum.
         self.moved, self.size = float(ROUNDINGS * np.sqrt(stiffness)), float(np.sqrt(mass))
@@ -233,8 +245,12 @@ class Rounding:
         """
         functional, known = self.functional, self.rows
         if contact:
-            known = known + np.tile(ROUNDINGS * functional.t2 * contact.bound(iterate.q)[functional.unknowns.free], 3)
-        rows = np.abs(functional.memory.read(iterate.f)) / (known * max(functional.extent, np.finfo(float).tiny))
+            known = known + np.tile(
+                ROUNDINGS * functional.t2 * contact.bound(iterate.q)[functional.unknowns.free], 3
+            )
+        rows = np.abs(functional.memory.read(iterate.f)) / (
+            known * max(functional.extent, np.finfo(float).tiny)
+        )
         squares, count = self.comm.allreduce(np.array([float(rows @ rows), rows.size]))
         return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= SINGLE_ROW)
 

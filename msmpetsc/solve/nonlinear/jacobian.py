@@ -11,7 +11,13 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.contact.obstacles.penalty import Contact, Duals
 from msmpetsc.errors import InputError
-from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, assemble, python_matrix
+from msmpetsc.solve.linear.operators import (
+    ContactBlocks,
+    ThreeColumns,
+    TrueHessian,
+    assemble,
+    python_matrix,
+)
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,
@@ -41,23 +47,39 @@ class Jacobian:
 
     def __post_init__(self) -> None:
         functional, options, true_hessian = self.functional, self.options, self.preset.true_hessian
-        self.comm, self.unknowns, elasticity = functional.comm, functional.unknowns, functional.elasticity
+        self.comm, self.unknowns, elasticity = (
+            functional.comm,
+            functional.unknowns,
+            functional.elasticity,
+        )
         self.diagonal = self._diagonal()
-        self.hessian = TrueHessian(self.unknowns, elasticity, functional.time_step, self._contact_blocks())
+        self.hessian = TrueHessian(
+            self.unknowns, elasticity, functional.time_step, self._contact_blocks()
+        )
         self.blocks = None if true_hessian else self._contact_blocks()  # that go with A
         chooses = self.preset.chooses and options.is_default("pc_type")
         kind = options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
-            raise InputError(f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; of A there is gamg")
-        context = self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)
+            raise InputError(
+                f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; of A there is gamg"
+            )
+        context = (
+            self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)
+        )
         self.operator = python_matrix(self.unknowns, context, self.comm)
         self.owned.callback(self.operator.destroy)
-        of_lattice = partial(LatticePreconditioner, self.unknowns, elasticity, functional.time_step, options.prefix)
-        mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
+        of_lattice = partial(
+            LatticePreconditioner, self.unknowns, elasticity, functional.time_step, options.prefix
+        )
+        mass, inertia = (
+            m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia)
+        )
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
         is_held = self.unknowns.total < self.unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
-        self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio, self.unknowns.total)
+        self.preconditioner = StepPreconditioner(
+            self._of_matrix, of_lattice, kind, chooses, ratio, self.unknowns.total
+        )
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
@@ -71,7 +93,9 @@ class Jacobian:
         if self.touches:  # contact changes what A is preconditioned with, but not A
             matrix = matrix.copy()
             self.owned.callback(matrix.destroy)
-        return Preconditioner(matrix, self.unknowns, self.options.prefix, self.functional.time_step, self.touches)
+        return Preconditioner(
+            matrix, self.unknowns, self.options.prefix, self.functional.time_step, self.touches
+        )
 
     def _contact_blocks(self) -> ContactBlocks | None:
         return ContactBlocks(self.unknowns, self.functional.time_step) if self.touches else None
@@ -82,11 +106,18 @@ class Jacobian:
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         self.functional.elasticity.add_bound(lattice.nodes, blocks)
         stiffness = blocks[unknowns.free][:, [0, 4, 8]].sum(axis=1)
-        diagonal: Floats = unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
+        diagonal: Floats = (
+            unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
+        )
         return diagonal
 
     def linearise(
-        self, q: Positions, contact: Contact | None, projected: bool, duals: Duals | None, known: bool = False
+        self,
+        q: Positions,
+        contact: Contact | None,
+        projected: bool,
+        duals: Duals | None,
+        known: bool = False,
     ) -> None:
         """Take the Jacobian at positions q (l, 3) [m] (collective): A is constant, only H and contact depend on q.
 

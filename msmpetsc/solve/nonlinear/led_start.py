@@ -48,7 +48,9 @@ class LedStart:
     vectors : three of unknowns, that are written to
     """
 
-    def __init__(self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP, vectors: Vectors):
+    def __init__(
+        self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP, vectors: Vectors
+    ):
         self.functional, self.jacobian, self.ksp, self.vectors = functional, jacobian, ksp, vectors
         self.most_its = ksp.getTolerances()[3]
 
@@ -86,12 +88,18 @@ class LedStart:
         """Return how far nodes go in the step, (l, 3) [m]: with obstacles that they touch, or by ``moved``."""
         functional, q = self.functional, self.functional.problem.q
         owned = contacts.points.distances(q, contacts.begin) - contacts.law.distance
-        distances, times = with_ghosts(functional.comm, functional.lattice, owned), (contacts.begin, contacts.time)
+        distances, times = (
+            with_ghosts(functional.comm, functional.lattice, owned),
+            (contacts.begin, contacts.time),
+        )
         return contacts.obstacles.carried(q, moved, times, distances, functional.lattice.cell_size)
 
     def _cushion(self, contacts: Contacts) -> float:
         """Return the distance [m] from which obstacles push bodies that are led: the farthest way of a held part."""
-        problem, obstacles = self.functional.problem, contacts.obstacles.way(contacts.begin, contacts.time)
+        problem, obstacles = (
+            self.functional.problem,
+            contacts.obstacles.way(contacts.begin, contacts.time),
+        )
         held = self.functional.comm.allreduce(greatest(np.abs(problem.fixed - problem.q)), MPI.MAX)
         return float(max(held, greatest(np.abs(obstacles)), contacts.law.distance))
 
@@ -105,7 +113,10 @@ class LedStart:
             for _ in range(PATIENCE):
                 now = begin + s * (end - begin)
                 left = np.where(is_held, (1 - s) * (problem.fixed - problem.q), 0.0)
-                contacts.time, functional.problem = now, replace(problem, prescribed=problem.fixed - left)
+                contacts.time, functional.problem = (
+                    now,
+                    replace(problem, prescribed=problem.fixed - left),
+                )
                 for _ in range(CORRECTIONS):
                     way = self._direction(q, np.zeros_like(left), still)
                     q = q + functional.free_share(q, q + way) * way
@@ -128,7 +139,11 @@ class LedStart:
 
         held, obstacles : how far held nodes (l, 3) and obstacles' points (o, 3) go along it [m]
         """
-        functional, unknowns, (x, change, f) = self.functional, self.functional.unknowns, self.vectors
+        functional, unknowns, (x, change, f) = (
+            self.functional,
+            self.functional.unknowns,
+            self.vectors,
+        )
         contact = functional.problem.contact
         assert contact is not None and contact.surface is not None
         if Stop.agreed(functional.comm):

@@ -90,7 +90,9 @@ class LocalGlobal(StepMethod):
         end = self.functional.vectors.take()
         end.waxpy(-1.0, y, x)
         with LOCAL:
-            share = self.functional.free_share(self.functional.positions(x), self.functional.positions(end))
+            share = self.functional.free_share(
+                self.functional.positions(x), self.functional.positions(end)
+            )
         self.functional.vectors.give_back(end)
         if share < 1.0:
             y.scale(share)

@@ -9,7 +9,13 @@ from petsc4py import PETSc
 
 from msmpetsc.comm import Stop
 from msmpetsc.errors import StepStopped
-from msmpetsc.solve.nonlinear.error_control import NOT_FINITE, ErrorControl, Outcome, not_converged, where_worst
+from msmpetsc.solve.nonlinear.error_control import (
+    NOT_FINITE,
+    ErrorControl,
+    Outcome,
+    not_converged,
+    where_worst,
+)
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
@@ -54,7 +60,11 @@ class StepMethod(ABC):
         if outcome.at_rounding:
             return int(REASON.CONVERGED_FNORM_ABS)
         if outcome.is_enough:
-            return int(REASON.CONVERGED_SNORM_RELATIVE if outcome.corrected else REASON.CONVERGED_FNORM_RELATIVE)
+            return int(
+                REASON.CONVERGED_SNORM_RELATIVE
+                if outcome.corrected
+                else REASON.CONVERGED_FNORM_RELATIVE
+            )
         if self.budget and its >= self.budget:
             return int(REASON.CONVERGED_ITS)
         if Stop.agreed(self.functional.comm):
@@ -68,7 +78,9 @@ class StepMethod(ABC):
         """Let the next linear solve leave as much as the step can do with; the user's own tolerances win."""
         if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
             rtol, atol = self.control.tolerances(outcome)
-            self.ksp.setTolerances(rtol=rtol, atol=None if self.options.is_given("ksp_atol") else atol)
+            self.ksp.setTolerances(
+                rtol=rtol, atol=None if self.options.is_given("ksp_atol") else atol
+            )
 
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
         """Return the outcome of a method that has ended by SNES's reason. Raises StepStopped and StepFailed."""
@@ -79,5 +91,7 @@ class StepMethod(ABC):
             if Stop.agreed(self.functional.comm):
                 raise StepStopped("stopped by a signal")
             worst = where_worst(self.functional, iterate)
-            raise not_converged(self.snes, self.ksp, outcome, self.snes.its, worst, self.preset.true_hessian)
+            raise not_converged(
+                self.snes, self.ksp, outcome, self.snes.its, worst, self.preset.true_hessian
+            )
         return outcome

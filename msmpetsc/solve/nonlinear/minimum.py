@@ -40,9 +40,18 @@ class Minimum:
     """Examines the iterates that a stepper comes to. All methods are collective."""
 
     def __init__(
-        self, functional: StepFunctional, estimate: ErrorEstimate, curvature: LowestCurvature, rounding: Rounding
+        self,
+        functional: StepFunctional,
+        estimate: ErrorEstimate,
+        curvature: LowestCurvature,
+        rounding: Rounding,
     ):
-        self.functional, self.estimate, self.curvature, self.rounding = functional, estimate, curvature, rounding
+        self.functional, self.estimate, self.curvature, self.rounding = (
+            functional,
+            estimate,
+            curvature,
+            rounding,
+        )
         self.memory, self.first = functional.memory, functional.vectors.take()
 
     def examine(self, at: Iterate, outcome: Outcome, enough: float) -> Verdict:
@@ -77,12 +86,16 @@ class Minimum:
         length, rest = functional.norm(first), functional.dual_norm(nearer.f) / value
         # A bound, if g is as convex from there on
         if value > CONVEX and length + rest <= KNOWN * enough:
-            return Verdict(self.rounding.relative(length + rest, functional.distance(nearer.q)), nearer)
+            return Verdict(
+                self.rounding.relative(length + rest, functional.distance(nearer.q)), nearer
+            )
         if corrected and estimate.missing is not None and value <= CONVEX:
             closely = bool(np.isfinite(estimate(at, functional.dual_norm(at.f), np.inf)))
             return self.examine(at, replace(outcome, corrected=closely), enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
-            return Verdict(self.rounding.relative(estimate.length, functional.distance(nearer.q)), nearer)
+            return Verdict(
+                self.rounding.relative(estimate.length, functional.distance(nearer.q)), nearer
+            )
         return Verdict(self._second_estimate(nearer, first, rest, enough, value), nearer)
 
     def _follow(self, at: Iterate) -> Iterate | None:
@@ -126,8 +139,13 @@ class Minimum:
             return DOUBTFUL * relative(max(first, second), distance)
         if estimate.missing is not None:
             return relative(first + second, distance)
-        correction.axpy(second / max(functional.norm(estimate.correction), sys.float_info.min), estimate.correction)
-        return relative(functional.norm(correction), functional.distance(nearer.q, estimate.correction))
+        correction.axpy(
+            second / max(functional.norm(estimate.correction), sys.float_info.min),
+            estimate.correction,
+        )
+        return relative(
+            functional.norm(correction), functional.distance(nearer.q, estimate.correction)
+        )
 
     def go_on(self, at: Iterate, verdict: Verdict) -> Iterate | None:
         """Return an iterate where g is lower than at one that is no minimum; None where there is none.
@@ -147,13 +165,17 @@ class Minimum:
         slope = functional.comm.allreduce(float(self.memory.read(at.f) @ direction))
         longest = float(functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
-        if slope > SLOPE * abs(curvature) * move:  # else both ways lead down, and ranks must not differ
+        if (
+            slope > SLOPE * abs(curvature) * move
+        ):  # else both ways lead down, and ranks must not differ
             move = -move
         x, best, lowest = functional.vectors.take(), 0.0, 0.0
         for _ in range(MOVES):
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
             q = functional.positions(x)
-            change = functional.change(q, base)[0] if functional.free_share(base, q) == 1.0 else np.inf
+            change = (
+                functional.change(q, base)[0] if functional.free_share(base, q) == 1.0 else np.inf
+            )
             if change < lowest:
                 best, lowest = move, change
                 move *= 2

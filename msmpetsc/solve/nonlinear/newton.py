@@ -39,7 +39,12 @@ DOWNHILL = 0.1
 RAISED = 2.0
 KSP = PETSc.KSP.ConvergedReason
 # Of KSP: no direction at all
-USELESS = (KSP.DIVERGED_NANORINF, KSP.DIVERGED_PCSETUP_FAILED, KSP.DIVERGED_BREAKDOWN, KSP.DIVERGED_NULL)
+USELESS = (
+    KSP.DIVERGED_NANORINF,
+    KSP.DIVERGED_PCSETUP_FAILED,
+    KSP.DIVERGED_BREAKDOWN,
+    KSP.DIVERGED_NULL,
+)
 
 
 @dataclass(eq=False)
@@ -109,13 +114,17 @@ class Newton(StepMethod):
         if self.overshot:
             return int(REASON.CONVERGED_ITS)
         most = snes.getTolerances()[3]
-        return self.reason_to_end(its, outcome) or (int(REASON.DIVERGED_MAX_IT) if its == most else 0)
+        return self.reason_to_end(its, outcome) or (
+            int(REASON.DIVERGED_MAX_IT) if its == most else 0
+        )
 
     def _linearise(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
         """Take H at an iterate, and let CG begin with the correction that an estimate found there, if any."""
         known = outcome.corrected and not projected
         with LOCAL:
-            self.jacobian.linearise(now.q, self.functional.problem.contact, projected, self.friction.duals, known)
+            self.jacobian.linearise(
+                now.q, self.functional.problem.contact, projected, self.friction.duals, known
+            )
             if self.slopes is not None and not (known or projected):
                 self.jacobian.hessian.take_slopes(self.slopes)
             self.slopes = None

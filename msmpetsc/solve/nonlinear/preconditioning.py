@@ -31,9 +31,13 @@ DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
 USUAL = 0.1  # ksp_rtol
 LARGE = 1000  # free nodes: from there on a search with multigrid is the faster
-USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
+USUAL_PACE = (
+    2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
+)
 WORTH = 10.0  # iterations that a new hierarchy takes the time of
-PATIENCE = 15.0  # iterations beyond its pace that a solve with an old one is given: one took 2,300 else
+PATIENCE = (
+    15.0  # iterations beyond its pace that a solve with an old one is given: one took 2,300 else
+)
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
 
 
@@ -50,7 +54,9 @@ class Preconditioner:
     added   : (m,) what is added to it, over t^2 [N/m]
     """
 
-    def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, prefix: str, time_step: float, touches: bool):
+    def __init__(
+        self, matrix: PETSc.Mat, unknowns: Unknowns, prefix: str, time_step: float, touches: bool
+    ):
         self.matrix, self.unknowns, self.t2, self.touches = matrix, unknowns, time_step**2, touches
         self.blocks: list[Block] = []
         self.pc = PETSc.PC().create(matrix.comm)
@@ -66,7 +72,9 @@ class Preconditioner:
         if not self.touches:
             return False
         lattice = self.unknowns.lattice
-        bound = (contact.bound(q) if contact else np.zeros(lattice.owned, like=q))[self.unknowns.free]
+        bound = (contact.bound(q) if contact else np.zeros(lattice.owned, like=q))[
+            self.unknowns.free
+        ]
         changed = bool(lattice.table.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR))
         if changed:
             self.added = bound
@@ -135,7 +143,11 @@ class LatticePreconditioner:
 
     def most_iterations(self, rtol: float) -> int | None:
         """Iterations of a solve to a relative tolerance that this hierarchy is given; None where it is of this x."""
-        return None if self.is_new or self.pace is None else int(self.pace * _digits(rtol) + PATIENCE - self.wasted)
+        return (
+            None
+            if self.is_new or self.pace is None
+            else int(self.pace * _digits(rtol) + PATIENCE - self.wasted)
+        )
 
     def learn(self, its: int, rtol: float) -> None:
         """Take note of the iterations that a linear solve took to a relative tolerance.
@@ -164,7 +176,9 @@ class LatticePreconditioner:
         if self.translations is None or contact is None:
             return self.translations is not None
         surface = contact.surface
-        alone = len(self.multigrid.bodies.free) == 1 and not (surface and surface.contacts.obstacles.total)
+        alone = len(self.multigrid.bodies.free) == 1 and not (
+            surface and surface.contacts.obstacles.total
+        )
         if surface and not alone and surface.presses(q):
             return False  # of one body alone it moves the middle no more than springs do
         pressed = any(len(nodes) for nodes, _ in contact.hessian(q))
@@ -232,7 +246,9 @@ class StepPreconditioner:
         if self.is_chosen:
             self.multigrid = self.make_multigrid()
         elif self.chooses and expected > LONG:
-            self._choose(f"t^2 k / m = {self.ratio:.3g}: Jacobi's would take some {expected:.0f} iterations a solve")
+            self._choose(
+                f"t^2 k / m = {self.ratio:.3g}: Jacobi's would take some {expected:.0f} iterations a solve"
+            )
         else:
             self.of_matrix = self.make_of_matrix()
 
@@ -244,7 +260,13 @@ class StepPreconditioner:
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """Take positions q (l, 3) [m]; whether that changed what is preconditioned with."""
-        if self.chooses and not self.is_chosen and contact and contact.surface and contact.surface.presses(q):
+        if (
+            self.chooses
+            and not self.is_chosen
+            and contact
+            and contact.surface
+            and contact.surface.presses(q)
+        ):
             self._choose("the surface presses on itself")
         return self.in_use.prepare(q, contact)
 
@@ -256,7 +278,11 @@ class StepPreconditioner:
     @property
     def products(self) -> int:
         """Products with the Hessian so far."""
-        return sum(lattice.multigrid.fine.products for lattice in (self.multigrid, self.for_searches) if lattice)
+        return sum(
+            lattice.multigrid.fine.products
+            for lattice in (self.multigrid, self.for_searches)
+            if lattice
+        )
 
     @contextmanager
     def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
@@ -279,7 +305,9 @@ class StepPreconditioner:
     def _choose(self, reason: str) -> None:
         self.is_chosen = True
         if self.multigrid is None:  # else it was chosen before, and forgotten
-            log.info("preconditioner: multigrid on the lattice (%s; -pc_type jacobi keeps to it)", reason)
+            log.info(
+                "preconditioner: multigrid on the lattice (%s; -pc_type jacobi keeps to it)", reason
+            )
             self.multigrid = self.make_multigrid()
 
     @property

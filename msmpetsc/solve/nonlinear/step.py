@@ -15,7 +15,13 @@ from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl, Outcome, no_minimum, where_worst
+from msmpetsc.solve.nonlinear.error_control import (
+    DEFAULT_ERROR,
+    ErrorControl,
+    Outcome,
+    no_minimum,
+    where_worst,
+)
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
@@ -100,12 +106,16 @@ class Stepper:
         self.options = SolverOptions(self.preset, self.prefix, self.budget)
         try:
             with petsc_errors("PETSc refuses its options"):
-                self.jacobian = Jacobian(self.functional, self.preset, self.options, self.touches, self.owned)
+                self.jacobian = Jacobian(
+                    self.functional, self.preset, self.options, self.touches, self.owned
+                )
                 self.snes, self.ksp = self._create_solvers()
                 self.control, self.minimum = self._create_control()
                 self.method = self._create_method()
                 take = self.functional.vectors.take
-                self.led_start = LedStart(self.functional, self.jacobian, self.ksp, (take(), take(), take()))
+                self.led_start = LedStart(
+                    self.functional, self.jacobian, self.ksp, (take(), take(), take())
+                )
         except InputError:
             self.destroy()
             raise
@@ -126,7 +136,9 @@ class Stepper:
         ksp = self._keep(inner.getKSP())
         ksp.setOptionsPrefix(prefix)
         pc = self._keep(ksp.getPC())
-        pc.setOptionsPrefix(f"{prefix}three_columns_")  # leaves the bare -pc_ to the preconditioner of A
+        pc.setOptionsPrefix(
+            f"{prefix}three_columns_"
+        )  # leaves the bare -pc_ to the preconditioner of A
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
         snes.setFromOptions()
@@ -138,7 +150,11 @@ class Stepper:
     def _refuse_of_snes(self) -> None:
         """Raise InputError for options of SNES that Newton's method has no use for."""
         given = PETSc.Options().getAll().items()
-        options = {name.removeprefix(self.prefix): value for name, value in given if name.startswith(self.prefix)}
+        options = {
+            name.removeprefix(self.prefix): value
+            for name, value in given
+            if name.startswith(self.prefix)
+        }
         for name, value in options.items():
             if name.startswith(OF_SNES) and LOOP.get(name) != value:
                 raise InputError(
@@ -157,7 +173,9 @@ class Stepper:
         if error is None and not self.budget:
             error = DEFAULT_ERROR
         tightest = self.ksp.getTolerances()[0]
-        return ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest), minimum
+        return ErrorControl(
+            functional, estimate, curvature, rounding, error or 0.0, tightest
+        ), minimum
 
     def _create_method(self) -> Newton | LocalGlobal:
         given = (
@@ -178,7 +196,9 @@ class Stepper:
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
-            self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
+            self.jacobian.hessian.linearise(
+                self.lattice.nodes, None
+            )  # Chebyshev's method tries it, for eigenvalues
             self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
             self.ksp.setOperators(self.jacobian.operator)
             self.ksp.setUp()
@@ -226,7 +246,9 @@ class Stepper:
         multigrid.balance(now.q, self.functional.problem.contact, now.f, x)
         balanced = self.functional.iterate(x)
         share = self.functional.free_share(now.q, balanced.q)
-        return balanced if share == 1.0 else self.functional.at(now.q + share * (balanced.q - now.q))
+        return (
+            balanced if share == 1.0 else self.functional.at(now.q + share * (balanced.q - now.q))
+        )
 
     def _first(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
         """Bring F down to the goal from a step's start (collective). Raises StepFailed and InputError.
@@ -234,14 +256,20 @@ class Stepper:
         If the first iteration of a static state overshoots, solids of a smaller lambda lead on to the solution.
         """
         newton = self.method
-        if not (isinstance(newton, Newton) and self.static and self.stiffest > 2 and not self.budget):
+        if not (
+            isinstance(newton, Newton) and self.static and self.stiffest > 2 and not self.budget
+        ):
             return self.method.minimise(start, outcome)
         newton.watches = True
         try:
             now, reached = newton.minimise(start, outcome)
         finally:
             newton.watches = False
-        return newton.minimise(self._softened(newton, now), outcome) if newton.overshot else (now, reached)
+        return (
+            newton.minimise(self._softened(newton, now), outcome)
+            if newton.overshot
+            else (now, reached)
+        )
 
     def _softened(self, newton: Newton, now: Iterate) -> Iterate:
         """Return the iterate of the greatest lambda below the solid's own. Raises StepFailed.
@@ -275,7 +303,12 @@ class Stepper:
         ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
         proof = self.control.estimate.products + self.minimum.curvature.products
-        return Work(iterations=self.method.iterations, ksp_its=ksp_its, products=products, proof_products=proof)
+        return Work(
+            iterations=self.method.iterations,
+            ksp_its=ksp_its,
+            products=products,
+            proof_products=proof,
+        )
 
     def spent(self) -> Work:
         """Return the work of the step in progress so far."""
@@ -291,10 +324,14 @@ class Stepper:
             return Verdict(outcome.error, now, is_minimum=True)
         enough = control.target * self.functional.distance(now.q) if control.target else np.inf
         verdict = self.minimum.examine(now, outcome, enough)
-        will_do = verdict.error <= control.target or (outcome.at_rounding and not np.isinf(verdict.error))
+        will_do = verdict.error <= control.target or (
+            outcome.at_rounding and not np.isinf(verdict.error)
+        )
         return replace(verdict, is_minimum=bool(self.budget) or will_do)
 
-    def _leave(self, now: Iterate, verdict: Verdict, outcome: Outcome) -> tuple[Iterate, Outcome] | None:
+    def _leave(
+        self, now: Iterate, verdict: Verdict, outcome: Outcome
+    ) -> tuple[Iterate, Outcome] | None:
         """Return an iterate of lower g to go on from, and its outcome so far (collective).
 
         None where g has no digits left to tell the two apart: the step is as good as the verdict says.

@@ -51,7 +51,9 @@ def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
             raise InputError(f"--device cuda (-{OPTION} {wanted}): {lacking}")
     import cupy
 
-    cupy.cuda.Device(PETSc.COMM_WORLD.rank % cupy.cuda.runtime.getDeviceCount()).use()  # of several the one PETSc takes
+    cupy.cuda.Device(
+        PETSc.COMM_WORLD.rank % cupy.cuda.runtime.getDeviceCount()
+    ).use()  # of several the one PETSc takes
     if AWARE not in PETSc.Options().getAll():
         # Not all MPI know GPUs, and without one PETSc stops at the first device use. It has read its options by now.
         ctypes.c_bool.in_dll(petsc_library(), AWARE).value = False
@@ -75,7 +77,9 @@ def missing_cuda() -> str | None:
         return f"{error.name or 'CuPy'} cannot be imported; pip install 'msmpetsc[cuda]' brings it"
     try:
         return None if cupy.cuda.runtime.getDeviceCount() else "no GPU is seen"
-    except Exception as error:  # of CuPy, of the runtime or of what loads it: no driver, one too old, no library
+    except (
+        Exception
+    ) as error:  # of CuPy, of the runtime or of what loads it: no driver, one too old, no library
         return f"no GPU is seen: {str(error).splitlines()[0]}"
 
 

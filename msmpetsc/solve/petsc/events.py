@@ -12,7 +12,12 @@ SETUP, STEPS, OUTPUT = (PETSc.Log.Stage(name) for name in ("set-up", "steps", "o
 REFERENCE = PETSc.Log.Stage("reference")  # steps solved once more, which are no part of the run
 for unused in REFERENCE, PETSc.Log.Stage("PCMPI"):  # PETSc's own of -mpi_linear_solver_server
     unused.visible = False  # -log_view calls a stage that never begins Unknown
-OF_THE_RUN = (0, SETUP.id, STEPS.id, OUTPUT.id)  # 0: PETSc's own, before the set-up and after the last frame
+OF_THE_RUN = (
+    0,
+    SETUP.id,
+    STEPS.id,
+    OUTPUT.id,
+)  # 0: PETSc's own, before the set-up and after the last frame
 
 GRADIENT = PETSc.Log.Event("msmpetsc gradient")
 ENERGY = PETSc.Log.Event("msmpetsc energy")  # differences of g

@@ -48,7 +48,9 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
     if failed is not None:
         told = text[0].partition("PETSC ERROR: See ")[0]  # before where to find help
         lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", told, re.MULTILINE) or [str(failed)]
-        raise InputError(f"PETSc cannot start with its options: {printable(lines[-1].strip(), 200)}")
+        raise InputError(
+            f"PETSc cannot start with its options: {printable(lines[-1].strip(), 200)}"
+        )
     if text[0]:
         sys.stderr.write(text[0])
 
@@ -78,9 +80,15 @@ def _check_lines(where: str, lines: list[str]) -> None:
             raise InputError(f"{where}: line {number}: {NOT_HERE[tokens[0]]}")
         value = tokens[1] if len(tokens) > 1 else ""
         is_alias = tokens[:1] == ["alias"] and len(tokens) == 3
-        is_option = len(tokens) <= 2 and all(map(OPTION.match, tokens[:1])) and not re.match("-[A-Za-z]", value)
+        is_option = (
+            len(tokens) <= 2
+            and all(map(OPTION.match, tokens[:1]))
+            and not re.match("-[A-Za-z]", value)
+        )
         if not is_alias and not is_option:
-            raise InputError(f"{where}: line {number} is no option with its value: {printable(line.strip(), 60)}")
+            raise InputError(
+                f"{where}: line {number} is no option with its value: {printable(line.strip(), 60)}"
+            )
 
 
 @contextmanager
@@ -123,7 +131,11 @@ def start_for_runs(comm: MPI.Comm, words: Sequence[str]) -> None:
     The others are for ``lent_options``, which takes them back.
     """
     if not is_running():
-        at_start = [(name, value) for name, value in options_of(words).items() if not READ_BY_OBJECTS.search(name)]
+        at_start = [
+            (name, value)
+            for name, value in options_of(words).items()
+            if not READ_BY_OBJECTS.search(name)
+        ]
         initialise(comm, [word for name, value in at_start for word in (f"-{name}", value) if word])
 
 
@@ -142,8 +154,12 @@ def lent_options(comm: MPI.Comm, words: Sequence[str]) -> Iterator[None]:
     database = PETSc.Options()
     before, options = database.getAll(), options_of(words)
     for name, value in options.items():
-        if not READ_BY_OBJECTS.search(name) and (name not in before or (before[name] or "") != value):
-            raise InputError(f"-{name}: PETSc runs already, and reads this at its start only: give it to the first run")
+        if not READ_BY_OBJECTS.search(name) and (
+            name not in before or (before[name] or "") != value
+        ):
+            raise InputError(
+                f"-{name}: PETSc runs already, and reads this at its start only: give it to the first run"
+            )
     try:
         for name, value in options.items():
             database.setValue(name, value or None)

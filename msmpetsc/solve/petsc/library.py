@@ -31,7 +31,12 @@ def total_iterations(ksp: PETSc.KSP) -> int:
 
 def dense_pointer(matrix: PETSc.Mat) -> int:
     """Address of a rank's part of a dense matrix, maybe on a GPU (MatDenseGetArrayAndMemType)."""
-    library, handle, array, kind = petsc_library(), ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
+    library, handle, array, kind = (
+        petsc_library(),
+        ctypes.c_void_p(matrix.handle),
+        ctypes.c_void_p(),
+        ctypes.c_int(),
+    )
     library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))
     pointer = array.value or 0
     library.MatDenseRestoreArrayAndMemType(handle, ctypes.byref(array))
@@ -43,12 +48,20 @@ def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
     out, those named twice are added (MatSetPreallocationCOO) (collective)."""
     index = [np.ascontiguousarray(i, PETSc.IntType) for i in (rows, columns)]
     count = ctypes.c_int64(len(rows))  # PetscCount
-    _check(petsc_library().MatSetPreallocationCOO(ctypes.c_void_p(matrix.handle), count, *map(_address, index)))
+    _check(
+        petsc_library().MatSetPreallocationCOO(
+            ctypes.c_void_p(matrix.handle), count, *map(_address, index)
+        )
+    )
 
 
 def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
     """Set those entries to values (n,), on a GPU if the matrix is there (MatSetValuesCOO)."""
-    _check(petsc_library().MatSetValuesCOO(ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)))
+    _check(
+        petsc_library().MatSetValuesCOO(
+            ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)
+        )
+    )
 
 
 @contextmanager
@@ -104,7 +117,9 @@ def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Itera
 def last_words(error: BaseException) -> str:
     """Message of a PETSc error, without its calls; for an unknown type with the nearest."""
     lines = str(error).splitlines()
-    said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
+    said = [
+        line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line
+    ]
     words = said[-1] if said else lines[0]
     wanted = re.search(r"requested (KSP|PC|SNES) type (\w+)", words)
     if wanted is None:

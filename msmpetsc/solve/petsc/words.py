@@ -10,7 +10,9 @@ from msmpetsc.errors import InputError, printable
 NAME = re.compile(r"-[A-Za-z]")
 SOLVER_OPTION = re.compile(r"-(npc_|inner_|sub_|mg_\w*|esteig_)?(snes|ksp|pc|mat|mg|sub)_\w+")
 PLAIN_VALUE = re.compile(r"([-+]?\.?\d|[^\W\d])[\w.,+-]*")  # no path, no file:name, no module:class
-MORE_THAN_SOLVING = re.compile(r"^-\w*_(python|view|monitor|dump|load|file|filename|reason|plot|tmpdir|prefix)(_|$)")
+MORE_THAN_SOLVING = re.compile(
+    r"^-\w*_(python|view|monitor|dump|load|file|filename|reason|plot|tmpdir|prefix)(_|$)"
+)
 
 
 def unsafe_word(words: Sequence[str]) -> str | None:
@@ -46,9 +48,13 @@ def words_of(options: str | Mapping[str, Any]) -> list[str]:
     try:
         words = shlex.split(options) if isinstance(options, str) else _words_of_mapping(options)
     except ValueError as error:
-        raise InputError(f"PETSc options {printable(str(options), 60)!r}: {str(error).lower()}") from None
+        raise InputError(
+            f"PETSc options {printable(str(options), 60)!r}: {str(error).lower()}"
+        ) from None
     if words and not NAME.match(words[0]):
-        raise InputError(f"PETSc options begin with a dash and a letter, not {printable(words[0], 60)!r}")
+        raise InputError(
+            f"PETSc options begin with a dash and a letter, not {printable(words[0], 60)!r}"
+        )
     return words
 
 

@@ -27,7 +27,16 @@ from msmpetsc.study.charts.plot import (
     log_axis,
     points,
 )
-from msmpetsc.study.table import ONCE_NOTE, Row, grouped, is_repeated, measured, records, spread, succeeded
+from msmpetsc.study.table import (
+    ONCE_NOTE,
+    Row,
+    grouped,
+    is_repeated,
+    measured,
+    records,
+    spread,
+    succeeded,
+)
 
 KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
@@ -87,7 +96,9 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
     Errors that read alike, to two digits, count as equal: no step can better the trajectory error
     of its time step but in the last digits, and those are no reason to pay more.
     """
-    return rows.iloc[front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))]
+    return rows.iloc[
+        front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))
+    ]
 
 
 def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFrame:
@@ -105,10 +116,22 @@ def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     charts = []
     for scene, rows in grouped(table, "scene").items():
         sizes = grouped(succeeded(rows), "cells")
-        swept = {cells: group for cells, group in sizes.items() if len(sizes) == 1 or group["label"].duplicated().any()}
+        swept = {
+            cells: group
+            for cells, group in sizes.items()
+            if len(sizes) == 1 or group["label"].duplicated().any()
+        }
         for cells, group in swept.items():
-            name = f"pareto_{scene}" if len(swept) == 1 else f"pareto_{scene}_{formatting.plain(cells)}"
-            title = f"{KIND}: {scene}, {formatting.count(cells)} cells" if cells > 0 else f"{KIND}: {scene}"
+            name = (
+                f"pareto_{scene}"
+                if len(swept) == 1
+                else f"pareto_{scene}_{formatting.plain(cells)}"
+            )
+            title = (
+                f"{KIND}: {scene}, {formatting.count(cells)} cells"
+                if cells > 0
+                else f"{KIND}: {scene}"
+            )
             charts.append(pareto_chart(name, title, group, styles))
     return [chart for chart in charts if chart.panels]
 
@@ -117,7 +140,9 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
     """Return the panels that have data."""
     step = measured(rows, *STEP.columns)
     of_steps = grouped(step, "time_step").values()  # only those of one compare by time a frame
-    step = max(of_steps, key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=step)
+    step = max(
+        of_steps, key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=step
+    )
     panels = [(STEP, step), (TRAJECTORY, measured(rows, *TRAJECTORY.columns))]
     panels = [(measure, shown) for measure, shown in panels if len(shown)]
     labels = dict.fromkeys(label for _, shown in panels for label in shown["label"])
@@ -125,8 +150,12 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
     chart = Chart(name, KIND, title, CAPTION, legend)
     for measure, shown in panels:
         draw_panel(chart, shown, measure)
-        lines = [cheapest_line(measure, level, contenders(shown, measure, level)) for level in LEVELS]
-        chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_repeated(shown) else [ONCE_NOTE])
+        lines = [
+            cheapest_line(measure, level, contenders(shown, measure, level)) for level in LEVELS
+        ]
+        chart.findings[f"The cheapest by {measure.name}"] = lines + (
+            [] if is_repeated(shown) else [ONCE_NOTE]
+        )
     return chart
 
 
@@ -147,7 +176,11 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel.whiskers(rows, measure.columns)
     panel.mark(points(rows.drop(best.index), measure.columns, columns), hollow=True)
     panel.curves(best, measure.columns, columns)
-    tied = [index for index, error in rows[measure.error].items() if index in contenders(rows, measure, error).index]
+    tied = [
+        index
+        for index, error in rows[measure.error].items()
+        if index in contenders(rows, measure, error).index
+    ]
     panel.rings(rows.loc[front.index.union(tied)], measure.columns)
 
 
@@ -167,7 +200,9 @@ def cheapest_line(measure: ErrorMeasure, level: float, best: DataFrame) -> str:
 
 def cost_of(row: Row, measure: ErrorMeasure) -> str:
     """Return the cost of a row, with its range over the repeats if known: 10 ms [9 ms to 21 ms]."""
-    ends = [formatting.seconds(row[name]) for name in ("least", "greatest") if row[name] is not None]
+    ends = [
+        formatting.seconds(row[name]) for name in ("least", "greatest") if row[name] is not None
+    ]
     return formatting.seconds(row[measure.cost]) + (f" [{' to '.join(ends)}]" if ends else "")
 
 
@@ -223,7 +258,9 @@ def reached(rows: DataFrame, level: float) -> str:
         return f"more than {formatting.count(rows['cells'].iloc[-1])} cells"
     between = rows.iloc[[above[-1] + 1, above[-1]]][["surface_error", "cells", "time_second"]]
     logs = np.log(between.to_numpy(float)).T
-    cells, seconds = (float(np.exp(np.interp(np.log(level), logs[0], column))) for column in logs[1:])
+    cells, seconds = (
+        float(np.exp(np.interp(np.log(level), logs[0], column))) for column in logs[1:]
+    )
     return f"{formatting.count(round(cells))} cells ({formatting.seconds(seconds)})"
 
 
@@ -237,7 +274,16 @@ GROWTH_CAPTION = (
     "the program itself and the surface mesh included. Whiskers reach from the least to the greatest of the repeats."
 )
 VARIED = ("error", "max_iterations", "ranks")  # may differ between curves of one method
-GROWTH_TIP = ("time_frame", "memory", "iterations", "ksp_its", "true_error", "time_setup", "time_factor", "ranks")
+GROWTH_TIP = (
+    "time_frame",
+    "memory",
+    "iterations",
+    "ksp_its",
+    "true_error",
+    "time_setup",
+    "time_factor",
+    "ranks",
+)
 GROWTH_PANELS = (  # title, column, how its ticks are written, whether it varies with the time
     ("frames a second", "fps", COUNT, True),
     ("time a frame and cell", "time_frame_a_cell", SECONDS, True),
@@ -249,22 +295,34 @@ GROWTH_PANELS = (  # title, column, how its ticks are written, whether it varies
 def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     """Return a chart for each scene and time step where some curve has two cell counts or more."""
     charts = []
-    for (scene, time_step), rows in grouped(measured(succeeded(table), "cells"), "scene", "time_step").items():
+    for (scene, time_step), rows in grouped(
+        measured(succeeded(table), "cells"), "scene", "time_step"
+    ).items():
         rows = with_curves(rows)
         if rows.groupby("curve")["cells"].nunique().max() > 1:
             step = f", time step {formatting.seconds(time_step)}" if time_step > 0 else ""
-            charts.append(growth_chart(f"growth_{scene}_{formatting.plain(time_step)}", f"{scene}{step}", rows, styles))
+            charts.append(
+                growth_chart(
+                    f"growth_{scene}_{formatting.plain(time_step)}", f"{scene}{step}", rows, styles
+                )
+            )
     return [chart for chart in charts if chart.panels]
 
 
 def with_curves(rows: DataFrame) -> DataFrame:
     """Return the rows with a column ``curve``: the method, its varied options, and its step error."""
-    varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
-    words = ([row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows))
+    varied = [
+        name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()
+    ]
+    words = (
+        [row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows)
+    )
     rows = rows.assign(curve=[", ".join(filter(None, text)) for text in words])
     names = {curve: curve for curve in rows["curve"]}
     for curve, reached in grouped(measured(rows, "true_error"), "curve").items():
-        ends = dict.fromkeys(map(formatting.error, (reached["true_error"].min(), reached["true_error"].max())))
+        ends = dict.fromkeys(
+            map(formatting.error, (reached["true_error"].min(), reached["true_error"].max()))
+        )
         names[curve] += f" (step error {' to '.join(ends)})"
     return rows.assign(curve=rows["curve"].map(names))
 
@@ -282,7 +340,8 @@ def styles_of(curves: DataFrame, styles: Styles) -> Styles:
 def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
     """Return the panels that have data."""
     rows = rows.assign(
-        time_frame_a_cell=rows["time_frame"] / rows["cells"], memory_a_cell=rows["memory"] / rows["cells"]
+        time_frame_a_cell=rows["time_frame"] / rows["cells"],
+        memory_a_cell=rows["memory"] / rows["cells"],
     ).sort_values("cells", kind="stable")
     own = styles_of(rows[["curve", "label"]].drop_duplicates().sort_index(), styles)
     chart = Chart(name, GROWTH, f"Growth with cells: {title}", GROWTH_CAPTION, own, columns=2)

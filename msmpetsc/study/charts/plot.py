@@ -74,7 +74,9 @@ def curve_styles(labels: Iterable[str]) -> Styles:
 
     def style(n: int) -> CurveStyle:
         rounds = n // len(COLORS)
-        return CurveStyle(COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)], DASHES[rounds % len(DASHES)])
+        return CurveStyle(
+            COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)], DASHES[rounds % len(DASHES)]
+        )
 
     return {label: style(n) for n, label in enumerate(dict.fromkeys(labels))}
 
@@ -82,14 +84,22 @@ def curve_styles(labels: Iterable[str]) -> Styles:
 def tips(rows: DataFrame, names: Iterable[str], curve: str = "label") -> list[str]:
     """Return the tooltip of each row: its curve, its numbers and the command that repeats it."""
     names = list(dict.fromkeys(names))
-    lines = ([row[curve], *(formatting.entry(row, name) for name in names), row["command"]] for row in records(rows))
+    lines = (
+        [row[curve], *(formatting.entry(row, name) for name in names), row["command"]]
+        for row in records(rows)
+    )
     return ["\n".join(filter(None, tip)) for tip in lines]
 
 
 def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dict[str, Any]:
     """Return an axis whose tick labels are written by ``words``, an expression of Vega."""
     axis = {"values": list(ticks), "labelExpr": words}
-    return {"type": "quantitative", "title": title, "scale": {"nice": False, "zero": False} | scale, "axis": axis}
+    return {
+        "type": "quantitative",
+        "title": title,
+        "scale": {"nice": False, "zero": False} | scale,
+        "axis": axis,
+    }
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
@@ -98,7 +108,9 @@ def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
     middle, half = (low + high) / 2, max(high - low, 0.85) * 0.58
     low, high = middle - half, middle + half
     steps = (1, 2, 5) if high - low < 2.5 else (1,)
-    ticks = [step * 10.0**decade for decade in range(math.floor(low), math.ceil(high)) for step in steps]
+    ticks = [
+        step * 10.0**decade for decade in range(math.floor(low), math.ceil(high)) for step in steps
+    ]
     return channel(title, words, ticks, type="log", domain=[10**low, 10**high])
 
 
@@ -117,7 +129,9 @@ class Axes:
         if values:
             axes = {"x": {"field": "x"} | self.x, "y": {"field": "y"} | self.y}
             silent = {"aria": "description" in channels}
-            self.layers.append({"data": {"values": values}, "mark": mark | silent, "encoding": axes | channels})
+            self.layers.append(
+                {"data": {"values": values}, "mark": mark | silent, "encoding": axes | channels}
+            )
 
     def stair(self, x: Iterable[float], y: Iterable[float]) -> None:
         """Draw a grey stair through points in their order."""
@@ -133,7 +147,9 @@ class Axes:
         bar = {"type": "errorbar", "ticks": part | {"size": 7}, "rule": part}
         self.draw(values, bar, y2={"field": "high"}, color=nominal(self.styles, "color"))
 
-    def curves(self, rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label") -> None:
+    def curves(
+        self, rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label"
+    ) -> None:
         """Draw the rows of each curve, in their order, as a line with a marker at each point."""
         values = points(rows, columns, names, curve)
         own = {"color": nominal(self.styles, "color"), "strokeDash": nominal(self.styles, "dash")}
@@ -144,22 +160,38 @@ class Axes:
         """Draw a marker with a tooltip at each of ``points``."""
         color = nominal(self.styles, "color")
         own = {"fill": color}
-        mark: dict[str, Any] = {"type": "point", "size": MARKER, "stroke": "white", "strokeWidth": 0.6}
+        mark: dict[str, Any] = {
+            "type": "point",
+            "size": MARKER,
+            "stroke": "white",
+            "strokeWidth": 0.6,
+        }
         if hollow:
             own = {"stroke": color}
             mark = {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
-        self.draw(values, mark, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own)
+        self.draw(
+            values, mark, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own
+        )
 
     def rings(self, rows: DataFrame, columns: Columns) -> None:
         """Draw a ring around each row."""
         values = [{"x": x, "y": y} for x, y in rows[list(columns)].itertuples(index=False)]
-        self.draw(values, {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0})
+        self.draw(
+            values, {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0}
+        )
 
 
-def points(rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label") -> list[dict[str, Any]]:
+def points(
+    rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label"
+) -> list[dict[str, Any]]:
     """Return each row as a point with coordinates, curve and tooltip."""
-    of_rows = zip(*(rows[name] for name in (*columns, curve)), tips(rows, names, curve), strict=True)
-    return [{"x": x, "y": y, "curve": name, "tip": tip, "n": n} for n, (x, y, name, tip) in enumerate(of_rows)]
+    of_rows = zip(
+        *(rows[name] for name in (*columns, curve)), tips(rows, names, curve), strict=True
+    )
+    return [
+        {"x": x, "y": y, "curve": name, "tip": tip, "n": n}
+        for n, (x, y, name, tip) in enumerate(of_rows)
+    ]
 
 
 @dataclass
@@ -195,7 +227,10 @@ class Chart:
             {"title": panel.title, "width": width, "height": self.height, "layer": panel.layers}
             for panel in self.panels
         ]
-        lines = [{"hconcat": panels[at : at + columns], "spacing": 15} for at in range(0, len(panels), columns)]
+        lines = [
+            {"hconcat": panels[at : at + columns], "spacing": 15}
+            for at in range(0, len(panels), columns)
+        ]
         own_legend = {"scale": {"fill": "independent", "shape": "independent"}}
         return {"vconcat": [*lines, legend(self.styles)], "resolve": own_legend, "spacing": 14}
 
@@ -209,7 +244,13 @@ def legend(styles: Styles) -> dict[str, Any]:
     channels = {"fill": nominal(styles, "color", shown), "shape": nominal(styles, "shape", shown)}
     values = [{"curve": name} for name in styles]
     mark = {"type": "point", "opacity": 0, "aria": False}
-    return {"width": WIDTH, "height": 1, "data": {"values": values}, "mark": mark, "encoding": channels}
+    return {
+        "width": WIDTH,
+        "height": 1,
+        "data": {"values": values},
+        "mark": mark,
+        "encoding": channels,
+    }
 
 
 def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -228,4 +269,8 @@ def save_png(chart: Chart, folder: Path) -> None:
 def svg_text(chart: Chart) -> str:
     """Return the chart as an <svg> element whose points have a <title>, which browsers show as a tooltip."""
     text = vl_convert.vegalite_to_svg({"config": CONFIG} | chart.spec())
-    return re.sub(r'<path aria-label="([^"]*)"([^>]*)/>', r'<path class="point"\2><title>\1</title></path>', text)
+    return re.sub(
+        r'<path aria-label="([^"]*)"([^>]*)/>',
+        r'<path class="point"\2><title>\1</title></path>',
+        text,
+    )

@@ -75,19 +75,30 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")
     legend = {
-        f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(COLORS[outcome], "square")
+        f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(
+            COLORS[outcome], "square"
+        )
         for outcome in reversed(OUTCOMES)
         if outcome in set(rows["outcome"])
     }
-    chart = Chart(f"stability_{name}", KIND, settings.get("title") or name, CAPTION, legend, COLUMNS, gap=35)
+    chart = Chart(
+        f"stability_{name}", KIND, settings.get("title") or name, CAPTION, legend, COLUMNS, gap=35
+    )
     chart.height = CELL * len(y.values)
     by_label = grouped(rows, "label")
     if set(x.values) == set(by_label):
-        draw_cells(chart.panel("", *axes_of_cases(x, y)), rows, x._replace(name="method"), y._replace(name="case"))
+        draw_cells(
+            chart.panel("", *axes_of_cases(x, y)),
+            rows,
+            x._replace(name="method"),
+            y._replace(name="case"),
+        )
         return chart
     for index, (label, group) in enumerate(by_label.items()):
         is_low = index + COLUMNS >= len(by_label)
-        panel = chart.panel(label, axis(x, shown=is_low, labelAngle=-90), axis(y, shown=index % COLUMNS == 0))
+        panel = chart.panel(
+            label, axis(x, shown=is_low, labelAngle=-90), axis(y, shown=index % COLUMNS == 0)
+        )
         draw_cells(panel, group, x, y)
     return chart
 
@@ -103,7 +114,9 @@ def axis(scale: Scale, shown: bool = True, **more: Any) -> dict[str, Any]:
 
 def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the axes of a map of named cases: cases from top to bottom, methods above."""
-    broken = [text.replace("-", "-\n").split("\n") if len(text) > 12 else [text] for text in x.texts]
+    broken = [
+        text.replace("-", "-\n").split("\n") if len(text) > 12 else [text] for text in x.texts
+    ]
     room = 4 + 14 * (max(map(len, broken)) - 1)
     across, down = axis(x, orient="top", labelOverlap=False, labelPadding=room), axis(y)
     across["axis"]["labelExpr"] = f"{json.dumps(broken)}[datum.value]"
@@ -114,7 +127,8 @@ def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
 def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
     """Draw cells with symbols and tooltips."""
     words = {
-        of.name: rows[column].map(dict(zip(of.values, of.texts, strict=True))) for column, of in (("x", x), ("y", y))
+        of.name: rows[column].map(dict(zip(of.values, of.texts, strict=True)))
+        for column, of in (("x", x), ("y", y))
     }
     placed = rows.assign(i=rows["x"].map(x.values.index), j=rows["y"].map(y.values.index), **words)
     values = [
@@ -127,7 +141,13 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
     ]  # fmt: skip
     own = {"type": "nominal", "scale": None}  # colours that stand in a column
     ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
-    panel.draw(values, {"type": "rect"}, fill={"field": "color"} | own, description={"field": "tip"}, **ends)
+    panel.draw(
+        values,
+        {"type": "rect"},
+        fill={"field": "color"} | own,
+        description={"field": "tip"},
+        **ends,
+    )
     text = {"text": {"field": "text"}, "x": {"field": "i"} | panel.x, "y": {"field": "j"} | panel.y}
     panel.draw(values, {"type": "text", "fontSize": 10.5}, **text, color={"field": "ink"} | own)
 

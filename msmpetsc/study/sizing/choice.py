@@ -79,7 +79,9 @@ class CostModel:
     steppings: Sequence[Stepping]
     solvings: Sequence[Solving]
     cells: float  # of the lattice that the steppings were tried on
-    costs: Sequence[tuple[float, float]]  # of one of them by the cells of the lattices tried, ascending
+    costs: Sequence[
+        tuple[float, float]
+    ]  # of one of them by the cells of the lattices tried, ascending
     explicit: bool  # whether that one was explicit, whose substeps shorten as the edge of a cell
     least: int  # cells that may be chosen
     most: int
@@ -104,11 +106,17 @@ class CostModel:
         """Return the number of cells that has this error; infinity for an error of 0."""
         if error <= 0:
             return math.inf
-        return max(self.least, math.ceil(self.law.size(error) ** -3)) if self.law.factor > 0 else self.least
+        return (
+            max(self.least, math.ceil(self.law.size(error) ** -3))
+            if self.law.factor > 0
+            else self.least
+        )
 
     def choice(self, stepping: Stepping, solving: Solving, cells: float) -> Choice:
         budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error, solving.error)
-        shorter = (stepping.method.integrator == "verlet") - self.explicit  # substeps, than those of the costs known
+        shorter = (
+            stepping.method.integrator == "verlet"
+        ) - self.explicit  # substeps, than those of the costs known
         growth = self.growth(self.cells, cells) * (cells / self.cells) ** (shorter / 3)
         cost = stepping.cost * solving.cost * growth
         method = replace(stepping.method, step_error=solving.step_error)
@@ -128,7 +136,9 @@ class CostModel:
 
     def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
         """Return the step errors that may be chosen; explicit steps have none."""
-        return [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings
+        return (
+            [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings
+        )
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,9 @@ class SizePlan:
 
     choice: Choice  # the cheapest that meets the error, or of the smallest error there is
     met: bool  # whether it is expected to meet the error
-    bounds: list[str] = field(default_factory=list)  # what keeps the error from being smaller, or sure, in words
+    bounds: list[str] = field(
+        default_factory=list
+    )  # what keeps the error from being smaller, or sure, in words
     tried: list[SizeTrial] = field(default_factory=list)
 
 
@@ -167,7 +179,9 @@ def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
         bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
     if best.cells > target / 2:
         wanted = f"half the error asked for would take {model.cells_for(target / 2):.2g}"
-        bounds.append(f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; {wanted}")
+        bounds.append(
+            f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; {wanted}"
+        )
     return bounds
 
 
@@ -202,9 +216,13 @@ def overrides(scene: Path, tables: Tables) -> list[str]:
     for name, table in tables.items():
         given = document.get(name, {})
         if any(value is None and key in given for key, value in table.items()):
-            changes.append(f"{name}={toml_value({**given, **table})}")  # --set changes keys, and takes none away
+            changes.append(
+                f"{name}={toml_value({**given, **table})}"
+            )  # --set changes keys, and takes none away
         else:
-            changes += [f"{name}.{key}={value}" for key, value in table.items() if value is not None]
+            changes += [
+                f"{name}.{key}={value}" for key, value in table.items() if value is not None
+            ]
     return changes
 
 

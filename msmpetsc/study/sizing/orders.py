@@ -16,7 +16,10 @@ from dataclasses import dataclass, replace
 
 from scipy.optimize import brentq
 
-ORDERS = (1.0, 2.2)  # that are believed: of a boundary seen by the share of its cells, of linear cells; of steps
+ORDERS = (
+    1.0,
+    2.2,
+)  # that are believed: of a boundary seen by the share of its cells, of linear cells; of steps
 ALIKE = 1.9  # times: sizes nearer than that differ by chance as much as by their order
 CLOSE = 1.01  # times: what parts sizes nearer than that is chance alone
 UNSEEN = 0.05  # a measured order may lie so far below the range before it counts as not seen
@@ -28,7 +31,9 @@ class ErrorLaw:
 
     factor: float
     order: float
-    seen: bool = True  # the order was measured; else it is the end of the range that the measurements left
+    seen: bool = (
+        True  # the order was measured; else it is the end of the range that the measurements left
+    )
     cosine: float = 1.0  # of what parts two runs and the finer one's error
 
     def error(self, size: float) -> float:
@@ -42,7 +47,11 @@ class ErrorLaw:
     def through(self, *known: tuple[float, float]) -> "ErrorLaw":
         """Return the law through the (size, error) of one run, with this order, or of two runs, the coarser first."""
         (a, error), (b, less) = known[0], known[-1]
-        order = math.log(error / less) / math.log(a / b) if a > CLOSE * b and error > less > 0 else self.order
+        order = (
+            math.log(error / less) / math.log(a / b)
+            if a > CLOSE * b and error > less > 0
+            else self.order
+        )
         return replace(self, factor=error / a**order, order=order)
 
     def measured(self, apart: float, finer: float) -> float:
@@ -90,7 +99,9 @@ def error_law(
     return ErrorLaw(_finer_error(apart, (a / b) ** order, cosine) / b**order, order, seen, cosine)
 
 
-def _order(sizes: Sequence[float], ratio: float, cosine: float, orders: tuple[float, float]) -> tuple[float, bool]:
+def _order(
+    sizes: Sequence[float], ratio: float, cosine: float, orders: tuple[float, float]
+) -> tuple[float, bool]:
     """Return the order at which distances have this ratio, clipped to the range, and whether it was observed."""
     a, b, c = sizes[-3:]
     low, high = orders

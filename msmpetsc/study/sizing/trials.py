@@ -44,8 +44,13 @@ LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
 CHOICES = 6  # that are tried
 NARROW = 1.05  # times the cells: between cells so alike none are tried
-VAGUE = 1 / 3  # of the error asked for: the most that the finest lattice may have by an order that is not sure
-AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where fewer cells are not tried any more
+VAGUE = (
+    1 / 3
+)  # of the error asked for: the most that the finest lattice may have by an order that is not sure
+AIM, ENOUGH = (
+    0.9,
+    0.75,
+)  # times the error asked for: what is tried, and where fewer cells are not tried any more
 
 
 class Asked(NamedTuple):
@@ -60,7 +65,9 @@ class Asked(NamedTuple):
 class Sizer:
     """Runs the trials of a scene for a surface error, and reports each."""
 
-    def __init__(self, scene: Path, bench: Bench, asked: Asked, report: Callable[[SizeTrial | str], None]):
+    def __init__(
+        self, scene: Path, bench: Bench, asked: Asked, report: Callable[[SizeTrial | str], None]
+    ):
         self.scene = scene
         self.bench = bench
         self.target = asked.target
@@ -68,13 +75,17 @@ class Sizer:
         self.as_given = load_scene(scene)
         count = asked.cells or self.as_given.cages.count
         if count is None:
-            raise InputError(f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has")
+            raise InputError(
+                f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has"
+            )
         self.cells = count
         self.report = report
         self.step = self.as_given.time.step
         steps = min(asked.frames, self.as_given.time.steps)
         self.is_static = self.as_given.time.integrator == STATIC
-        self.duration = self.step * max(1, steps if self.is_static else steps // 2 * 2)  # twice the step fits, too
+        self.duration = self.step * max(
+            1, steps if self.is_static else steps // 2 * 2
+        )  # twice the step fits, too
         self.halved = [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
         self.solved = min(1e-3, self.target / 10)  # step error of the trials
         self.bounds: list[str] = []
@@ -98,17 +109,28 @@ class Sizer:
         coarse = self._coarser(1)
         steppings = self._steppings(coarse)
         fair = [each for each in steppings if each.error <= self.target / 2]
-        method = (min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)).method
+        method = (
+            min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)
+        ).method
         solvings = self._solvings(method, coarse)
         lattices = self._lattices(method)
         costs = [(each.cells, each.cost) for each in lattices]
         on = next(each.cells for each in self.trials if each.asked == coarse)
         law = self._law(lattices)
         model = CostModel(
-            law, steppings, solvings, on, costs, method.integrator == "verlet", 1, COARSER**3 * self.cells
+            law,
+            steppings,
+            solvings,
+            on,
+            costs,
+            method.integrator == "verlet",
+            1,
+            COARSER**3 * self.cells,
         )
         wanted = model.cheapest(AIM * self.target)
-        like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
+        like = (
+            wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
+        )
         # such an order makes the error of the finest lattice, which is part of all that are measured
         vague = not law.seen or _apart(lattices[0], lattices[1]) > FAR
         blind = vague and (wanted is None or law.error(lattices[-1].edge) > VAGUE * self.target)
@@ -131,18 +153,28 @@ class Sizer:
         if not ladder:
             ladder, sizes = self._implicit(cells)
         if len(ladder) < 2:
-            raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
+            raise InputError(
+                f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared"
+            )
         finest, left = ladder[-1], self._left(ladder, sizes)
         if left > self.target / PART:
             apart = _apart(ladder[-2], finest)
-            self.bounds.append(f"the step: the two shortest of {finest.method.integrator} are {apart:.1e} apart")
-        known = [Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]]
+            self.bounds.append(
+                f"the step: the two shortest of {finest.method.integrator} are {apart:.1e} apart"
+            )
+        known = [
+            Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]
+        ]
         known.append(Stepping(finest.method, left, finest.cost))
         explicit = finest.method.integrator == "verlet"
-        chosen_from = known[:1] if explicit else known  # shorter substeps than verlet's own cost much, and give nothing
+        chosen_from = (
+            known[:1] if explicit else known
+        )  # shorter substeps than verlet's own cost much, and give nothing
         for integrator in IMPLICIT:
             if explicit or integrator != finest.method.integrator:
-                chosen_from += self._others(integrator, chosen_from, finest=finest, left=left, cells=cells)
+                chosen_from += self._others(
+                    integrator, chosen_from, finest=finest, left=left, cells=cells
+                )
         return chosen_from
 
     def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
@@ -180,11 +212,20 @@ class Sizer:
         return error_law(sizes, apart, ORDERS).error(sizes[-1])
 
     def _others(
-        self, integrator: IntegratorName, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
+        self,
+        integrator: IntegratorName,
+        known: list[Stepping],
+        *,
+        finest: SizeTrial,
+        left: float,
+        cells: int,
     ) -> list[Stepping]:
         """Return runs of an integrator with halved steps, while it may be the cheapest."""
         others: list[Stepping] = []
-        enough = min((self._at_scale(each) for each in known if each.error <= self.target / 2), default=math.inf)
+        enough = min(
+            (self._at_scale(each) for each in known if each.error <= self.target / 2),
+            default=math.inf,
+        )
         for step in self.halved:
             run = self._run(self._method(integrator, step), cells)
             if run is None:
@@ -223,7 +264,9 @@ class Sizer:
         finer = (self._run(method, self._coarser(power)) for power in (1, 0))
         runs = [run for run in (next(coarsest, None), *finer) if run is not None]
         if len(runs) < 2:
-            raise InputError(f"{self.scene}: only one lattice could be run, see above: the cells' error is not known")
+            raise InputError(
+                f"{self.scene}: only one lattice could be run, see above: the cells' error is not known"
+            )
         return runs
 
     def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
@@ -237,10 +280,14 @@ class Sizer:
         orders = (least, least) if inverted else (USUAL if far else least, greatest)
         across = _apart(runs[0], runs[-1])
         cosine = cosine_of(apart[0], apart[1], across) if len(runs) > 2 else 0.0
-        law = error_law([each.edge for each in runs], apart, orders, None if far else across, cosine)
+        law = error_law(
+            [each.edge for each in runs], apart, orders, None if far else across, cosine
+        )
         law, self.cell_bound = replace(law, seen=law.seen and not inverted), ""
         if not law.seen:
-            self.cell_bound = f"the cells: their distances show no order; order {law.order:g} is taken"
+            self.cell_bound = (
+                f"the cells: their distances show no order; order {law.order:g} is taken"
+            )
         return law
 
     def _coarser(self, power: float) -> int:
@@ -248,15 +295,23 @@ class Sizer:
         cells: float = self.cells / COARSER ** (3 * power)
         return max(1, round(cells))
 
-    def _checked(self, model: CostModel, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, CostModel]:
+    def _checked(
+        self, model: CostModel, lattices: Sequence[SizeTrial]
+    ) -> tuple[SizePlan, CostModel]:
         """Choose, run and measure, until the error is little less than the target.
 
         Each choice lies between the cells that met the error and those that did not, for errors go
         up and down from lattice to lattice. Returns the model with what was learnt, too.
         """
         law, finest, met = model.law, lattices[-1], None
-        fine = [(finest.edge, law.error(finest.edge))] if law.error(finest.edge) < AIM * self.target else []
-        coarse: list[tuple[float, float]] = []  # sizes and errors of what is too coarse, and of what is not
+        fine = (
+            [(finest.edge, law.error(finest.edge))]
+            if law.error(finest.edge) < AIM * self.target
+            else []
+        )
+        coarse: list[
+            tuple[float, float]
+        ] = []  # sizes and errors of what is too coarse, and of what is not
         for _ in range(CHOICES):
             choice = model.cheapest(AIM * self.target) or model.cheapest(self.target)
             if choice is None:
@@ -268,7 +323,10 @@ class Sizer:
             measured = self._measured(choice, run, finest, law)
             error = measured.total / self.target
             if error <= 1:
-                met, fine = replace(choice, cost=run.cost, budget=measured), [(run.edge, measured.cells)]
+                met, fine = (
+                    replace(choice, cost=run.cost, budget=measured),
+                    [(run.edge, measured.cells)],
+                )
                 model = replace(model, most=choice.cells - 1)
             else:
                 coarse = [(run.edge, measured.cells)]
@@ -285,7 +343,9 @@ class Sizer:
             return replace(model, least=fewest)
         method = self._as_tried(choice.method)
         kept = [each for each in model.steppings if each.method != method]
-        self.bounds.append(f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells")
+        self.bounds.append(
+            f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells"
+        )
         return replace(model, steppings=kept or model.steppings)
 
     def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> Budget:
@@ -295,7 +355,9 @@ class Sizer:
         """
         if 1 < run.cells / finest.cells < FINE:
             return choice.budget
-        finest = self._run(self._as_tried(choice.method), finest.asked) or finest  # so that only the cells differ
+        finest = (
+            self._run(self._as_tried(choice.method), finest.asked) or finest
+        )  # so that only the cells differ
         apart = _apart(run, finest)
         if run.edge < finest.edge:
             return replace(choice.budget, cells=law.measured_finer(apart, run.edge, finest.edge))
@@ -323,13 +385,17 @@ class Sizer:
 
     def _run(self, method: Candidate, cells: int) -> SizeTrial | None:
         """Return a trial, run at most once; None if it fails, which is reported."""
-        done = next((each for each in self.trials if (each.method, each.asked) == (method, cells)), None)
+        done = next(
+            (each for each in self.trials if (each.method, each.asked) == (method, cells)), None
+        )
         if done is not None:
             return done
         case = self.case(method, cells)
         row = self.bench.measure(case, keep=True)
         if row["status"] != "ok" or not row.get("time_second"):
-            self.report(f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}")
+            self.report(
+                f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}"
+            )
             return None
         trial = SizeTrial(
             method, cells, row["cells"], row["time_second"], row["iterations"], row.get("inverted") or 0.0,
@@ -341,7 +407,10 @@ class Sizer:
 
     def case(self, method: Candidate, cells: int) -> Case:
         """Return the case of a method and a number of cells, with output at the frames of the scene."""
-        cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
+        cages = self.as_given.cages.model_dump(exclude_unset=True) | {
+            "count": cells,
+            "cell_size": None,
+        }
         timeout = TIME if cells < self.cells else LONG_TIME
         case = Case(
             scene=self.scene.stem, file=self.scene, content="", set=(f"cages={toml_value(cages)}",), ranks=self.ranks,

@@ -24,8 +24,12 @@ class Scenes:
         """Run each scene once; its figures by their names."""
         found = {}
         for scene, frames in FRAMES.items():
-            run = lab.run(scene, Path("run.h5"), ["--frames", frames], [CELLS, "output.surface=false"])
-            found[scene] = {name: float(values[1:].mean()) for name, values in run.frames(*MEANS).items()}
+            run = lab.run(
+                scene, Path("run.h5"), ["--frames", frames], [CELLS, "output.surface=false"]
+            )
+            found[scene] = {
+                name: float(values[1:].mean()) for name, values in run.frames(*MEANS).items()
+            }
             totals = run.cost["memory"], run.cost["time"]["setup"]
             found[scene] |= dict(zip(TOTALS, totals, strict=True))
         return found

@@ -10,7 +10,13 @@ ERROR, STEPS, STEP = 1e-6, 6, 0.01
 HELD = [{"region": {"box": [[0, 0, 0], [0.05, 1, 1]], "relative": True}}]
 FAR = {"box": [[0.95, 0, 0], [1, 1, 1]], "relative": True}
 LED = [{"region": FAR, "path": [{"time": 4 * STEP, "by": [0.05, 0, 0.05]}], "stop": 5 * STEP}]
-FLOOR = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1], "response": "penalty", "friction": 0.4}
+FLOOR = {
+    "shape": "plane",
+    "point": [0, 0, -0.01],
+    "normal": [0, 0, 1],
+    "response": "penalty",
+    "friction": 0.4,
+}
 FALLING = {"start": {"velocity": [0.5, 0, -1.5]}, "obstacle": [FLOOR]}
 SOFT = {"young_modulus": 1e5, "density": 1000.0}
 TIME = {"step": STEP, "duration": STEPS * STEP}
@@ -28,12 +34,20 @@ QUICK = {"touching"}  # each takes some ten seconds
 
 
 @pytest.mark.parametrize(
-    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+    "case",
+    [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES],
 )
 def test_frames_are_those_by_jacobi(petsc_options, tmp_path: Path, case: str):
     """With several coarse levels. Errors of N steps add up to N (N + 1) / 2 of the greatest."""
-    base = {"sides": np.array([8, 3, 3]) * CELL, "material": SOFT, "time": TIME, "solver": {"error": ERROR}}
-    path = block_scene(tmp_path, **base | {"gravity": {"acceleration": [0, 1.0, -9.81]}} | CASES[case])
+    base = {
+        "sides": np.array([8, 3, 3]) * CELL,
+        "material": SOFT,
+        "time": TIME,
+        "solver": {"error": ERROR},
+    }
+    path = block_scene(
+        tmp_path, **base | {"gravity": {"acceleration": [0, 1.0, -9.81]}} | CASES[case]
+    )
 
     def positions(preset: str, **options: str) -> np.ndarray:
         petsc_options(**options)
@@ -45,4 +59,6 @@ def test_frames_are_those_by_jacobi(petsc_options, tmp_path: Path, case: str):
     by_multigrid = positions("newton-multigrid", pc_type="mg", pc_mg_levels="3")
     far = np.abs(by_jacobi - by_jacobi[0]).max()
     assert far > 1e-3
-    np.testing.assert_allclose(by_multigrid, by_jacobi, rtol=0, atol=ERROR * STEPS * (STEPS + 1) / 2 * far)
+    np.testing.assert_allclose(
+        by_multigrid, by_jacobi, rtol=0, atol=ERROR * STEPS * (STEPS + 1) / 2 * far
+    )

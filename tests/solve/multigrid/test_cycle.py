@@ -56,8 +56,14 @@ def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "rod"])
 def test_cycles_of_two_materials(name: str, contrast: float, pins: bool):
     """One precision serves both: what is 1e6 times softer has a digit or so of it left."""
-    with hierarchy(COMM, build(COMM, LATTICES[name], contrast=contrast, pins=pins), SHAPES["twisted"]) as case:
-        check(case, 0.1 if contrast < 1e6 else 0.02, beyond=1e-7 * contrast if contrast > 1e3 else 1e-4)
+    with hierarchy(
+        COMM, build(COMM, LATTICES[name], contrast=contrast, pins=pins), SHAPES["twisted"]
+    ) as case:
+        check(
+            case,
+            0.1 if contrast < 1e6 else 0.02,
+            beyond=1e-7 * contrast if contrast > 1e3 else 1e-4,
+        )
 
 
 def test_one_free_node():
@@ -73,7 +79,9 @@ def test_one_free_node():
 def test_a_sheet_with_its_underside_held(density: float, shape: str):
     """Its free nodes lie halfway between layers of coarse ones: P^T H P is singular, but for the raised diagonal."""
     lattice = build(COMM, LATTICES["thin sheet"], density=density)
-    with hierarchy(COMM, lattice.pin(lattice.nodes[:, 2] < 3.01), SHAPES[shape], coarsest=10) as case:
+    with hierarchy(
+        COMM, lattice.pin(lattice.nodes[:, 2] < 3.01), SHAPES[shape], coarsest=10
+    ) as case:
         p = case.interpolation(0)
         assert np.linalg.matrix_rank(p) <= p.shape[1] / 2
         check(case, 0.3)
@@ -111,7 +119,9 @@ def test_few_iterations_at_any_step_and_fineness(name: str, shape: str):
     assert (found[-1] - found[0]).max() <= GROWTH
 
 
-BENT = np.concatenate([block(30, 4, 4), at(block(4, 30, 4), 30, 0, 0), at(block(4, 4, 30), 30, 30, 0)])
+BENT = np.concatenate(
+    [block(30, 4, 4), at(block(4, 30, 4), 30, 0, 0), at(block(4, 4, 30), 30, 30, 0)]
+)
 STATIC = 1e3  # [s]: a step so long that mass counts for nothing
 AT_REST = {None: 3, 0.25: 3, 0.45: 4, 0.49: 8, 0.499: 20}  # by Poisson's ratio, None of springs
 
@@ -119,5 +129,7 @@ AT_REST = {None: 3, 0.25: 3, 0.45: 4, 0.49: 8, 0.499: 20}  # by Poisson's ratio,
 @pytest.mark.parametrize("poisson", AT_REST)
 def test_few_iterations_of_a_slender_body_at_rest(poisson: float | None):
     """Coarse diagonals that are raised by 1e-5 hold it to the ground: 5, 5, 8, 18 and 59 iterations."""
-    with hierarchy(COMM, build(COMM, BENT, pins=True, poisson=poisson), SHAPES["rest"], STATIC) as case:
+    with hierarchy(
+        COMM, build(COMM, BENT, pins=True, poisson=poisson), SHAPES["rest"], STATIC
+    ) as case:
         assert max(case.iterations(TOLERANCE, rough) for rough in (False, True)) <= AT_REST[poisson]

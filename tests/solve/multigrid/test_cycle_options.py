@@ -36,8 +36,12 @@ REFUSED = {
 def test_options_of_the_cycle(msmpetsc, tmp_path: Path, ranks: int):
     path = block_scene(tmp_path, **SCENE)
     for options, shown in OBEYED.items():
-        done = msmpetsc(ranks, "run", path, "-o", tmp_path / "o.h5", "--overwrite", *options.split(), status=0)
-        assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV")), options
+        done = msmpetsc(
+            ranks, "run", path, "-o", tmp_path / "o.h5", "--overwrite", *options.split(), status=0
+        )
+        assert not any(
+            noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV")
+        ), options
         assert shown in done.stdout, options
 
 

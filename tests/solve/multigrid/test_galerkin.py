@@ -15,19 +15,28 @@ CASES = {  # lattice, shape, contact, more
     "many": ("many bodies", "twisted", True, {}),
     "thin": ("thin sheet", "twisted", False, {"pins": True}),
     "solid": ("block that begins at odd indices", "twisted", True, {"poisson": 0.45, "pins": True}),
-    "solid, crushed, touching, of two materials": ("limbs", "crushed", True, {"poisson": 0.49, "contrast": 1e3}),
+    "solid, crushed, touching, of two materials": (
+        "limbs",
+        "crushed",
+        True,
+        {"poisson": 0.49, "contrast": 1e3},
+    ),
 }
 
 
 def raised(matrix: np.ndarray, case: Case) -> np.ndarray:
     """Its diagonal, by more where a body is free."""
-    return matrix + (1e-5 if case.multigrid.bodies.free.any() else 1e-8) * np.diag(matrix.diagonal())
+    return matrix + (1e-5 if case.multigrid.bodies.free.any() else 1e-8) * np.diag(
+        matrix.diagonal()
+    )
 
 
 def assert_close(found: np.ndarray, expected: np.ndarray, accuracy: float = 1e-12) -> None:
     """Beside what the nodes have themselves: a soft part stands by a stiff one."""
     size = np.sqrt(expected.diagonal())
-    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=accuracy)
+    np.testing.assert_allclose(
+        found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=accuracy
+    )
 
 
 def check_levels(case: Case) -> None:
@@ -50,15 +59,21 @@ def check_operator(coarse: CoarseOperator) -> None:
         x.array[:] = values
         coarse.matrix.mult(x, expected)
         coarse.operator.mult(x, found)
-        np.testing.assert_allclose(found.array, expected.array, rtol=0, atol=2e-6 * abs(expected.array).max())
+        np.testing.assert_allclose(
+            found.array, expected.array, rtol=0, atol=2e-6 * abs(expected.array).max()
+        )
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_levels_are_galerkin_products(name: str):
     """And positive definite, at whatever positions."""
     lattice, shape, contact, more = CASES[name]
-    with hierarchy(COMM, build(COMM, LATTICES[lattice], **more), SHAPES[shape], contact=contact, coarsest=10) as case:
-        assert len(case.multigrid.levels) > 1 or name == "many"  # of one cell each: no grid is coarser
+    with hierarchy(
+        COMM, build(COMM, LATTICES[lattice], **more), SHAPES[shape], contact=contact, coarsest=10
+    ) as case:
+        assert (
+            len(case.multigrid.levels) > 1 or name == "many"
+        )  # of one cell each: no grid is coarser
         check_levels(case)
         np.testing.assert_allclose(case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y)), case.hessian(),
                                    rtol=0, atol=1e-5 * np.abs(case.hessian()).max())  # fmt: skip
@@ -67,21 +82,29 @@ def test_levels_are_galerkin_products(name: str):
 @pytest.mark.parametrize("mass", [1e-9, 1e9])
 @pytest.mark.parametrize("name", LATTICES)
 def test_levels_of_light_and_heavy_bodies(name: str, mass: float):
-    with hierarchy(COMM, heavier(build(COMM, LATTICES[name]), mass), SHAPES["twisted"], coarsest=10) as case:
+    with hierarchy(
+        COMM, heavier(build(COMM, LATTICES[name]), mass), SHAPES["twisted"], coarsest=10
+    ) as case:
         check_levels(case)
 
 
 def test_a_new_hierarchy_takes_nothing_of_the_old_one():
     """Positions, contact, and what stood in the matrices."""
     with hierarchy(
-        COMM, build(COMM, LATTICES["limbs"], pins=True), SHAPES["crushed"], contact=True, coarsest=10
+        COMM,
+        build(COMM, LATTICES["limbs"], pins=True),
+        SHAPES["crushed"],
+        contact=True,
+        coarsest=10,
     ) as case:
         check_levels(case)
         case.q, case.blocks = SHAPES["twisted"](case.lattice.nodes), np.empty((0, 9))
         case.multigrid.update(case.q, case.blocks)
         check_levels(case)
         again = case.cycle()
-    with hierarchy(COMM, build(COMM, LATTICES["limbs"], pins=True), SHAPES["twisted"], coarsest=10) as case:
+    with hierarchy(
+        COMM, build(COMM, LATTICES["limbs"], pins=True), SHAPES["twisted"], coarsest=10
+    ) as case:
         np.testing.assert_array_equal(case.cycle(), again)
 
 
@@ -91,10 +114,15 @@ def test_a_hierarchy_says_what_its_levels_are():
     with hierarchy(COMM, lattice, SHAPES["twisted"], coarsest=10) as case:
         blocks = case.hessian().reshape(-1, 3, len(case.hessian()) // 3, 3)
         dense = 9 * int(np.abs(blocks).max(axis=(1, 3)).astype(bool).sum())
-        coarse = [np.count_nonzero(case.level(level)) for level in range(len(case.multigrid.levels))]
+        coarse = [
+            np.count_nonzero(case.level(level)) for level in range(len(case.multigrid.levels))
+        ]
         nodes, nonzeros = zip(*case.multigrid.sizes, strict=True)
         assert nonzeros[0] == dense and nodes[0] == len(case.hessian()) // 3
         assert all(stored >= needed for stored, needed in zip(nonzeros[1:], coarse, strict=True))
         said = repr(case.multigrid).splitlines()
-        assert said[0] == f"multigrid of {len(nodes)} levels, operator complexity {sum(nonzeros) / dense:.3f}"
+        assert (
+            said[0]
+            == f"multigrid of {len(nodes)} levels, operator complexity {sum(nonzeros) / dense:.3f}"
+        )
         assert [int(line.split()[2]) for line in said[2:]] == list(nonzeros)

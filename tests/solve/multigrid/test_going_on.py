@@ -18,7 +18,9 @@ HELD = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
 FAR = {"box": [[0.74, -1, -1], [0.76, 1, 1]]}
 LED = [{"region": FAR, "path": [{"time": 0.08, "by": [0.05, 0, 0.05]}], "stop": 0.1}]
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
-PRESSING = [GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}]
+PRESSING = [
+    GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}
+]
 SOFT = {"young_modulus": 1e5, "density": 1000.0}
 
 
@@ -26,7 +28,13 @@ def scene(preset: str, **tables) -> dict:
     time = {"step": 0.02, "duration": 0.02 * STEPS}
     solver = {"preset": preset, "error": 1e-3}
     sides = np.array([6, 3, 3]) * CELL
-    return {"sides": sides, "gravity": GRAVITY, "material": SOFT, "time": time, "solver": solver} | tables
+    return {
+        "sides": sides,
+        "gravity": GRAVITY,
+        "material": SOFT,
+        "time": time,
+        "solver": solver,
+    } | tables
 
 
 def pressed(preset: str, **tables) -> dict:
@@ -61,13 +69,20 @@ QUICK = {"solid, pressed", "switched, pressed", "fallback"}  # each takes some f
 
 
 @pytest.mark.parametrize(
-    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+    "case",
+    [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES],
 )
-def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, case: str, monkeypatch):
+def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(
+    tmp_path: Path, case: str, monkeypatch
+):
     """Of runs that build hierarchies in some steps and keep them in others, or change over in the midst of a step."""
     built, chosen, build, choose = [], [], LatticePreconditioner._build, StepPreconditioner._choose
-    monkeypatch.setattr(LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1])
-    monkeypatch.setattr(StepPreconditioner, "_choose", lambda *given: (chosen.append(1), choose(*given))[1])
+    monkeypatch.setattr(
+        LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1]
+    )
+    monkeypatch.setattr(
+        StepPreconditioner, "_choose", lambda *given: (chosen.append(1), choose(*given))[1]
+    )
     frames = assert_goes_on_exactly(block_scene(tmp_path, **CASES[case]), every=3)
     assert len(built) > 1 and (chosen or not case.startswith("switched"))
     assert case != "fallback" or sum(frame.fallbacks for frame in frames) > 0
@@ -79,6 +94,20 @@ def test_a_run_that_was_stopped_goes_on_exactly(tmp_path: Path, ranks: int):
     stiff = {"young_modulus": 1e9, "density": 1000.0}
     path = block_scene(tmp_path, **scene("newton", pin=HELD, anchor=LED, material=stiff))
     for step, file in ((6, "x.h5"), (-1, "whole.h5")):
-        run(ranks, WORKERS / "stop_worker.py", step, "run", path, "-o", tmp_path / file, "-pc_mg_levels", 3, status=0)
-    assert run(ranks, WORKERS / "stop_worker.py", -1, "run", "--resume", tmp_path / "x.h5").returncode == 0
+        run(
+            ranks,
+            WORKERS / "stop_worker.py",
+            step,
+            "run",
+            path,
+            "-o",
+            tmp_path / file,
+            "-pc_mg_levels",
+            3,
+            status=0,
+        )
+    assert (
+        run(ranks, WORKERS / "stop_worker.py", -1, "run", "--resume", tmp_path / "x.h5").returncode
+        == 0
+    )
     assert_same(tmp_path / "x.h5", tmp_path / "whole.h5")

@@ -17,7 +17,9 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
     with hierarchy(COMM, build(COMM, LATTICES[name], pins=pins), coarsest=2) as case:
         nodes, free = case.lattice.nodes, case.unknowns.free
         fine = np.rint((nodes - ORIGIN) / CELL).astype(int)
-        fine[:, 0] += case.multigrid.bodies.apart(COMM, fine)  # each body has coarse nodes of its own
+        fine[:, 0] += case.multigrid.bodies.apart(
+            COMM, fine
+        )  # each body has coarse nodes of its own
         fine = fine[free]
         for level, coarse in enumerate(case.multigrid.levels):
             p = case.interpolation(level)
@@ -26,15 +28,20 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
             np.testing.assert_allclose(p.sum(axis=1), 1, rtol=1e-15)
             ijk = decode_morton(coarse.grid.table.keys)
             values = 2 * ijk @ slopes + at_origin
-            np.testing.assert_allclose((p @ values.ravel()).reshape(-1, 3), fine @ slopes + at_origin, rtol=1e-12)
+            np.testing.assert_allclose(
+                (p @ values.ravel()).reshape(-1, 3), fine @ slopes + at_origin, rtol=1e-12
+            )
             assert (p != 0).any(axis=0).all()  # no coarse node without fine ones
             fine = ijk
 
 
 @pytest.mark.parametrize(
-    ("name", "coarsest", "count"), [("block", 800, 1), ("block", 10, 3), ("thin sheet", 800, 1), ("rod", 10, 4)]
+    ("name", "coarsest", "count"),
+    [("block", 800, 1), ("block", 10, 3), ("thin sheet", 800, 1), ("rod", 10, 4)],
 )
-def test_grids_have_the_neighbours_of_half_an_index_until_one_is_small(name: str, coarsest: int, count: int):
+def test_grids_have_the_neighbours_of_half_an_index_until_one_is_small(
+    name: str, coarsest: int, count: int
+):
     corners = np.argwhere(np.ones((2, 2, 2)))
     with hierarchy(COMM, build(COMM, LATTICES[name]), coarsest=coarsest) as case:
         ijk = decode_morton(case.lattice.table.keys)

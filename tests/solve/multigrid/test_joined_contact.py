@@ -57,7 +57,9 @@ def test_the_smoother_inverts_blocks_and_contact_together(surface: SurfaceHessia
     np.testing.assert_allclose(eigenvalues, 1.0, atol=1e-4)
 
 
-def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(surface: SurfaceHessian):
+def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
+    surface: SurfaceHessian,
+):
     """Stiff are those that give way less than their nodes let them, of the pairs here the last one's."""
     compliance = np.full(NODES, 1e-8)
     stiff, others = surface.split(compliance, POINTS)
@@ -67,7 +69,12 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(surf
     )
     assert np.abs(joined(stiff)).max() > 1e3 * np.abs(joined(others)).max()
     one, rest = surface.split(compliance, 1)  # the stiffest alone
-    assert one is not None and rest is not None and one.points.shape == (3, 3) and rest.points.shape == (18, 18)
+    assert (
+        one is not None
+        and rest is not None
+        and one.points.shape == (3, 3)
+        and rest.points.shape == (18, 18)
+    )
     assert surface.split(1e-12 * compliance, POINTS)[0] is None
 
 
@@ -87,7 +94,9 @@ def test_the_coarsest_matrix_has_the_contact_of_now_and_room_for_that_of_before(
         np.testing.assert_allclose(matrix[:, :], 2 * np.eye(size) + T2 * contact)
         found.append(matrix.handle)
     assert found[0] == found[1] == found[2]
-    assert coarse.nonzeros.nnz == 9  # of the last contact alone: that of before would have taken ten times as many
+    assert (
+        coarse.nonzeros.nnz == 9
+    )  # of the last contact alone: that of before would have taken ten times as many
     coarse.destroy()
     without.destroy()
 
@@ -95,13 +104,17 @@ def test_the_coarsest_matrix_has_the_contact_of_now_and_room_for_that_of_before(
 SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}
 
 
-def test_contact_that_joins_nodes_takes_a_part_of_the_iterations_to_the_same_frames(tmp_path: Path, monkeypatch):
+def test_contact_that_joins_nodes_takes_a_part_of_the_iterations_to_the_same_frames(
+    tmp_path: Path, monkeypatch
+):
     """In its first two steps, to 1e-12: to 1e-10 the second of them comes to either of two minima."""
     tables = {"material": SOLID, "time": {"step": 0.002, "duration": 0.068}}
     its, positions = [], []
     for most in (0, cycle.POINTS):
         monkeypatch.setattr(cycle, "POINTS", most)
-        _, frames = play(pinch_scene(tmp_path, solver={"preset": "newton-multigrid", "error": 1e-12}, **tables))
+        _, frames = play(
+            pinch_scene(tmp_path, solver={"preset": "newton-multigrid", "error": 1e-12}, **tables)
+        )
         touching = [frame for frame in frames if frame.self_contacts > 0]
         assert len(touching) == 2
         its.append(sum(frame.ksp_its for frame in touching))

@@ -12,7 +12,9 @@ import msmpetsc
 from msmpetsc.build import build_model
 from msmpetsc.errors import InputError
 
-study = pytest.importorskip("solid_study")  # scripts/solid_study.py, which needs scikit-fem and manifold3d
+study = pytest.importorskip(
+    "solid_study"
+)  # scripts/solid_study.py, which needs scikit-fem and manifold3d
 
 TOLERANCE = 3e-2  # -ksp_rtol of newton's presets
 STATIC = 1e3  # [s]: a step so long that mass counts for nothing
@@ -30,7 +32,9 @@ def body(name: str) -> tuple[trimesh.Trimesh, dict]:
             pytest.skip(str(missing))
     if name == "rod":
         path = Path(os.environ.get("MSMPETSC_SOLID", "")) / "rod_cut.ply"
-        return trimesh.load(path, process=False) if path.exists() else pytest.skip(f"no {path}"), {"count": 10_000}
+        return trimesh.load(path, process=False) if path.exists() else pytest.skip(f"no {path}"), {
+            "count": 10_000
+        }
     return study.box(1, 1, 8 if name == "beam" else 30), {"cell_size": 1 / 8}
 
 
@@ -38,13 +42,19 @@ def body(name: str) -> tuple[trimesh.Trimesh, dict]:
 def test_iterations_of_solids_at_rest(name: str, tmp_path: Path):
     mesh, cages = body(name)
     mesh.export(tmp_path / "body.obj", digits=17)
-    tables = {"mesh": {"source": str(tmp_path / "body.obj")}, "cages": cages, "pin": [study.held(2, 0, -1)]}
+    tables = {
+        "mesh": {"source": str(tmp_path / "body.obj")},
+        "cages": cages,
+        "pin": [study.held(2, 0, -1)],
+    }
     found = []
     for poisson in POISSON:
         law = {"law": "neo-hookean", "poisson_ratio": poisson} if poisson else {"law": "linear"}
         material = {"young_modulus": 1e9, "density": 1000} | law
         time = {"integrator": "static"}
-        lattice = build_model(COMM, msmpetsc.Scene.of(tables | {"material": material, "time": time})).lattice
+        lattice = build_model(
+            COMM, msmpetsc.Scene.of(tables | {"material": material, "time": time})
+        ).lattice
         with hierarchy(COMM, lattice, SHAPES["rest"], STATIC) as case:
             found.append(case.iterations(TOLERANCE, rough=False))
     print(f"\n| {name} | {len(lattice.cells)} |", " | ".join(map(str, found)), "|")

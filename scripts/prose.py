@@ -1,0 +1,106 @@
+#!/usr/bin/env python3
+"""Check the English of docstrings and comments:  scripts/prose.py [files or folders]
+
+Print each offence with its place, then the rates of each folder. Exit with status 1 if a sentence
+is too long or begins badly, if a comment stands at the end of a line of code or is too wide, or if
+a folder has more of the vague words than a reader bears.
+"""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+LONGEST = 25  # words in a sentence
+WIDEST = 88  # columns of a comment
+# most of these words in 1,000, as counted in the models of good style (PyFR, scikit-fem, lineax)
+VAGUE = {"what": 0.5, "one, ones, those, others, such": 3.6}
+MARKS = ("type:", "noqa", "fmt:", "!", "pragma", "%%")
+CODE = re.compile(r"``[^`]*``|`[^`]*`|^(?: {4,}|>>>|\|).*$", re.MULTILINE)
+
+
+def docstrings(source: str) -> Iterator[tuple[int, str]]:
+    """Yield the first line's number and the text of each docstring."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and node.body:
+            first = node.body[0]
+            if text := ast.get_docstring(node):
+                yield first.lineno, text
+
+
+def comments(source: str) -> Iterator[tuple[int, str, bool, int]]:
+    """Yield line number, text, whether code stands before it and last column of each comment.
+
+    Comments on consecutive lines of their own are a single text.
+    """
+    block: list[tuple[int, str, bool, int]] = []
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        text = token.string[1:].strip()
+        if token.type != tokenize.COMMENT or text.startswith(MARKS):
+            continue
+        (line, column), behind = token.start, bool(token.line[: token.start[1]].strip())
+        if block and not behind and block[-1][0] + block[-1][1].count("\n") + 1 == line:
+            begin, before, _, width = block.pop()
+            block.append((begin, f"{before}\n{text}", False, max(width, token.end[1])))
+        else:
+            yield from block
+            block = [(line, text, behind, token.end[1])]
+    yield from block
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Yield the sentences of a text, its code and its tables left out."""
+    for paragraph in re.split(r"\n\s*\n|\n\s*[-*] ", CODE.sub("x", text)):
+        yield from re.split(r"(?<=[.!?:;])\s+", " ".join(paragraph.split()))
+
+
+def offences(path: Path, counts: Counter[str]) -> Iterator[tuple[int, str]]:
+    """Yield line number and fault; add the words of the file to ``counts``."""
+    source = path.read_text()
+    texts = [(line, text) for line, text in docstrings(source)]
+    for line, text, behind, width in comments(source):
+        texts.append((line, text))
+        if behind:
+            yield line, "comment behind code: give it a line of its own above"
+        elif width > WIDEST:
+            yield line, f"comment of {width} columns, at most {WIDEST}"
+    for line, text in texts:
+        words = Counter(re.findall(r"[a-z']+", CODE.sub("", text).lower()))
+        counts["words"] += words.total()
+        for vague in VAGUE:
+            number = sum(words[word] for word in vague.split(", "))
+            counts[vague] += number
+            if number:
+                yield line, f"({number} of: {vague})"
+        for sentence in sentences(text):
+            if (length := len(sentence.split())) > LONGEST:
+                yield line, f"sentence of {length} words: {sentence[:60]} ..."
+            if re.match(r"(Of|Where|What) ", sentence):
+                yield line, f"sentence begins with {sentence.split()[0]}: {sentence[:60]}"
+
+
+def main(names: list[str]) -> int:
+    """Print the offences in these files; return the exit status."""
+    paths = [Path(name) for name in names] or [ROOT / "msmpetsc"]
+    files = [file for path in paths for file in (sorted(path.rglob("*.py")) or [path])]
+    failed, folders = False, defaultdict[Path, Counter[str]](Counter)
+    for file in files:
+        for line, fault in sorted(offences(file, folders[file.parent])):
+            failed |= not fault.startswith("(")
+            print(f"{file}:{line}: {fault}")
+    for folder, counts in folders.items():
+        rates = {vague: 1000 * counts[vague] / max(counts["words"], 1) for vague in VAGUE}
+        over = any(rate > VAGUE[vague] for vague, rate in rates.items())
+        failed |= over and counts["words"] > 200
+        shown = ", ".join(f"{rate:.1f} of {vague!r}" for vague, rate in rates.items())
+        print(f"{folder}: {counts['words']} words; in 1,000: {shown}{' - too many' * over}")
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -65,7 +65,7 @@ class TrueErrors:
             return np.full(2, np.nan)
         start, distance = (_distances(reference, x, exact) for x in (problem.y, position))
         errors: Floats = np.divide(distance, start, out=np.zeros(2), where=start > 0)
-        errors[0] = reference.control.rounding.added_to(errors[0], start[0])
+        errors[0] = reference.control.rounding.step_error(errors[0], start[0])
         return errors
 
     def _reference(self, stepper: Stepper) -> Stepper:

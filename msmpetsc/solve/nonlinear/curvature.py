@@ -1,17 +1,20 @@
-"""Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
+"""Lowest curvature of a step's true Hessian H = M + t^2 (Hessian of E).
 
-F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring or cell is compressed enough, H is
-positive definite for certain, which one pass over them tells.
-Elsewhere the load factor nu may say so, the greatest with H v = (1 - nu) H+ v, H+ the projected Hessian, which has
-nothing negative and all of M: no eigenvalue of M^(-1) H is below 1 - nu. It is 1 where a body buckles, and grows as
-what presses the body does (linear buckling analysis), so that one that was found serves for many steps. Where it is not
-small the lowest eigenvalue of M^(-1) H is looked for: at length when the body is compressed anew or more than it was,
-or something showed a negative curvature; at all other steps the mode found last is followed in a few iterations, with
-multigrid only where its curvature changed.
+F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. Three tests follow
+each other until H is known to be positive definite or a direction of negative curvature is found:
 
-Both are found by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev
-2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1); with Jacobi's a single direction was seen to settle
-on the third.
+1. H is positive definite if no spring or cell is compressed enough. One pass over them tells.
+2. The load factor nu is the greatest number with H v = (1 - nu) H+ v. H+ is the projected Hessian,
+   which has all of M and nothing negative, so no eigenvalue of M^(-1) H is below 1 - nu. A body
+   buckles at nu = 1. The load factor grows as the load does (linear buckling analysis), so a load
+   factor serves many steps.
+3. The lowest eigenvalue of M^(-1) H is computed if nu is not small. A long search is made if the
+   compression has grown or if a solve has met a negative curvature. At all other steps a few
+   iterations follow the last mode, with multigrid only if its curvature has changed.
+
+Tests 2 and 3 use locally optimal conjugate gradients on a block of directions (Knyazev 2001,
+Toward the optimal preconditioned eigensolver, Algorithm 5.1), with the preconditioner of the step.
+A block is needed since a single direction may settle on a higher mode.
 """
 
 from collections.abc import Callable
@@ -29,33 +32,47 @@ from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
-MOST = 100  # iterations of a long search
-SETTLED = (
-    0.95  # of the curvature when half as many iterations were done: there is no lower one to come
-)
-SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
-MORE = 1.25  # times the compression of the last long search, or its mode's curvature: another mode may be lowest
-ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
+# Most iterations of a long search
+MOST = 100
+# A long search ends if the curvature is above this share of its value half as many
+# iterations ago
+SETTLED = 0.95
+# A search ends if a negative curvature is above this multiple of its value two
+# iterations ago
+SHARPENED = 1.1
+# Growth of the compression, or of the mode's curvature, beyond which another mode may
+# be the lowest
+MORE = 1.25
+# Modes of at least this share of the lowest negative curvature count as equally steep
+ALIKE = 0.9
 TINY = np.finfo(float).tiny
-DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none; a compression that is none
+# Relative eigenvalue of a Gram matrix below which directions are linearly dependent
+DEPENDENT = 1e-10
 
-Block = tuple[
-    Rows, ...
-]  # directions (k, n), what H makes of them, and what M or the projected Hessian does
+# Directions (k, n), their products with H, and their products with M or the projected
+# Hessian
+Block = tuple[Rows, ...]
 Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
 
 
 class Alarm(IntEnum):
-    """Where something has shown a negative curvature."""
+    """Place where a solve has met a negative curvature.
+
+    at an earlier iterate or at the last one.
+    """
 
     NOWHERE = 0
-    ON_THE_WAY = 1  # at an iterate that the step has left
+    ON_THE_WAY = 1
     HERE = 2
 
 
 class SearchEffort(NamedTuple):
-    """block: directions of a long search; least: its iterations where it finds nothing; followed:
-    iterations of a short one, of two directions."""
+    """Effort of searches.
+
+    block    : directions of a long search
+    least    : fewest iterations of a long search
+    followed : iterations of a short search, which has two directions
+    """
 
     block: int
     least: int
@@ -63,19 +80,25 @@ class SearchEffort(NamedTuple):
 
 
 EFFORT = SearchEffort(4, 12, 2)
-# With multigrid smooth modes come at once. But not where something is alarming: one bent by 270 degrees had a lowest
-# curvature of 0.04, and seemed to have 0.35.
+# With multigrid smooth modes converge at once. After an alarm EFFORT is taken all the
+# same: a folded body may hide its lowest mode.
 UNIFORM_EFFORT = SearchEffort(2, 3, 1)
-UNCHANGED = 0.1  # of its curvature: a mode that is followed is taken as it is
-LIGHT = 0.5  # load factor: up to there no mode need be known
-UNSEEN = 1.2  # times the load factor that a few iterations find, which is no more than the true one
-GROWN = 4.0  # times the compression that it was found at: so far a body is taken to be loaded alike
-NEGLIGIBLE = 0.3  # of the greatest compression: nodes of less do not say how it has grown
+# Relative change of the mode's curvature below which the mode is taken as it is
+UNCHANGED = 0.1
+# Load factor up to which no mode need be known
+LIGHT = 0.5
+# Safety factor on a load factor of few iterations, which is a lower bound
+UNSEEN = 1.2
+# Growth of the compression up to which a body counts as loaded alike
+GROWN = 4.0
+# Share of the greatest compression below which a node does not tell how the load has
+# grown
+NEGLIGIBLE = 0.3
 
 
 @dataclass(frozen=True)
 class Compressed:
-    """The greatest and the sum, over the free nodes of all ranks, of t^2 concavity / m."""
+    """Greatest value and sum of t^2 concavity / m over the free nodes of all ranks."""
 
     greatest: float = 0.0
     total: float = 0.0
@@ -83,9 +106,9 @@ class Compressed:
 
 @dataclass(frozen=True)
 class Compression(Compressed):
-    """Compression of a body at some positions.
+    """Compression of a body at given positions.
 
-    inertia : M is part of H, which outweighs what is not positive in the rest
+    inertia : whether M is part of H and outweighs negative parts of the elastic Hessian
     ratios  : t^2 concavity / m (m,) of this rank's free nodes
     """
 
@@ -94,7 +117,10 @@ class Compression(Compressed):
 
     @property
     def least_curvature(self) -> float:
-        """No eigenvalue of M^(-1) H is less; 0 where M does not outweigh all that is negative for certain."""
+        """Lower bound of the eigenvalues of M^(-1) H.
+
+        0 if M may not outweigh the negative parts.
+        """
         return max(1 - self.greatest, 0.0) if self.inertia else 0.0
 
 
@@ -102,9 +128,11 @@ NONE = Compression()
 
 
 class LowestCurvature:
-    """Looks for directions of negative curvature of a step's Hessian. All methods but properties are collective.
+    """Search for directions of negative curvature of a step's Hessian.
 
-    preconditioner : of the step's linear solves, or multigrid for a long search
+    All methods but properties are collective.
+
+    preconditioner : of the step's linear solves; it switches to multigrid for a long search
     """
 
     state: ClassVar[dict[str, Range]] = {
@@ -123,27 +151,34 @@ class LowestCurvature:
             functional.unknowns,
             functional.memory,
         )
-        self.its = 0  # of all searches so far
-        self.products = 0  # of them with H, and at multigrid's finest level
-        self.searched = Compressed()  # the compression that the last long search was at
-        self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
-        self.value = 0.0  # its curvature when it was found
-        self.knows_mode = False  # in the last checkpoint
-        self.load = np.inf  # load factor found last; infinite where none was
-        self.loads = np.zeros_like(
-            functional.lattice.mass[self.unknowns.free]
-        )  # compression (m,) that it was found at
-        self.load_mode: Floats | None = None  # and its mode (n,)
+        # Iterations, and products with H (multigrid's finest level included), of all
+        # searches so far
+        self.its = 0
+        self.products = 0
+        # Compression at which the last long search was made
+        self.searched = Compressed()
+        # Lowest known mode (n,), of unit length in the norm of M, and its curvature
+        # when it was found
+        self.mode: Floats | None = None
+        self.value = 0.0
+        # Whether the last checkpoint has the mode
+        self.knows_mode = False
+        # Last load factor, infinite if there is none, the compression (m,) there, and
+        # its mode (n,)
+        self.load = np.inf
+        self.loads = np.zeros_like(functional.lattice.mass[self.unknowns.free])
+        self.load_mode: Floats | None = None
         self.vectors = [self.unknowns.create_vector() for _ in range(2)]
-        self.rigid: Rows | None = None  # motions (6, n) that are left out
+        # Rigid motions (6, n) that a search leaves out
+        self.rigid: Rows | None = None
 
     @property
     def effort(self) -> SearchEffort:
-        """Effort that a search takes with this preconditioner."""
+        """Effort of a search with the present preconditioner."""
         return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
     def compression(self, q: Positions) -> Compression:
-        """Compression at positions q (l, 3) [m] in the functional's problem."""
+        """Return the compression at positions q (l, 3) [m] in the functional's problem."""
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
         concavity = elasticity.concavity(q)[free]
@@ -156,12 +191,12 @@ class LowestCurvature:
     def lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
     ) -> tuple[float, Floats | None]:
-        """Lowest eigenvalue of M^(-1) H that a search comes to, and a direction (n,) of about that curvature.
+        """Return the lowest eigenvalue of M^(-1) H that a search finds, and its direction (n,).
 
-        Or a positive number that it is no less than, and None, where the load factor is small.
+        If the load factor is small, return a positive lower bound of the eigenvalue, and None.
 
-        q       : positions (l, 3) [m] that H was linearised at last
-        hint    : a direction that may have part in it
+        q    : positions (l, 3) [m] at which H was linearised last
+        hint : a direction that may contain the mode
         """
         products = self.hessian.products + self.preconditioner.products
         is_known = not (alarm or self.unknowns.static)
@@ -169,16 +204,19 @@ class LowestCurvature:
         found = None if least >= 1 - LIGHT else self._lowest(q, compression, alarm, hint)
         self.products += self.hessian.products + self.preconditioner.products - products
         if found is None:
-            self.searched = Compressed()  # so that a body that is loaded more has a long search
+            # A body that is loaded more then has a long search
+            self.searched = Compressed()
             return least, None
         values, modes = found
-        if not np.isfinite(values[0]):  # springs of no length: from a cusp any way leads down
+        # Springs of zero length have a cusp: g falls along any direction
+        if not np.isfinite(values[0]):
             self.mode = None
             return -np.inf, self._random(1)[0]
         self.mode, self.value = modes[0].copy(), float(values[0])
         if values[0] < 0:
-            # A random direction's projection on all that lead down as well: where a body may buckle to many sides, it
-            # goes the same way on any ranks, no matter which of them rounding has made the first.
+            # A body may buckle to several sides alike. The projection of noise on these
+            # modes does not depend on their order, which is rounding's, so all ranks
+            # take one side.
             down = modes[: int((values <= ALIKE * values[0]).sum())]
             parts = self.comm.allreduce(to_host((down * self.functional.mass) @ self._random(1)[0]))
             return values[0], like(down, parts / max(np.linalg.norm(parts), TINY)) @ down
@@ -187,15 +225,16 @@ class LowestCurvature:
     def _lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
     ) -> tuple[Floats, Rows]:
-        """The lowest curvatures (k,) and their modes (k, n), followed or searched for at length."""
+        """Return the lowest curvatures (k,) and their modes (k, n), by a short or a long search."""
         found, before = None, self.searched
         more = (
             compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
         )
-        if not (alarm or more):  # in which case modes may have come
+        # Another mode may be the lowest after an alarm or a greater compression
+        if not (alarm or more):
             found = self._followed()
         if found is None:
-            # What was doubtful is so in the next step, too
+            # After an alarm the next step makes a long search, too
             self.searched = (
                 Compressed() if alarm else Compressed(compression.greatest, compression.total)
             )
@@ -206,14 +245,15 @@ class LowestCurvature:
         return found
 
     def _load(self, q: Positions, ratios: Floats) -> float:
-        """The load factor at positions q (l, 3) [m], at the most: as far as the body is loaded as it was when that was
-        found, it grows as the compression does."""
+        """Return an upper bound of the load factor at positions q (l, 3) [m].
+
+        While a body is loaded alike, its load factor grows as its compression (m,) does.
+        """
         floor = NEGLIGIBLE * max(self.comm.allreduce(greatest(self.loads), MPI.MAX), DEPENDENT)
         growth = self.comm.allreduce(greatest(ratios / np.maximum(self.loads, floor)), MPI.MAX)
         load: float = UNSEEN * self.load * growth
-        is_heavy = (
-            MORE * UNSEEN * self.load > LIGHT
-        )  # so nearly that a search would soon be due again
+        # So near the limit that the next growth would need another search
+        is_heavy = MORE * UNSEEN * self.load > LIGHT
         if not np.isfinite(load) or (not is_heavy and (growth > GROWN or load > LIGHT)):
             with self.preconditioner.searching(q, self.functional.problem.contact):
                 self.load = self._load_factor(q) if self.preconditioner.is_uniform else np.inf
@@ -221,7 +261,7 @@ class LowestCurvature:
         return load
 
     def _load_factor(self, q: Positions) -> float:
-        """The greatest nu with H v = (1 - nu) H+ v, H+ the projected Hessian, found by a few iterations."""
+        """Return the greatest nu with H v = (1 - nu) H+ v, H+ the projected Hessian."""
         functional, hessian = self.functional, self.hessian
         projected = TrueHessian(
             self.unknowns, functional.elasticity, functional.time_step, hessian.contact
@@ -237,14 +277,17 @@ class LowestCurvature:
         return 1 - float(values[0])
 
     def _followed(self) -> tuple[Floats, Rows] | None:
-        """Lowest curvatures, and their modes, near the mode found last. None where none is known, or where it has
-        stiffened so much that another may be the lowest now: one of 0.29 hid behind one that went from 0.87 to 1.57."""
+        """Return the lowest curvatures and their modes near the last mode.
+
+        Return None without a last mode, or if the mode has stiffened so much that another mode may
+        be the lowest now.
+        """
         if self.mode is None:
             return None
         its = self.effort.followed
         values, modes = self._iterate(self.mode[None], 1, 0, 0)
         if abs(values[0] - self.value) <= UNCHANGED * self.value:
-            # As it was, so that slow changes add up
+            # The stored curvature stays, so that slow changes add up
             return np.array([self.value]), modes
         values, modes = self._iterate(
             np.concatenate([self.mode[None], self._random(1)]), 2, its, its
@@ -254,16 +297,20 @@ class LowestCurvature:
     def _search_at_length(
         self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort
     ) -> tuple[Floats, Rows]:
-        """Search from something of each mode, for near a mode that is known a lower one comes up
-        late, and without rigid motions, for their curvature mostly is about 1, which would hide a
-        lower one as long; then from the best of all of them."""
+        """Return the lowest curvatures and their modes by a long search from noise.
+
+        Near a known mode a lower mode converges late, so the search begins with parts of all
+        modes. Rigid motions have a curvature of about 1 and would hide a lower mode as long, so
+        they are left out at first. A second search begins with the best of all directions.
+        """
         is_uniform = effort is UNIFORM_EFFORT
         start = self._random(effort.block - (is_uniform and self.mode is not None))
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
         known = [] if self.mode is None else [self.mode[None]]
         self.rigid = self._rigid_motions(q)
-        if self.rigid is None and is_uniform:  # nothing hides a mode, nor is any slow to come
+        # Nothing hides a mode, and all modes converge fast
+        if self.rigid is None and is_uniform:
             return self._iterate(np.concatenate([start, *known]), effort.block, MOST, effort.least)
         _, modes = self._iterate(self._without_rigid(start), effort.block, MOST, effort.least)
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
@@ -272,24 +319,29 @@ class LowestCurvature:
         )
 
     def _random(self, count: int) -> Rows:
-        """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
+        """Return preconditioned noise (count, n), which does not depend on the number of ranks."""
         return self._unit(self._of_each(self.preconditioner.apply, self.functional.noise(count)))
 
     def _iterate(
         self, start: Rows, block: int, most: int, least: int, weigh: Act | None = None
     ) -> tuple[Floats, Rows]:
-        """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l,
-        n), and theirs (k, n). They are of W^(-1) H, W what ``weigh`` applies, M if None."""
+        """Return the lowest eigenvalues (k,), k <= block, of W^(-1) H and their modes (k, n).
+
+        start : directions (l, n)
+        most  : most iterations
+        least : fewest iterations
+        weigh : applies W; M if None
+        """
         size = min(block, len(start))
         values, (x, last) = self._ritz(self._block(start, weigh), size)
-        size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
+        # A small body has fewer modes than the block
+        size, lowest = len(values), [values[0]]
         for its in range(1, most + 1):
             residuals = x[1] - like(start, values)[:, None] * x[2]
             sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
             self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
-            residuals /= like(
-                residuals, np.maximum(sizes, TINY)[:, None]
-            )  # so that float32 holds them
+            # Multigrid works in single precision
+            residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])
             w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
             blocks = [x, self._block(w, weigh), *([] if last is None else [last])]
             values, (x, last) = self._ritz(
@@ -311,8 +363,11 @@ class LowestCurvature:
         return directions, self._of_each(self.hessian.mult, directions), weighed
 
     def _ritz(self, block: Block, size: int) -> tuple[Floats, tuple[Block, Block | None]]:
-        """The lowest eigenvalues in the span of a block, ascending (size,); their directions, of unit length, and of
-        each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
+        """Return the lowest Ritz values (size,) in the span of a block, ascending, and two blocks.
+
+        The first block has the Ritz vectors, of unit length. The second block has the parts of
+        the Ritz vectors outside the first ``size`` directions, the conjugate directions.
+        """
         span, products, weighed = block
         grams = self.comm.allreduce(
             np.stack([to_host(span @ products.T), to_host(span @ weighed.T)])
@@ -332,8 +387,10 @@ class LowestCurvature:
         return values[:size], (best, tuple(rest @ rows[size:] for rows in block))
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
-        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal
-        in M; None if nodes are held."""
+        """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].
+
+        They are orthonormal in M. Return None if nodes are fixed.
+        """
         if self.unknowns.total < self.functional.lattice.table.total:
             return None
         columns = q[self.unknowns.free].T
@@ -345,7 +402,8 @@ class LowestCurvature:
                 columns[(c + 1) % 3],
             )
         motions = motions.reshape(6, -1)
-        for _ in range(2):  # once more, for what the first left of rounding
+        # Orthogonalised twice: the first pass leaves rounding
+        for _ in range(2):
             sizes, parts = np.linalg.eigh(
                 self.comm.allreduce(to_host((motions * self.functional.mass) @ motions.T))
             )
@@ -369,13 +427,13 @@ class LowestCurvature:
         return results
 
     def _unit(self, directions: Rows) -> Rows:
-        """Directions scaled to unit length in the norm of M; those of no length stay so."""
+        """Return directions scaled to unit length in the norm of M; zero directions stay zero."""
         squares: Floats = self.comm.allreduce(to_host(directions**2 @ self.functional.mass))
         lengths: Rows = like(directions, np.maximum(np.sqrt(squares), TINY))[:, None]
         return directions / lengths
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Store the mode and what was searched: another long search at each checkpoint would cost a tenth of a run."""
+        """Store the mode and the searched compression, so that a restart needs no long search."""
         rows = np.zeros((self.functional.lattice.owned, 3), like=self.functional.lattice.nodes)
         self.knows_mode = self.mode is not None
         if self.mode is not None:
@@ -386,7 +444,7 @@ class LowestCurvature:
         checkpoint.keep_counts(self)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
+        """Restore the mode and the searched compression."""
         checkpoint.restore_counts(self)
         if self.knows_mode:
             rows = like(self.functional.mass, checkpoint.row("lowest_mode"))
@@ -394,7 +452,7 @@ class LowestCurvature:
         self.loads = like(self.functional.mass, checkpoint.row("loads"))[self.unknowns.free]
 
     def forget(self, modes: bool = True) -> None:
-        """Forget what a checkpoint does not hold; ``modes``: all else, too."""
+        """Forget all that a checkpoint does not hold; ``modes``: the mode and the load, too."""
         self.load_mode = None
         if modes:
             self.searched, self.mode, self.load = Compressed(), None, np.inf

@@ -1,13 +1,17 @@
-"""Stopping rule of a step: the error that x is known to have, and how closely the next linear solve must be made.
+"""Stopping rule of a step: the estimated error of an iterate x, and the tolerance of the next
+linear solve.
 
-The error of x is |x - x*|_M / |x - y|_M, estimated. |F(x)|_(M^-1) / |x - y|_M bounds it wherever E
-is convex between x and x*. Where that will do, or no estimate can be had, the bound is the error.
+The relative error of x is |x - x*|_M / |x - y|_M. Three numbers stand for the error, from the
+cheapest to the dearest:
 
-No estimate is made where the linear solve that led to x knows that what it left of |e|_H will do (linear.cg_bound), and
-F is little else than r, what it left of F: |F - r|_(M^-1) bounds the rest.
+1. |F(x)|_(M^-1) is an upper bound if E is convex between x and x*.
+2. The linear solve that led to x bounds its own error in the norm of H (linear.cg_bound). The
+   nonlinear residual F - r, r the residual of the linear solve, bounds the rest of the error.
+3. An estimate solves for the Newton correction at x (error_estimate).
 
-With multigrid |F|_(P^-1), P the preconditioner, tells when an estimate is worth its cost: a linear solve leaves it. It
-is believed where F at the next iterate is about that, so that g is a parabola there (LINEAR).
+With multigrid the natural norm |F|_(P^-1), P the preconditioner, tells when an estimate is worth
+its cost. The natural norm is trusted if F at the next iterate is about the residual that the linear
+solve has left: g is nearly quadratic there.
 """
 
 from dataclasses import dataclass, field, replace
@@ -22,26 +26,47 @@ from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvatu
 from msmpetsc.solve.nonlinear.error_estimate import FEW, LOWER, ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
+# Relative error of a step if the user names none
 DEFAULT_ERROR = 1e-3
-FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left to tell by
-KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
-FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
-LEAST_RATIO = 10.0  # taken, however near they were: an estimate that comes too early is the next solve's start
-EARLY = 2.0  # times the error that would do: when a step is first estimated
-LOOSEST = 0.3  # ksp_rtol
-SHARE = 0.5  # of the error that would do, left to the linear solve
-LINEAR = 2.0  # times |F|_(P^-1) that a linear solve leaves of it: g is a parabola there
-FINAL = 60.0  # times the error that would do: a linear solve from there on is to be the last
-PARABOLA = 0.2  # of F: what the linear solve has not left of it, where its bound is believed
-NEAR = 0.02  # least eigenvalue of P^(-1) H: P is near H
-STAYS = 0.5  # of |F| before: where it no longer falls, it may be rounding of stiff contact
-CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
-NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
+# Relative error below which g, which is quadratic in the error, has no digits left
+FULL_STEP_ERROR = 1e-5
+# Share of the acceptable error; an error known to be below it needs no closer estimate
+KNOWN = 0.8
+# Ratio of the bound to the error before any estimate was made
+FIRST_RATIO = 5.0
+# Least ratio of bound to error in use; an estimate that is early starts the next linear
+# solve
+LEAST_RATIO = 10.0
+# Multiple of the acceptable error at which a step is first estimated
+EARLY = 2.0
+# Greatest ksp_rtol
+LOOSEST = 0.3
+# Share of the acceptable error that the linear solve may leave
+SHARE = 0.5
+# Ratio of |F|_(P^-1) to the residual of the linear solve up to which g counts as
+# quadratic
+LINEAR = 2.0
+# Multiple of the acceptable error from which a linear solve should be the last
+FINAL = 60.0
+# Share of F that the nonlinear residual may have for the bound of the linear solve to
+# hold
+PARABOLA = 0.2
+# Least eigenvalue of P^(-1) H for which P counts as close to H
+NEAR = 0.02
+# Ratio of |F| to the last |F| above which F may be rounding of stiff contact
+STAYS = 0.5
+# Factor on the goal after a doubt, and its least value
+CLOSER, CLOSEST = 0.1, 1e-3
+# ksp_atol that never ends a solve, PETSc's default
+NO_ATOL = 1e-50
+# DIVERGED_FNORM_NAN, which PETSc 3.25 renames
+NOT_FINITE = -4
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
     PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
     NOT_FINITE: "not finite",
-    -14: "not finite",  # from PETSc 3.25 on: DIVERGED_OBJECTIVE_NANORINF
+    # DIVERGED_OBJECTIVE_NANORINF, from PETSc 3.25 on
+    -14: "not finite",
 }
 REASON = {
     value: name
@@ -55,95 +80,112 @@ KSP_REASON = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solve has come to, as far as is known at its last iterate.
+    """State of a solve at its last iterate.
 
-    corrected   : the last iterate's error was estimated, so that its Newton correction is known
-    doubts      : how often the step came to a point that is no minimum, or farther from one than it seemed
+    goal        : relative error at which the solve ends; 0 if a budget of iterations ends it
+    error       : relative error of the iterate, estimated or bounded
+    bound       : upper bound of the relative error, by |F|_(M^-1)
+    residual    : |F|_(M^-1) of the iterate
+    distance    : |x - y|_M of the iterate
+    early       : multiple of the goal at which the error is estimated
+    corrected   : whether the error was estimated, so that the Newton correction is known
+    left        : |r|_(P^-1) of the last linear solve; infinite if unknown
+    solved      : bound on |e|_H that the last linear solve has left; infinite if unknown
+    nonlinear   : |F - r|_(M^-1), r the residual of the last linear solve; infinite if unknown
+    alarm       : place where a solve has met a negative curvature
+    at_rounding : whether F is rounding and nothing else
+    doubts      : number of points found to be no minimum, or farther from it than estimated
+    compression : of the iterate; None if not yet computed
     """
 
-    goal: float = 0.0  # relative error to come to; 0 where a budget of iterations ends the step
-    error: float = np.inf  # of the last iterate, estimated or bounded
-    bound: float = np.inf  # on it
-    residual: float = np.inf  # |F|_(M^-1) of the last iterate
-    distance: float = 0.0  # |x - y|_M of it
-    early: float = EARLY  # how many times the goal an error may be to be estimated
+    goal: float = 0.0
+    error: float = np.inf
+    bound: float = np.inf
+    residual: float = np.inf
+    distance: float = 0.0
+    early: float = EARLY
     corrected: bool = False
-    left: float = (
-        np.inf
-    )  # by the linear solve that led here, |r|_(P^-1); infinite where that says nothing
-    solved: float = np.inf  # bound on what it left of |e|_H
-    beside: float = (
-        np.inf
-    )  # |F - r|_(M^-1), r what it left of F; infinite where g is no parabola there
-    alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
-    at_rounding: bool = False  # F is nothing but rounding
+    left: float = np.inf
+    solved: float = np.inf
+    nonlinear: float = np.inf
+    alarm: Alarm = Alarm.NOWHERE
+    at_rounding: bool = False
     doubts: int = 0
-    compression: Compression | None = None  # of the last iterate, where it was asked for
+    compression: Compression | None = None
 
-    def known(self, lowest: float) -> float:
-        """The relative error by what the linear solve left and what F is beside that, where M^(-1) H has no eigenvalue
-        below ``lowest``; infinite where that says nothing."""
+    def error_of_solve(self, lowest: float) -> float:
+        """Return the bound of the relative error by the last linear solve; infinite if it has none.
+
+        lowest : lower bound of the eigenvalues of M^(-1) H
+        """
         if not min(lowest, self.distance) > 0:
             return np.inf
-        return float((self.solved / np.sqrt(lowest) + self.beside / lowest) / self.distance)
+        return float((self.solved / np.sqrt(lowest) + self.nonlinear / lowest) / self.distance)
 
     @property
     def is_flat(self) -> bool:
-        """Whether g is so near its minimum that changes of it have no digits."""
+        """Whether g is so close to its minimum that changes of g have no digits."""
         return self.bound < FULL_STEP_ERROR and (self.corrected or not self.doubts)
 
     @property
     def is_enough(self) -> bool:
-        """Whether the error is below the goal, or nothing but rounding is left."""
+        """Whether the error is below the goal or F is rounding."""
         return self.at_rounding or self.error <= self.goal
 
 
 @dataclass(eq=False)
 class ErrorControl:
-    """Judges the iterates of one stepper. All methods that are given an iterate are collective."""
+    """Errors of the iterates of one stepper. All methods that take an iterate are collective.
+
+    target       : relative error at which a step is done; 0 if a budget of iterations ends it
+    tightest     : least ksp_rtol of a linear solve
+    ratio        : ratio of bound to error in the last estimate
+    has_residual : whether estimate.residual has the residual of the last linear solve
+    error_per_residual : ratio of the bound on |e|_H to |r|_(P^-1) in the last linear solve; 0: none
+    """
 
     functional: StepFunctional
     estimate: ErrorEstimate
     curvature: LowestCurvature
     rounding: Rounding
-    target: float  # relative error at which a step is done; 0 where a budget of iterations ends it
-    tightest: float  # ksp_rtol that no linear solve goes below
-    ratio: float = FIRST_RATIO  # of bound to error in the last estimate
+    target: float
+    tightest: float
+    ratio: float = FIRST_RATIO
     solve_bound: SolveBound = field(default_factory=SolveBound)
-    has_residual: bool = (
-        False  # of the last linear solve, in estimate.residual until the iterate is judged
-    )
-    slack: float = (
-        0.0  # bound on |e|_H over |r|_(P^-1) at the end of the last linear solve; 0: none
-    )
+    has_residual: bool = False
+    error_per_residual: float = 0.0
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
-        """What is known at an iterate: its error, or a bound on it while that is far too large."""
+        """Return the outcome at an iterate.
+
+        its error, or the bound while the bound is far above the goal.
+        """
         residual, distance = (
             self.functional.dual_norm(iterate.f),
             self.functional.distance(iterate.q),
         )
         stays = residual > STAYS * before.residual
-        at_rounding = self.rounding.is_all_of(
+        at_rounding = self.rounding.explains(
             iterate, self.functional.problem.contact if stays else None
         )
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(
             before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm
         )
-        now = replace(now, corrected=False, beside=np.inf, compression=None)
-        if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
+        now = replace(now, corrected=False, nonlinear=np.inf, compression=None)
+        # No error is relative to the start x = y
+        if not distance > 0 or not np.isfinite(residual):
             return replace(now, error=0.0 if at_rounding else np.inf)
         now = replace(now, bound=residual / distance)
         if self.has_residual and now.solved <= now.goal * now.distance and not now.alarm:
-            now = self._known(iterate, now)
+            now = self._bounded_by_solve(iterate, now)
             if now.error <= now.goal:
                 return now
-        if self._is_next_no_dearer(now):
+        if self._prefers_next_solve(now):
             return replace(now, error=now.bound)
-        is_near = at_rounding or now.bound <= self._farthest(now)
+        is_near = at_rounding or now.bound <= self._useful_bound(now)
         seems_near = is_near
-        if self._is_smooth(now):  # whether the linear solve that led here has left so little
+        if self._trusts_natural_norm(now):
             seems_near = now.left <= EARLY * now.goal * now.distance * np.sqrt(self.estimate.least)
         if not seems_near and not at_rounding:
             return replace(now, error=now.bound)
@@ -156,32 +198,31 @@ class ErrorControl:
         found = self.estimated(iterate, now, now.goal)
         if is_near or self.estimate.is_trusted:
             return found
-        return replace(
-            found, error=now.bound
-        )  # F is not what was left of it: g is no parabola here
+        # F is not the residual of the linear solve: g is not quadratic here
+        return replace(found, error=now.bound)
 
-    def _is_next_no_dearer(self, now: Outcome) -> bool:
-        """Whether the next linear solve costs no more than an estimate, which is one itself, and leads on."""
+    def _prefers_next_solve(self, now: Outcome) -> bool:
+        """Return whether the next linear solve costs no more than an estimate."""
         if now.alarm or now.doubts or now.at_rounding:
             return False
         return now.goal * now.distance < now.solved < np.inf
 
-    def _known(self, iterate: Iterate, now: Outcome) -> Outcome:
-        """What is known where the last linear solve has left so little that it may be the last of all."""
+    def _bounded_by_solve(self, iterate: Iterate, now: Outcome) -> Outcome:
+        """Return the outcome with the error bounded by the last linear solve."""
         self.estimate.residual.aypx(-1.0, iterate.f)
         self.has_residual = False
-        beside = self.functional.dual_norm(self.estimate.residual)
-        if beside > PARABOLA * now.residual:
+        nonlinear = self.functional.dual_norm(self.estimate.residual)
+        if nonlinear > PARABOLA * now.residual:
             return replace(now, error=np.inf)
-        now = self.with_compression(iterate, replace(now, beside=beside))
+        now = self.with_compression(iterate, replace(now, nonlinear=nonlinear))
         assert now.compression is not None
-        error = now.known(now.compression.least_curvature or self.estimate.convexity)
+        error = now.error_of_solve(now.compression.least_curvature or self.estimate.convexity)
         if error > 0:
             self.ratio = max(now.bound / error, 1.0)
         return replace(now, error=error)
 
     def with_compression(self, iterate: Iterate, now: Outcome) -> Outcome:
-        """Return the outcome of an iterate, with its compression."""
+        """Return the outcome with the compression of its iterate."""
         return (
             now
             if now.compression
@@ -189,16 +230,20 @@ class ErrorControl:
         )
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
-        """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
+        """Return the outcome with an estimated error.
+
+        The error is relative to |x - e - y|_M, e the Newton correction, since x may still be close
+        to y.
+        """
         distance = now.distance
         enough = EARLY * goal * distance if goal else np.inf
-        trusted = LINEAR * now.left if self._is_smooth(now) else 0.0
+        trusted = LINEAR * now.left if self._trusts_natural_norm(now) else 0.0
         length = self.estimate(
             iterate, now.residual, enough, KNOWN * goal * distance, trusted=trusted
         )
         if not np.isfinite(length):
             return replace(now, error=now.bound, alarm=Alarm.HERE)
-        is_known = now.bound <= self._farthest(now) or self.estimate.is_trusted
+        is_known = now.bound <= self._useful_bound(now) or self.estimate.is_trusted
         if self.estimate.missing is None and is_known:
             self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
         error = self.rounding.relative(
@@ -206,16 +251,19 @@ class ErrorControl:
         )
         return replace(now, error=error, early=1.0, corrected=True)
 
-    def _farthest(self, now: Outcome) -> float:
-        """The bound up to which an estimate says something, by what those before have said."""
+    def _useful_bound(self, now: Outcome) -> float:
+        """Return the bound up to which an estimate is useful, by the ratio of the last estimates."""
         return max(self.ratio, LEAST_RATIO) * now.early * now.goal
 
-    def _is_smooth(self, now: Outcome) -> bool:
-        """Whether |F|_(P^-1) may bound errors: P is near H, and nothing has shown a negative curvature."""
+    def _trusts_natural_norm(self, now: Outcome) -> bool:
+        """Return whether |F|_(P^-1) may bound errors.
+
+        P is close to H and H had no negative curvature.
+        """
         return now.left < np.inf and not now.alarm and self.estimate.least >= NEAR
 
-    def led_by(self, ksp: PETSc.KSP, now: Outcome) -> Outcome:
-        """What is known once a linear solve with the true Hessian has led to the next iterate."""
+    def after_linear_solve(self, ksp: PETSc.KSP, now: Outcome) -> Outcome:
+        """Return the outcome with the bounds that a linear solve with the true Hessian gives."""
         is_natural = (
             ksp.getType() == PETSc.KSP.Type.CG and ksp.getNormType() == PETSc.KSP.NormType.NATURAL
         )
@@ -233,32 +281,38 @@ class ErrorControl:
         return replace(now, left=left, solved=solved)
 
     def _solved(self, ksp: PETSc.KSP) -> float:
-        """Bound on |e|_H that a linear solve has left."""
+        """Return the bound on |e|_H that a linear solve has left; infinite if unknown."""
         is_far = self.estimate.preconditioner.is_uniform and self.estimate.least < NEAR
-        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.is_blind or is_far:
+        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.needs_probe or is_far:
             return np.inf
         solved, residual = self.solve_bound.of(LOWER * self.estimate.least), ksp.getResidualNorm()
         if np.isfinite(solved) and residual > 0:
-            self.slack = solved / residual
+            self.error_per_residual = solved / residual
         return solved
 
     def tolerances(self, now: Outcome) -> tuple[float, float]:
-        """ksp_rtol and ksp_atol of the next linear solve: it need not gain more digits than are missing."""
+        """Return ksp_rtol and ksp_atol of the next linear solve.
+
+        it gains the missing digits and no more.
+        """
         missing = now.bound / self.ratio
         is_last = missing <= FINAL * now.goal
         rtol = CLOSEST * self.tightest if is_last else self.tightest
-        if self._is_smooth(now):
+        if self._trusts_natural_norm(now):
             return rtol, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
-        if is_last and self.slack and not self.estimate.preconditioner.is_uniform:
-            return rtol, SHARE * now.goal * now.distance / self.slack
-        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), 1e-50  # PETSc's: none
+        if is_last and self.error_per_residual and not self.estimate.preconditioner.is_uniform:
+            return rtol, SHARE * now.goal * now.distance / self.error_per_residual
+        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), NO_ATOL
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
-        """What is known where a step goes on from a point that is no minimum, or farther from one
-        than it seemed; None where there is no more to gain.
+        """Return the outcome from which a step goes on after a doubt; None if nothing is to be
+        gained.
 
-        has_moved : the point was left. From a saddle the goal stays; else it becomes closer, until g has no digits left
-            to tell by: where a second correction has shown that g is no parabola, a bound of the same size says nothing
+        The goal stays after a saddle. Otherwise the goal becomes closer until g has no digits left:
+        a second correction has shown that g is not quadratic, so an error bound of the same size
+        says nothing.
+
+        has_moved : whether the step goes on from another point
         """
         is_saddle, closest = np.isinf(now.error), CLOSEST * self.target
         goal = now.goal if has_moved and is_saddle else CLOSER * now.goal
@@ -277,17 +331,17 @@ class ErrorControl:
 
     def forget(self, modes: bool) -> None:
         self.ratio = FIRST_RATIO
-        self.slack = 0.0
+        self.error_per_residual = 0.0
         self.estimate.forget(modes)
 
 
 def not_converged(
     snes: PETSc.SNES, ksp: PETSc.KSP, now: Outcome, iterations: int, worst: str, true_hessian: bool
 ) -> StepFailed:
-    """SNES gave up after ``iterations``.
+    """Return the failure of a SNES that gave up after ``iterations``.
 
-    worst        : words of where_worst
-    true_hessian : newton's presets, which another one would not help
+    worst        : description by ``where_worst``
+    true_hessian : whether the preset is newton's, so that no other preset can help
     """
     reason, kind = REASON.get(snes.reason, str(snes.reason)), KINDS.get(snes.reason, "iterations")
     preset = "" if true_hessian else "another preset (newton), "
@@ -296,28 +350,28 @@ def not_converged(
         reason += f" (KSP {KSP_REASON.get(ksp.reason, str(ksp.reason))} after {ksp.its} its)"
         advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
     return StepFailed(
-        f"did not converge: {reason} after {iterations} iterations, residual |F| = {now.residual:.2e}, "
-        f"relative error {now.error:.2e}{worst}; try {advice}",
+        f"did not converge: {reason} after {iterations} iterations, "
+        f"residual |F| = {now.residual:.2e}, relative error {now.error:.2e}{worst}; try {advice}",
         kind,
     )
 
 
 def no_minimum(now: Outcome, worst: str) -> StepFailed:
-    """All that the step came to was no minimum, or farther from one than it seemed."""
+    """Return the failure of a step whose iterates all were doubtful."""
     seen = (
         "a saddle or a fold"
         if np.isinf(now.error)
         else "a point farther from its solution than it seemed"
     )
     return StepFailed(
-        f"did not come to a minimum: it came to {seen} {now.doubts} times, residual |F| = {now.residual:.2e}{worst}; "
-        "try a smaller time.step, or another preset (newton)",
+        f"did not come to a minimum: it came to {seen} {now.doubts} times, "
+        f"residual |F| = {now.residual:.2e}{worst}; try a smaller time.step, or another preset (newton)",
         "no minimum",
     )
 
 
 def where_worst(functional: StepFunctional, iterate: Iterate) -> str:
-    """Words on where F pulls farthest, and on what is inside out (collective)."""
+    """Return words on the node of the greatest F and on inverted cells (collective)."""
     comm, lattice = functional.comm, functional.lattice
     node = node_of_greatest(comm, lattice, *functional.pull(iterate.f))
     return f", worst at {node}{describe_inverted(comm, lattice, iterate.q)}"

@@ -1,4 +1,4 @@
-"""First guess of a step: the best of a few guesses that cost next to nothing."""
+"""First guess of a step: the best of several guesses that cost next to nothing."""
 
 import numpy as np
 
@@ -9,24 +9,22 @@ from msmpetsc.solve.nonlinear.functional import StepFunctional
 class FirstGuess:
     """Guesses for the steps of one lattice.
 
-    extrapolate : the guess of least g, not y as published
+    extrapolate : take the guess of least g; otherwise y, as published
     """
 
     def __init__(self, functional: StepFunctional, extrapolate: bool):
         self.functional, self.extrapolate = functional, extrapolate
-        self.holds = (
-            functional.unknowns.total < functional.lattice.table.total
-        )  # some nodes are no unknowns
-        self.corrections: list[
-            Positions
-        ] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
+        # Whether some nodes are fixed and thus no unknowns
+        self.has_fixed = functional.unknowns.total < functional.lattice.table.total
+        # c = x - y of the last steps (l, 3) [m], at most two, the newest first
+        self.corrections: list[Positions] = []
 
     def best(self) -> Positions:
-        """The start (l, 3) [m] of the step that the functional has begun (collective).
+        """Return the best guess (l, 3) [m] for the step that the functional has begun (collective).
 
-        Besides y, as published: y and the elastic corrections of the last steps, extrapolated; q_n, moved by
-        what the free flight moves on average where nothing is held, so that a step that stops early keeps the momentum;
-        and the free flight y + t^2 M^(-1) f_ext itself.
+        The guesses are y; y plus the extrapolated elastic corrections of the last steps; q_n moved
+        by the mean displacement of the free flight; and the free flight y + t^2 M^(-1) f_ext. The
+        mean displacement keeps the momentum of a free body even if the step stops early.
         """
         problem, lattice = self.functional.problem, self.functional.lattice
         q, y = problem.q, problem.y
@@ -38,17 +36,21 @@ class FirstGuess:
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
         surface = self.functional.surface
-        met = surface is not None and surface.presses(q)  # parts of it push each other
-        if not met:  # else a free flight leads into what presses
+        presses = surface is not None and surface.presses(q)
+        # A free flight would lead into the parts that press each other
+        if not presses:
             guesses.append(flight)
-        values = [self.functional.value(self.held(guess)) for guess in guesses]
-        best = self._least(guesses, values) if surface and met else int(np.argmin(values))
+        values = [self.functional.value(self.with_fixed(guess)) for guess in guesses]
+        best = self._least(guesses, values) if surface and presses else int(np.argmin(values))
         return guesses[best]
 
     def _least(self, guesses: list[Positions], without: list[float]) -> int:
-        """The guess (a number) of least g, of which ``without`` is that without self-contact.
+        """Return the number of the guess of least g.
 
-        Self-contact costs most to ask for, and takes no more away than it, or an elastic slip, stores at the start.
+        Self-contact costs most. It lowers g by no more than the energy that it, or an elastic slip,
+        stores at the start. So most guesses are ruled out without it.
+
+        without : g of each guess without self-contact
         """
         functional = self.functional
         problem, best, least = functional.problem, 0, np.inf
@@ -58,31 +60,31 @@ class FirstGuess:
         for number in np.argsort(without):
             if without[number] - stored >= least:
                 break
-            value = functional.value(self.held(guesses[number]), True)
+            value = functional.value(self.with_fixed(guesses[number]), True)
             if value < least:
                 best, least = int(number), value
         return best
 
     def learn(self, x: Positions) -> None:
-        """The step has come to x (l, 3) [m]."""
+        """Take the correction of a step that ended at x (l, 3) [m]."""
         self.corrections = [x - self.functional.problem.y, *self.corrections[:1]]
 
     def forget(self) -> None:
-        """Forget what earlier steps showed."""
+        """Forget the corrections of earlier steps."""
         self.corrections = []
 
-    def held(self, guess: Positions) -> Positions:
-        """The guess, but with the held nodes where they will be."""
+    def with_fixed(self, guess: Positions) -> Positions:
+        """Return the guess (l, 3) [m] with fixed nodes at their places after the step."""
         lattice = self.functional.lattice
         return (
             np.where(lattice.pinned[:, None], self.functional.problem.fixed, guess)
-            if self.holds
+            if self.has_fixed
             else guess
         )
 
     def drift(self, moved: Rows) -> Floats | float:
-        """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""
-        if self.holds:
+        """Return the mean (3,) by mass of displacements (l, 3) [m]; 0 if some nodes are fixed."""
+        if self.has_fixed:
             return 0.0
         mass = self.functional.lattice.mass
         sums = np.append(to_host(mass @ moved[: len(mass)]), float(mass.sum()))

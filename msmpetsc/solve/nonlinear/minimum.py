@@ -1,8 +1,8 @@
-"""Examination of where a step ended: at a minimum of g, as near to it as was said, or at a point
-where F is small and no more.
+"""Test whether an iterate is a minimum of g, and whether its error was estimated rightly.
 
-The estimate of a step's error is the Newton correction e at x. Where a body is compressed g may have a fold or a saddle
-between x and x - e, or curve so much that e says little; so all is looked at once more at x - e, which is nearer.
+F may be small without a minimum. The estimate of a step's error is the Newton correction e at x.
+If the body is compressed, g may have a fold or a saddle between x and x - e. Its curvature may also
+change so much that e says little. So Hessian and error are examined once more at x - e.
 """
 
 import sys
@@ -18,26 +18,41 @@ from msmpetsc.solve.nonlinear.error_control import KNOWN, Outcome
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
-CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
-SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
-DOUBTFUL = 30.0  # times what both say may be the error: 10 times were seen in a valley
-SLOPE = 0.25  # over what the curvature makes of it on the first move: less, as of a symmetric body, may be rounding
-FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled while g falls, or halved until it does
+# Least eigenvalue of M^(-1) H below which the first estimate may have missed too much
+CONVEX = 0.5
+# Share of the first correction; a second correction above it shows that g is not
+# quadratic
+SMALL = 0.3
+# Factor on an error that both corrections disagree on
+DOUBTFUL = 30.0
+# Ratio of a slope to the curvature's share in the first move; a smaller slope may be
+# rounding
+SLOPE = 0.25
+# First move off a saddle [cells], doubled while g falls or halved until g falls; and
+# most moves
+FIRST_MOVE, MOVES = 1e-3, 24
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on an iterate."""
+    """Verdict on an iterate.
 
-    error: float  # relative, of the iterate; infinite where no estimate can be had
-    nearer: Iterate  # the point that was looked at
-    direction: Floats | None = None  # (n,) of negative curvature; None where there is none
-    curvature: float = 1.0  # of it, an eigenvalue of M^(-1) H
-    is_minimum: bool = False  # that will do
+    error      : relative error of the iterate; infinite if no estimate can be had
+    examined   : point at which g was examined, x or x - e
+    direction  : (n,) of negative curvature; None if there is none
+    curvature  : along the direction, an eigenvalue of M^(-1) H
+    is_minimum : whether the step may end at the iterate
+    """
+
+    error: float
+    examined: Iterate
+    direction: Floats | None = None
+    curvature: float = 1.0
+    is_minimum: bool = False
 
 
 class Minimum:
-    """Examines the iterates that a stepper comes to. All methods are collective."""
+    """Examination of a stepper's iterates. All methods are collective."""
 
     def __init__(
         self,
@@ -55,82 +70,85 @@ class Minimum:
         self.memory, self.first = functional.memory, functional.vectors.take()
 
     def examine(self, at: Iterate, outcome: Outcome, enough: float) -> Verdict:
-        """Examine an iterate, or rather the point that is the iterate less its estimated error.
+        """Return the verdict on an iterate, by the point x - e or by x without a correction.
 
-        outcome : of the iterate, with its compression; corrected if estimate.correction is of the iterate
-        enough  : the length of an error that will do, |e|_M
+        outcome : of the iterate, with its compression; ``corrected`` if estimate.correction is its e
+        enough  : acceptable error |e|_M [m sqrt(kg)]
         """
         functional, estimate, compression = self.functional, self.estimate, outcome.compression
         assert compression is not None
-        nearer = self._follow(at) if outcome.corrected else None
-        corrected, first = nearer is not None, self.first
+        examined = self._corrected_iterate(at) if outcome.corrected else None
+        corrected, first = examined is not None, self.first
         estimate.correction.copy(first)
-        if nearer is None:
-            nearer = at
+        if examined is None:
+            examined = at
             first.set(0.0)
-        estimate.linearise(nearer.q)
-        estimate.residual.aypx(-1.0, nearer.f)
+        estimate.linearise(examined.q)
+        estimate.residual.aypx(-1.0, examined.f)
         # Change of F that H at the iterate does not predict
         bent = functional.dual_norm(estimate.residual)
         hint = estimate.correction if outcome.alarm else None
         value, direction = compression.least_curvature, None
         if value <= CONVEX:
-            value, direction = self.curvature.lowest(nearer.q, compression, outcome.alarm, hint)
+            value, direction = self.curvature.lowest(examined.q, compression, outcome.alarm, hint)
         if value < 0:
-            return Verdict(np.inf, nearer, direction, value)
+            return Verdict(np.inf, examined, direction, value)
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
-        known = outcome.known(value)
+        known = outcome.error_of_solve(value)
         if value > CONVEX and np.isfinite(known) and known * outcome.distance <= enough:
-            return Verdict(known, nearer)
-        length, rest = functional.norm(first), functional.dual_norm(nearer.f) / value
-        # A bound, if g is as convex from there on
+            return Verdict(known, examined)
+        length, rest = functional.norm(first), functional.dual_norm(examined.f) / value
+        # An upper bound if g stays as convex
         if value > CONVEX and length + rest <= KNOWN * enough:
             return Verdict(
-                self.rounding.relative(length + rest, functional.distance(nearer.q)), nearer
+                self.rounding.relative(length + rest, functional.distance(examined.q)), examined
             )
         if corrected and estimate.missing is not None and value <= CONVEX:
             closely = bool(np.isfinite(estimate(at, functional.dual_norm(at.f), np.inf)))
             return self.examine(at, replace(outcome, corrected=closely), enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
             return Verdict(
-                self.rounding.relative(estimate.length, functional.distance(nearer.q)), nearer
+                self.rounding.relative(estimate.length, functional.distance(examined.q)), examined
             )
-        return Verdict(self._second_estimate(nearer, first, rest, enough, value), nearer)
+        return Verdict(self._second_estimate(examined, first, rest, enough, value), examined)
 
-    def _follow(self, at: Iterate) -> Iterate | None:
-        """Return an iterate less its correction; None if the surface meets itself on the way."""
-        x, q, is_free = self._end(at)
+    def _corrected_iterate(self, at: Iterate) -> Iterate | None:
+        """Return the iterate x - e; None if the surface crosses itself on the way."""
+        x, q, is_free = self._corrected(at)
         if not is_free:
             self.functional.vectors.give_back(x)
             return None
         return self.functional.iterate(x, q)
 
-    def _end(self, at: Iterate) -> tuple[PETSc.Vec, Positions, bool]:
-        """Return the unknowns of an iterate less its correction, their positions (l, 3) [m], and whether the way there
-        is free. The caller gives the vector of unknowns back."""
+    def _corrected(self, at: Iterate) -> tuple[PETSc.Vec, Positions, bool]:
+        """Return the unknowns x - e, their positions (l, 3) [m], and whether the way is free.
+
+        The caller gives the vector of unknowns back.
+        """
         functional, x = self.functional, self.functional.vectors.take()
         x.waxpy(-1.0, self.estimate.correction, at.x)
         q = functional.positions(x)
         return x, q, functional.free_share(at.q, q) == 1.0
 
     def _second_estimate(
-        self, nearer: Iterate, correction: PETSc.Vec, bound: float, enough: float, lowest: float
+        self, examined: Iterate, correction: PETSc.Vec, bound: float, enough: float, lowest: float
     ) -> float:
-        """Estimate the error of the iterate by both corrections, of which the first is ``correction``.
+        """Return the relative error of the iterate by two corrections, the first of them
+        ``correction``.
 
-        If the second leads through the surface, g is no parabola over it, and the error may be far larger.
-        Where the second cannot be had, as CG breaks down on an F of little but rounding, what
-        bounds it has its place if the curvature allows; else the error is infinite.
+        If the second correction crosses the surface, g is not quadratic along it, and the error
+        may be far larger. CG may break down on an F of rounding alone: then the bound stands for
+        the second correction if the curvature allows, else the error is infinite.
         """
         functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
-        distance, first = functional.distance(nearer.q), functional.norm(correction)
-        will_do = KNOWN * enough - first if lowest > CONVEX else 0.0
-        second = estimate(nearer, bound, enough, will_do, lowest)
+        distance, first = functional.distance(examined.q), functional.norm(correction)
+        acceptable = KNOWN * enough - first if lowest > CONVEX else 0.0
+        second = estimate(examined, bound, enough, acceptable, lowest)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
         if functional.surface is not None:
-            end, _, is_free = self._end(nearer)
+            end, _, is_free = self._corrected(examined)
             functional.vectors.give_back(end)
             if not is_free:
                 return relative(first + DOUBTFUL * second, distance)
@@ -144,30 +162,32 @@ class Minimum:
             estimate.correction,
         )
         return relative(
-            functional.norm(correction), functional.distance(nearer.q, estimate.correction)
+            functional.norm(correction), functional.distance(examined.q, estimate.correction)
         )
 
-    def go_on(self, at: Iterate, verdict: Verdict) -> Iterate | None:
-        """Return an iterate where g is lower than at one that is no minimum; None where there is none.
+    def lower_iterate(self, at: Iterate, verdict: Verdict) -> Iterate | None:
+        """Return an iterate of lower g than one that is no minimum; None if there is none.
 
-        It is the point examined, or lies from there along a direction of negative curvature, as far as doubling the
-        move lets g fall.
+        It is the point examined, or a point farther along a direction of negative curvature.
         """
-        falls = self.functional.change(verdict.nearer.q, at.q)[0] < 0
-        lower = verdict.nearer if falls else None
+        falls = self.functional.change(verdict.examined.q, at.q)[0] < 0
+        lower = verdict.examined if falls else None
         if verdict.direction is None:
             return lower
         return self._descend(lower or at, verdict.direction, verdict.curvature) or lower
 
     def _descend(self, at: Iterate, direction: Floats, curvature: float) -> Iterate | None:
-        """Return an iterate along a direction (n,) of negative curvature; None if g does not fall that way."""
+        """Return an iterate of lower g along a direction (n,) of negative curvature.
+
+        None if g rises.
+        """
         functional, base = self.functional, at.q
         slope = functional.comm.allreduce(float(self.memory.read(at.f) @ direction))
         longest = float(functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
-        if (
-            slope > SLOPE * abs(curvature) * move
-        ):  # else both ways lead down, and ranks must not differ
+        # A smaller slope may be rounding: both signs lead down, and all ranks take one
+        # sign
+        if slope > SLOPE * abs(curvature) * move:
             move = -move
         x, best, lowest = functional.vectors.take(), 0.0, 0.0
         for _ in range(MOVES):

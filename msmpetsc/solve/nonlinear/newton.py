@@ -153,7 +153,7 @@ class Newton(StepMethod):
             outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
         if detour:
             return replace(outcome, left=np.inf, solved=np.inf)
-        return self.control.led_by(self.ksp, outcome)
+        return self.control.after_linear_solve(self.ksp, outcome)
 
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:
         """Return the first iterate x - s y of enough descent; None if g falls for no s.

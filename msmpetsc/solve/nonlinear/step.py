@@ -220,7 +220,7 @@ class Stepper:
                 verdict = self.examine(now, outcome)
             self.first_guess.learn(now.q)
             distance = self.functional.distance(now.q)
-            error = self.control.rounding.added_to(verdict.error, distance, outcome.at_rounding)
+            error = self.control.rounding.step_error(verdict.error, distance, outcome.at_rounding)
             cost = replace(self.spent(), step_error=error)
             slack = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
             return StepResult(now.q, problem.q, cost, problem=problem, slack=slack)
@@ -233,7 +233,7 @@ class Stepper:
         self.control.estimate.convexity = 1.0
         guess = self.first_guess.best() if start is None else start
         if start is None or self.static:
-            guess = self.led_start.reach(self.first_guess.held(guess), self.first_guess.drift)
+            guess = self.led_start.reach(self.first_guess.with_fixed(guess), self.first_guess.drift)
         with LOCAL:
             now = self.functional.at(guess)
         multigrid = self.jacobian.preconditioner.to_balance
@@ -337,7 +337,7 @@ class Stepper:
         None where g has no digits left to tell the two apart: the step is as good as the verdict says.
         Raises StepFailed.
         """
-        lower = self.minimum.go_on(now, verdict)
+        lower = self.minimum.lower_iterate(now, verdict)
         doubted = self.control.doubt(replace(outcome, error=verdict.error), lower is not None)
         if doubted and doubted.doubts > DOUBTS:
             raise no_minimum(doubted, where_worst(self.functional, lower or now))

@@ -107,7 +107,7 @@ class ContactFaces:
                     raise
                 contacts.widen()
             else:
-                self.compare(result.position, LEFT_OUT * result.slack)
+                self.compare(result.position, LEFT_OUT * result.energy_tolerance)
         return result
 
     def compare(self, x: Positions, left_out: float) -> None:

@@ -12,8 +12,8 @@ each other until H is known to be positive definite or a direction of negative c
    compression has grown or if a solve has met a negative curvature. At all other steps a few
    iterations follow the last mode, with multigrid only if its curvature has changed.
 
-Tests 2 and 3 use locally optimal conjugate gradients on a block of directions (Knyazev 2001,
-Toward the optimal preconditioned eigensolver, Algorithm 5.1), with the preconditioner of the step.
+Tests 2 and 3 use locally optimal conjugate gradients on a block of directions, with the step's
+preconditioner (Knyazev 2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1).
 A block is needed since a single direction may settle on a higher mode.
 """
 

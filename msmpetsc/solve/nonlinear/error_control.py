@@ -252,7 +252,7 @@ class ErrorControl:
         return replace(now, error=error, early=1.0, corrected=True)
 
     def _useful_bound(self, now: Outcome) -> float:
-        """Return the bound up to which an estimate is useful, by the ratio of the last estimates."""
+        """Return the bound up to which an estimate is useful, by the last ratio."""
         return max(self.ratio, LEAST_RATIO) * now.early * now.goal
 
     def _trusts_natural_norm(self, now: Outcome) -> bool:
@@ -365,7 +365,8 @@ def no_minimum(now: Outcome, worst: str) -> StepFailed:
     )
     return StepFailed(
         f"did not come to a minimum: it came to {seen} {now.doubts} times, "
-        f"residual |F| = {now.residual:.2e}{worst}; try a smaller time.step, or another preset (newton)",
+        f"residual |F| = {now.residual:.2e}{worst}; "
+        "try a smaller time.step, or another preset (newton)",
         "no minimum",
     )
 

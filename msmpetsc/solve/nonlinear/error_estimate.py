@@ -147,7 +147,7 @@ class ErrorEstimate:
         return self.length
 
     def _length(self) -> float:
-        """Return |e_k|_M extrapolated by its growth since k / 2; its upper bound if CG was cut short."""
+        """Return |e_k|_M, extrapolated by its growth; its upper bound if CG was cut short."""
         length, its = self.functional.norm(self.correction), self.ksp.its
         if self.missing is not None:
             return length + self.missing

@@ -28,10 +28,11 @@ ROUNDINGS = 3 * np.finfo(float).eps
 SINGLE_ROW = 10.0
 # Displacement by rounding, relative to the body's size, that is of no concern
 NEGLIGIBLE = 1e-6
-# Displacement by a load, relative to the body's greatest coordinate, beyond which no digits of the
-# body's shape are left
+# Displacement by a load, relative to the body's greatest coordinate, beyond which no
+# digits of the body's shape are left
 FARTHEST = 1e6
-# Ratio of the displacement by rounding to the displacement by forces beyond which a step is refused
+# Ratio of the displacement by rounding to the displacement by forces beyond which a
+# step is refused
 HOPELESS = 0.3
 
 
@@ -43,7 +44,7 @@ class StepProblem:
     y          : positions (l, 3) [m] of the nodes after the step without forces
     load       : f_ext (owned, 3) [N]
     contact    : penalties that press on the nodes in this step
-    prescribed : q_n with anchored nodes at their places after the step (l, 3) [m]; None if they stay
+    prescribed : q_n with anchored nodes where they are after the step (l, 3) [m]; None if they stay
     rates      : two positions (l, 3) [m] whose difference gives the strain rates of a viscous solid
                  (elasticity.viscosity.Viscosity.begin)
     """
@@ -179,11 +180,11 @@ class StepFunctional:
 
     @property
     def surface(self) -> SurfaceContact | None:
-        """Contact of the surface with itself and with obstacles in this step; None if there is none."""
+        """Contact of the surface with itself and obstacles in this step; None without any."""
         return self.problem.contact.surface if self.problem.contact else None
 
     def free_share(self, base: Positions, q: Positions, begin: float | None = None) -> float:
-        """Return the share, at most 1, of the straight way from base to q (l, 3) [m] without a crossing.
+        """Return the share of the straight way from base to q (l, 3) [m] without a crossing.
 
         begin : time [s] from which obstacles move to their present places; None if they stay
         """
@@ -251,8 +252,9 @@ class Rounding:
         stiffness, mass = self.comm.allreduce(
             np.array([3 * float(diagonal.sum()), float(functional.mass.sum())])
         )
-        # An error of eps k in the forces moves nodes by at most eps sqrt(sum of t^2 k), in the norm
-        # of a positive definite H and so in the norm of M. The diagonal is no less than t^2 k.
+        # An error of eps k in the forces moves nodes by at most eps sqrt(sum of t^2 k).
+        # This holds in the norm of a positive definite H, and so in that of M. The
+        # diagonal is no less than t^2 k.
         self.moved, self.size = float(ROUNDINGS * np.sqrt(stiffness)), float(np.sqrt(mass))
 
     def refuse_loads(self) -> None:
@@ -264,11 +266,14 @@ class Rounding:
         if moved > FARTHEST * functional.extent:
             raise InputError(
                 f"loads of up to {most:.2g} N on a node would move it by {moved:.2g} m in a step, "
-                f"of a body that reaches {functional.extent:.2g} m: check gravity, force and their units"
+                f"of a body that reaches {functional.extent:.2g} m: "
+                "check gravity, force and their units"
             )
 
     def explains(self, iterate: Iterate, contact: Contact | None) -> bool:
-        """Return whether F is rounding alone, row by row: soft parts have less rounding than stiff parts.
+        """Return whether F is rounding alone.
+
+        Rows are tested one by one, since soft parts have less rounding than stiff parts.
 
         contact : whose stiffness at the iterate counts; None to leave contact out, which costs less
         """

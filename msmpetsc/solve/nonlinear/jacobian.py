@@ -1,4 +1,4 @@
-"""Jacobian of F, as SNES has it: an operator to solve with, and what preconditions that."""
+"""Jacobian of F: the operator of the linear solves, and its preconditioner."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -31,19 +31,21 @@ from msmpetsc.solve.presets import Preset, SolverOptions
 
 @dataclass(eq=False)
 class Jacobian:
-    """The true Hessian of g, or the constant A = M + t^2 L in its place (Eq. 15-17).
+    """True Hessian of g, or the constant A = M + t^2 L in its place (paper Eq. 15-17).
 
-    diagonal : of inertia and the Hessian at rest (m,), of this rank's free nodes; of springs it is that of A [kg]
+    touches  : whether steps may have a ``contact``
+    owned    : takes the objects to destroy, in the order of their creation
+    diagonal : (m,) inertia plus t^2 times the stiffness at rest of this rank's free nodes [kg]
 
-    Raises InputError where A is too large for PETSc, or of a type that does not go with the arrays,
-    and for multigrid of the Hessian where the operator is A (collective).
+    Raises InputError if A is too large for PETSc, if its type does not go with the arrays, or if
+    multigrid is asked of A (collective).
     """
 
     functional: StepFunctional
     preset: Preset
     options: SolverOptions
-    touches: bool  # steps may have a ``contact``
-    owned: ExitStack  # takes what must be destroyed, in the order it was made
+    touches: bool
+    owned: ExitStack
 
     def __post_init__(self) -> None:
         functional, options, true_hessian = self.functional, self.options, self.preset.true_hessian
@@ -56,12 +58,14 @@ class Jacobian:
         self.hessian = TrueHessian(
             self.unknowns, elasticity, functional.time_step, self._contact_blocks()
         )
-        self.blocks = None if true_hessian else self._contact_blocks()  # that go with A
+        # Contact's blocks beside A
+        self.blocks = None if true_hessian else self._contact_blocks()
         chooses = self.preset.chooses and options.is_default("pc_type")
         kind = options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
             raise InputError(
-                f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; of A there is gamg"
+                f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; "
+                "of A there is gamg"
             )
         context = (
             self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)
@@ -83,14 +87,15 @@ class Jacobian:
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
-        """A, assembled where something is to be done with it."""
+        """Matrix A, assembled on first use."""
         matrix = assemble(self.comm, self.unknowns, self.functional.time_step, self.options.prefix)
         self.owned.callback(matrix.destroy)
         return matrix
 
     def _of_matrix(self) -> Preconditioner:
         matrix = self.matrix
-        if self.touches:  # contact changes what A is preconditioned with, but not A
+        if self.touches:
+            # Contact changes the preconditioner of A, but not A
             matrix = matrix.copy()
             self.owned.callback(matrix.destroy)
         return Preconditioner(
@@ -101,7 +106,7 @@ class Jacobian:
         return ContactBlocks(self.unknowns, self.functional.time_step) if self.touches else None
 
     def _diagonal(self) -> Floats:
-        """Return by how much free nodes (m,) resist being moved: inertia + t^2 times the trace of their blocks [kg]."""
+        """Return inertia + t^2 times the trace of the stiffness block of free nodes (m,) [kg]."""
         unknowns, lattice = self.unknowns, self.unknowns.lattice
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         self.functional.elasticity.add_bound(lattice.nodes, blocks)
@@ -119,11 +124,11 @@ class Jacobian:
         duals: Duals | None,
         known: bool = False,
     ) -> None:
-        """Take the Jacobian at positions q (l, 3) [m] (collective): A is constant, only H and contact depend on q.
+        """Linearise H and contact at positions q (l, 3) [m]; A is constant (collective).
 
-        projected : without the negative parts of H
-        duals     : of friction; none: its true curvature
-        known     : H was linearised at this very q already
+        projected : leave out the negative parts of H
+        duals     : of friction; None for its true curvature
+        known     : H is linearised at q already
         """
         if self.preset.true_hessian and not known:
             self.hessian.linearise(q, contact, projected, duals)
@@ -135,11 +140,12 @@ class Jacobian:
 
 
 class FrictionDuals:
-    """Forces of friction, which Newton's method has as unknowns beside positions (contact.obstacles.friction), in the
-    step in progress.
+    """Forces of friction, which are unknowns of Newton's method beside positions.
 
-    contact : of the step; None where there is none
-    duals   : of the next Hessian; None where there is no contact. Nodes begin with their secants
+    See contact.obstacles.friction.
+
+    contact : of the step in progress; None without any
+    duals   : of the next Hessian; None without contact. Nodes begin with their secants
     """
 
     def __init__(self) -> None:
@@ -151,8 +157,11 @@ class FrictionDuals:
         self.contact = contact
         self.duals = contact.no_duals() if contact else None
 
-    def see(self, q: Positions, base: Positions, is_full: bool) -> None:
-        """Look at the full step from base to q (l, 3) [m], or at a part of it: then the full one went too far."""
+    def update(self, q: Positions, base: Positions, is_full: bool) -> None:
+        """Update the duals after a step from base to q (l, 3) [m].
+
+        is_full : whether it is the full step; a shorter step resets the duals
+        """
         if self.contact is None or self.duals is None:
             return
         if is_full:

@@ -1,7 +1,7 @@
-"""Methods with the constant matrix A = M + t^2 L for the Jacobian: any of PETSc's SNES, whose callbacks these are.
+"""Methods with the constant matrix A = M + t^2 L for the Jacobian, by any of PETSc's SNES.
 
-With A, Newton's method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). SNES accelerates it
-(anderson, ngmres), searches along it, or takes A for the first Hessian of L-BFGS.
+With A, Newton's method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). SNES
+accelerates it (anderson, ngmres), searches along it, or begins L-BFGS with A.
 """
 
 from dataclasses import dataclass, replace
@@ -21,9 +21,9 @@ from msmpetsc.solve.refused_options import BY_ERROR
 class LocalGlobal(StepMethod):
     """A SNES with A for its Jacobian. All methods are collective.
 
-    prefix  : of its options
-    has_npc : a plain iteration preconditions SNES
-    base    : positions (l, 3) [m] that changes of g are counted from
+    prefix  : of the options
+    has_npc : whether a plain iteration preconditions SNES
+    base    : positions (l, 3) [m] to which changes of g are relative
     outcome : of SNES's last iterate
     """
 
@@ -46,18 +46,18 @@ class LocalGlobal(StepMethod):
             self.ksp.setInitialGuessNonzero(True)
 
     def begin(self) -> None:
-        """Begin a step: there is nothing to forget."""
+        """Begin a step; nothing is kept from the last step."""
 
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
         self.base, self.outcome = start.q, replace(outcome, residual=np.inf)
         if self.has_npc:
-            # It solves with A before SNES looks at its start
+            # The NPC solves with A before SNES tests its start
             self.outcome = self.control.judge(start, self.outcome)
             if self.outcome.is_enough:
                 return start, self.outcome
             self.adapt(self.outcome)
         if self.snes.getType() == PETSc.SNES.Type.QN:
-            # QN alone keeps its secants of the solve before; a new type has none
+            # QN keeps the secants of the last solve; a new type has none
             self.snes.setType(PETSc.SNES.Type.KSPONLY)
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()
@@ -74,17 +74,21 @@ class LocalGlobal(StepMethod):
         return iterate, self.outcome
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        """Write F(x) to f (SNESFunction)."""
         with LOCAL:
             self.functional.evaluate(x, f)
 
     def _objective(self, _: PETSc.SNES, x: PETSc.Vec) -> float:
-        """Return g(x) - g(base), a difference that keeps its digits; -1 where it has none left, so that x is taken."""
+        """Return g(x) - g(base) (SNESObjective).
+
+        If the difference has no digits left, return -1, so that the line search accepts x.
+        """
         with LOCAL:
             change, distance = self.functional.change(self.functional.positions(x), self.base)
         return -1.0 if self.outcome.is_flat and distance > 0 else change
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Shorten the way from x to x - y where the surface meets itself on it; return whether it was."""
+        """Shorten y if the surface crosses itself from x to x - y; return whether y changed."""
         if self.functional.surface is None:
             return False
         end = self.functional.vectors.take()
@@ -99,7 +103,7 @@ class LocalGlobal(StepMethod):
         return share < 1.0
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
-        """Take contact at x, and the start of the linear solve (SNES calls it before each)."""
+        """Linearise contact at x and set the initial guess of the linear solve (SNESJacobian)."""
         with LOCAL:
             self.base = self.functional.positions(x)
             self.jacobian.linearise(self.base, self.functional.problem.contact, False, None)
@@ -111,7 +115,7 @@ class LocalGlobal(StepMethod):
             z.axpy(1.0, self.f)
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int:
-        """Return PETSc's reason to end by the iterate's error or the budget; 0 to go on (its convergence test)."""
+        """Return PETSc's reason to end, or 0 to go on (SNESConvergenceTest)."""
         if its > 0 or not self.has_npc:
             x = snes.getSolution()
             # With an NPC, ``f`` is of another x

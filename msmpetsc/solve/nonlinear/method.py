@@ -1,4 +1,4 @@
-"""Minimisation of one step's g by a method: when its iterations end, and how closely it solves linear systems."""
+"""Base of the methods that minimise g in a step."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -21,17 +21,17 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
-# Iterations of CG that the rest of an iteration of a method costs
+# Cost of an iteration of a method without its linear solve [iterations of CG]
 ITERATION = 10
 REASON = PETSc.SNES.ConvergedReason
 
 
 @dataclass(eq=False)
 class StepMethod(ABC):
-    """A method that brings the residual F down to the goal of an outcome. All methods are collective.
+    """Method that reduces the residual F to the goal of an outcome. All methods are collective.
 
-    snes, ksp : PETSc's, with the user's options
-    budget    : iterations after which the method ends; 0 for none
+    snes, ksp : with the user's options
+    budget    : iterations after which the method ends; 0 for no budget
     spent     : returns the work of the step in progress so far
     """
 
@@ -46,15 +46,18 @@ class StepMethod(ABC):
     spent: Callable[[], Work]
 
     def __post_init__(self) -> None:
-        # Of all steps so far
+        # Iterations of all steps so far
         self.iterations = 0
 
     @abstractmethod
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
-        """Return an iterate at the goal of an outcome, and its outcome. Raises StepFailed, StepStopped, InputError."""
+        """Return an iterate at the goal of an outcome, and its outcome.
+
+        Raises StepFailed, StepStopped and InputError.
+        """
 
     def reason_to_end(self, its: int, outcome: Outcome) -> int:
-        """Return PETSc's reason why a method ends after so many iterations; 0 if it goes on."""
+        """Return PETSc's reason to end after ``its`` iterations; 0 to go on."""
         if not np.isfinite(outcome.residual):
             return NOT_FINITE
         if outcome.at_rounding:
@@ -75,7 +78,7 @@ class StepMethod(ABC):
         return int(REASON.ITERATING)
 
     def adapt(self, outcome: Outcome) -> None:
-        """Let the next linear solve leave as much as the step can do with; the user's own tolerances win."""
+        """Set the tolerances of the next linear solve by the step's error, if the user does not."""
         if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
             rtol, atol = self.control.tolerances(outcome)
             self.ksp.setTolerances(
@@ -83,7 +86,7 @@ class StepMethod(ABC):
             )
 
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
-        """Return the outcome of a method that has ended by SNES's reason. Raises StepStopped and StepFailed."""
+        """Return the final outcome by SNES's reason. Raises StepStopped and StepFailed."""
         reason = self.snes.reason
         if reason == REASON.CONVERGED_ITS and not (outcome.corrected or outcome.is_enough):
             return self.control.estimated(iterate, outcome, 0.0)

@@ -72,7 +72,7 @@ class Minimum:
     def examine(self, at: Iterate, outcome: Outcome, enough: float) -> Verdict:
         """Return the verdict on an iterate, by the point x - e or by x without a correction.
 
-        outcome : of the iterate, with its compression; ``corrected`` if estimate.correction is its e
+        outcome : of the iterate, with its compression; ``corrected`` if estimate.correction is e
         enough  : acceptable error |e|_M [m sqrt(kg)]
         """
         functional, estimate, compression = self.functional, self.estimate, outcome.compression

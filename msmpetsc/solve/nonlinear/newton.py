@@ -1,12 +1,13 @@
-"""Newton's method for one step, with the true Hessian H of g, CG, and a line search that asks for g:
+"""Newton's method for a step, with the true Hessian H of g, CG, and a line search on g:
 
-    H(x_k) y = F(x_k)                by CG, to the digits that the step still misses
-    y <- the part of y on which the surface meets nothing
+    H(x_k) y = F(x_k)                by CG, to the digits that the step still lacks
+    y <- the part of y on which the surface crosses nothing
     x_(k+1) = x_k - s y              g(x_(k+1)) <= g(x_k) - ALPHA s y . F(x_k)     (Armijo)
 
-until the error of x_k is below the goal (error_control). Under compression H may be indefinite: CG then stops with the
-descent that it has. If CG's first direction has a negative curvature, s y climbs for each s; then H without its
-negative parts takes over for some iterations.
+until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
+then stops with the descent direction found so far. If CG's first direction has a negative
+curvature, g rises along y for every s. Then the projected Hessian, without negative parts, takes
+over for some iterations.
 """
 
 from dataclasses import dataclass, replace
@@ -23,22 +24,25 @@ from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
 from msmpetsc.solve.nonlinear.method import REASON, StepMethod
 from msmpetsc.solve.petsc.events import LOCAL
 
-# Iterations with the projected Hessian, which comes in slowly, before the true one has another try
+# Iterations with the projected Hessian, which converges slowly, before the true Hessian
+# is tried
 PROJECTED = 5
-# Rise of |F| in the first iteration of a static state beyond which softer solids lead on
+# Growth of |F| in the first iteration of a static state beyond which softer solids come
+# first
 SOFTER = 9.0
-# Armijo's share of the slope that a step must fall by
+# Share of the slope by which a step must lower g (Armijo)
 ALPHA = 1e-4
-# Least and greatest share of a length that the line search tries next
+# Least and greatest share of a step length that the line search tries next
 LEAST, MOST = 0.1, 0.5
-# Shortest share of a direction: of a way that climbs a smaller one may seem to fall, by rounding
+# Least step length; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
-# Share of its slope that a direction keeps as it is bent at obstacles
+# Share of its slope that a direction must keep when it is bent at obstacles
 DOWNHILL = 0.1
-# Rise of |F| after a full step that no energy was asked for: friction and contact have kinks that g has no digits for
+# Growth of |F| after an unchecked full step beyond which g is checked again: friction
+# and contact have kinks
 RAISED = 2.0
 KSP = PETSc.KSP.ConvergedReason
-# Of KSP: no direction at all
+# Reasons of KSP without a usable direction
 USELESS = (
     KSP.DIVERGED_NANORINF,
     KSP.DIVERGED_PCSETUP_FAILED,
@@ -49,7 +53,7 @@ USELESS = (
 
 @dataclass(eq=False)
 class Newton(StepMethod):
-    """Newton's method, as the ``solve`` of a SNES of PETSc's type python. All methods are collective."""
+    """Newton's method as the context of a SNES of type python. All methods are collective."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,9 +61,10 @@ class Newton(StepMethod):
         self.y, self.end = vectors.take(), vectors.take()
         self.friction = FrictionDuals()
         self.most_its = self.ksp.getTolerances()[3]
-        # V U' of a softer solid's cells, for the first Hessian of the next solve
+        # V U' of the cells of a softer solid, for the first Hessian of the next solve
         self.slopes: Array | None = None
-        # Whether the first iteration may end the solve, if |F| rises by SOFTER from ``begun``; and whether it did
+        # Whether the solve may end after an iteration in which |F| grows by SOFTER,
+        # whether it did so, and |F| at its start
         self.watches, self.overshot, self.begun = False, False, np.inf
         self._given: tuple[Iterate, Outcome] | None = None
 
@@ -69,6 +74,7 @@ class Newton(StepMethod):
         self.slopes = None
 
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
+        """Return the iterate that the loop ends at, and its outcome (StepMethod.minimise)."""
         self._given = start, outcome
         self.snes.solve(None, self.end)
         iterate, outcome = self._given
@@ -79,7 +85,8 @@ class Newton(StepMethod):
         assert self._given is not None
         now, outcome = self._given
         outcome = self.control.judge(now, replace(outcome, residual=np.inf))
-        # Iterations left with the projected Hessian; whether g is asked for however near its minimum is
+        # Iterations left with the projected Hessian; whether g is checked close to its
+        # minimum, too
         projected, asks, its = self.preset.projected, False, 0
         while not (reason := self._reason(snes, its, now, outcome)):
             self._linearise(now, outcome, projected > 0)
@@ -105,7 +112,7 @@ class Newton(StepMethod):
         snes.setConvergedReason(reason)
 
     def _reason(self, snes: PETSc.SNES, its: int, now: Iterate, outcome: Outcome) -> int:
-        """Return PETSc's reason to end at an iterate; 0 to go on."""
+        """Monitor an iterate and return PETSc's reason to end there; 0 to go on."""
         snes.setIterationNumber(its)
         snes.monitor(its, now.f.norm())
         if its == 0:
@@ -119,7 +126,7 @@ class Newton(StepMethod):
         )
 
     def _linearise(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
-        """Take H at an iterate, and let CG begin with the correction that an estimate found there, if any."""
+        """Linearise H at an iterate; CG starts with the correction of an estimate there."""
         known = outcome.corrected and not projected
         with LOCAL:
             self.jacobian.linearise(
@@ -129,14 +136,14 @@ class Newton(StepMethod):
                 self.jacobian.hessian.take_slopes(self.slopes)
             self.slopes = None
         if not self.options.is_given("ksp_initial_guess_nonzero"):
-            # PREONLY starts from nothing
+            # PREONLY has no initial guess
             known = known and self.ksp.getType() != PETSc.KSP.Type.PREONLY
             if known:
                 self.control.estimate.correction.copy(self.y)
             self.ksp.setInitialGuessNonzero(known)
 
     def _solve(self, now: Iterate, outcome: Outcome) -> bool:
-        """Solve H y = F; return whether y is a direction at all."""
+        """Solve H y = F; return whether y is usable."""
         self.adapt(outcome)
         rtol = self.ksp.getTolerances()[0]
         if not self.options.is_given("ksp_max_it"):
@@ -147,18 +154,18 @@ class Newton(StepMethod):
         self.jacobian.preconditioner.learn(self.ksp.its, rtol, self.control.solve_bound.reduction)
         return self.ksp.reason not in USELESS
 
-    def _after_solve(self, outcome: Outcome, detour: bool) -> Outcome:
-        """Return an outcome with the bounds of the linear solve; after a ``detour`` there are none."""
+    def _after_solve(self, outcome: Outcome, changed: bool) -> Outcome:
+        """Return the outcome with the bounds of the linear solve, unless y has changed since."""
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
             outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
-        if detour:
+        if changed:
             return replace(outcome, left=np.inf, solved=np.inf)
         return self.control.after_linear_solve(self.ksp, outcome)
 
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:
-        """Return the first iterate x - s y of enough descent; None if g falls for no s.
+        """Return the first iterate x - s y of sufficient descent; None if g falls for no s.
 
-        flat : g is so near its minimum that its change has no digits: the full step is taken
+        flat : g is so close to its minimum that its change has no digits; take the full step
         """
         slope, s, x = -abs(self.y.dot(now.f)), 1.0, self.functional.vectors.take()
         longer = None
@@ -166,7 +173,7 @@ class Newton(StepMethod):
             x.waxpy(-s, self.y, now.x)
             with LOCAL:
                 q = self.functional.positions(x)
-                self.friction.see(q, now.q, s == 1.0)
+                self.friction.update(q, now.q, s == 1.0)
                 change, _ = (-np.inf, 0.0) if flat else self.functional.change(q, now.q)
                 if change <= ALPHA * s * slope:
                     return self.functional.iterate(x, q)
@@ -175,7 +182,10 @@ class Newton(StepMethod):
         return None
 
     def _limit(self, now: Iterate) -> bool:
-        """Shorten or bend y where it enters obstacles or crosses the surface; return whether it did."""
+        """Shorten or bend y if it enters obstacles or causes a crossing.
+
+        return whether y changed.
+        """
         if self.functional.problem.contact is None:
             return False
         self.end.waxpy(-1.0, self.y, now.x)
@@ -188,21 +198,24 @@ class Newton(StepMethod):
         return stopped is not None or share < 1.0
 
     def _stop_at_obstacles(self, now: Iterate, after: Positions) -> Positions | None:
-        """Bend y so that nodes that come into an obstacle on the way to ``after`` (l, 3) [m] end at its surface.
+        """Bend y so that nodes end at the surface of an obstacle that they would enter.
 
-        Return where they end; None where y stays, since g is no less there, or the bent way hardly leads downhill.
+        H at x does not know obstacles that nodes do not touch yet. A line search that shortened the
+        whole step for each of them would let them come in one by one.
 
-        H at x knows nothing of obstacles that are not touched yet: nodes run deep into them, and a line search that
-        shortens the whole way for it would let them come in one by one.
+        after : positions (l, 3) [m] at x - y
+
+        Return the new end (l, 3) [m]. Return None if y stays, since g is no less at the new end or
+        the bent direction hardly leads downhill.
         """
         functional, contact, bent = self.functional, self.functional.problem.contact, self.end
         stopped = contact.stopped(after, now.q) if contact else None
         if not functional.comm.allreduce(stopped is not None, MPI.LOR):
             return None
         functional.unknowns.from_nodes(after if stopped is None else stopped, bent)
-        # Nodes that are led stay where they are led to
+        # Fixed nodes stay at their places
         free = functional.positions(bent)
-        # Without self-contact, which costs most
+        # Self-contact is left out, as it costs most
         if functional.value(free) >= functional.value(after):
             return None
         bent.aypx(-1.0, now.x)
@@ -213,11 +226,15 @@ class Newton(StepMethod):
 
 
 def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:
-    """Return the next length of a line search from the slope of g and its changes at the lengths tried last.
+    """Return the next step length of a line search.
 
-    It is the minimum of the cubic through g(0), its slope and both changes, of the parabola if there is but one, kept
-    within LEAST and MOST of the last length (Dennis and Schnabel 1996, Numerical Methods for Unconstrained
-    Optimization, A6.3.1).
+    It is the minimum of the cubic through g(0), its slope and the last two changes of g. After the
+    first trial it is that of the parabola. It is kept within LEAST and MOST of the last length
+    (Dennis and Schnabel 1996, Numerical Methods for Unconstrained Optimization, A6.3.1).
+
+    slope  : derivative of g by the step length at 0
+    tried  : last step length and change of g there
+    longer : step length before and change of g there; None after the first trial
     """
     s, change = tried
     if not np.isfinite(change):

@@ -1,9 +1,10 @@
-"""Preconditioners of a step's linear solves: of A, or multigrid of the Hessian on the lattice.
+"""Preconditioners of a step's linear solves: any PC of A, or multigrid of the Hessian.
 
-With Jacobi's, CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations, kappa = 2 (1 + t^2 k / m) where nothing is held,
-k the springs at a node together; multigrid takes about four whatever that is, each as dear as several. So short steps
-are Jacobi's, until they are seen to take longer than they should. A search for the lowest modes, which Jacobi's takes a
-hundred iterations for, has multigrid of its own meanwhile.
+With Jacobi's preconditioner CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations. In free space
+kappa = 2 (1 + t^2 k / m), k the stiffness of the springs at a node. Multigrid takes about four
+iterations for any kappa, each of them several times as dear. So short steps use Jacobi's until it
+takes more iterations than multigrid is worth. Jacobi's takes a hundred iterations for the lowest
+modes, so a search for them uses multigrid of its own.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,30 +29,34 @@ from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 MULTIGRID = PETSc.PC.Type.MG
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
-LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
-USUAL = 0.1  # ksp_rtol
-LARGE = 1000  # free nodes: from there on a search with multigrid is the faster
-USUAL_PACE = (
-    2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
-)
-WORTH = 10.0  # iterations that a new hierarchy takes the time of
-PATIENCE = (
-    15.0  # iterations beyond its pace that a solve with an old one is given: one took 2,300 else
-)
-MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
+# Iterations of Jacobi's that cost more than a few of multigrid and its set-up
+LONG = 40
+# Usual ksp_rtol
+USUAL = 0.1
+# Free nodes from which a search is faster with multigrid
+LARGE = 1000
+# Iterations per digit with a hierarchy of the present positions
+USUAL_PACE = 2.5
+# Iterations that cost as much as a new hierarchy
+WORTH = 10.0
+# Iterations beyond its pace that a solve with an old hierarchy is given
+PATIENCE = 15.0
+# t^2 k / m beyond which rounding hides the mass, which alone tells where a free body
+# moves
+MASSLESS = 1e9
 
 
 class Preconditioner:
-    """Any PETSc preconditioner of A, applied to the three columns, with a bound on contact's blocks on A's diagonal.
+    """Any PETSc preconditioner of A, applied to the three columns of coordinates.
 
-    It is this inner one that the options -pc_... set, for every preset: A is also what the true
-    Hessian is preconditioned with. A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a
-    step downhill too.
+    The options -pc_... set it for every preset, since A also preconditions the true Hessian. A
+    bound on contact's blocks is added to the diagonal of A. The sum is no less than A plus the
+    blocks, so that a direct solve with it gives a descent direction, too.
 
-    matrix  : A, m x m, of its own where there may be contact: all three columns go in one call, as MUMPS can
-    touches : whether there may be
+    matrix  : A (m, m), a copy if there may be contact
+    touches : whether there may be contact
     own     : (m,) diagonal of A, of this rank [kg]
-    added   : (m,) what is added to it, over t^2 [N/m]
+    added   : (m,) addition to the diagonal, over t^2 [N/m]
     """
 
     def __init__(
@@ -68,7 +73,10 @@ class Preconditioner:
         self.added = np.zeros_like(self.own)
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
-        """Add the bound of contact at positions q (l, 3) [m]; whether that changed the matrix (collective)."""
+        """Add the bound of contact at positions q (l, 3) [m] (collective).
+
+        Return whether the matrix changed.
+        """
         if not self.touches:
             return False
         lattice = self.unknowns.lattice
@@ -83,8 +91,10 @@ class Preconditioner:
         return changed
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Write P^-1 x to y, all three columns in a single call, as MUMPS can."""
         memory = self.unknowns.memory
-        if not self.blocks:  # where the inner preconditioner works: a direct solver does on the CPU
+        if not self.blocks:
+            # A direct solver works on the CPU
             where = HOST if self.pc.getType() in DIRECT else memory
             self.blocks = [Block(self.matrix, where), Block(self.matrix, where)]
         right, solution = self.blocks
@@ -99,19 +109,21 @@ class Preconditioner:
         return r / (self.own + self.t2 * self.added)
 
     def destroy(self) -> None:
+        """Destroy all PETSc objects (collective)."""
         for part in (*self.blocks, self.pc, self.vector):
             part.destroy()
 
 
 class LatticePreconditioner:
-    """Multigrid of the Hessian, with a hierarchy that is kept while it pays. Collective.
+    """Multigrid of the Hessian, whose hierarchy is kept while it pays. All methods are collective.
 
-    matrix, pc   : the projected Hessian, and PETSc's PCMG of it
-    translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
-    is_first : there is none yet
-    pace     : iterations a digit of the first solve with it; None before that
-    wasted   : iterations since then that were more than that
-    is_stale : a new one is due; ``is_new``: the present one was built where the linear solve to come was linearised
+    matrix, pc   : projected Hessian, and PETSc's PCMG of it
+    translations : of bodies without fixed nodes, exact while ``is_free``; None if all are fixed
+    is_first     : whether there is no hierarchy yet
+    pace         : iterations per digit of the first solve with the hierarchy; None before it
+    excess       : iterations above the pace since then
+    is_stale     : whether a new hierarchy is due
+    is_new       : whether the hierarchy was built at the positions of the next linear solve
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -123,11 +135,11 @@ class LatticePreconditioner:
         self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
         self.is_first = True
         self.pace: float | None = None
-        self.wasted = 0.0
+        self.excess = 0.0
         self.is_stale, self.is_new, self.is_free = True, False, False
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
-        """Build a hierarchy at positions q (l, 3) [m] if a new one is due; whether it was."""
+        """Build a hierarchy at positions q (l, 3) [m] if it is due; return whether it was."""
         self.is_free, is_due = self._is_free(q, contact), self.is_stale
         self.is_new = is_due
         if is_due:
@@ -136,31 +148,38 @@ class LatticePreconditioner:
         return is_due
 
     def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies that nothing holds as wholes to where forces balance, from q, or unknowns x, where F is f."""
+        """Translate free bodies to the balance of their forces, from positions q with residual f.
+
+        q : positions (l, 3) [m] of the unknowns x, which are changed
+        """
         if self.translations and self._is_free(q, contact):
             columns = self.unknowns.columns_to_write(x)
             columns -= self.translations.of(self.unknowns.columns(f))
 
     def most_iterations(self, rtol: float) -> int | None:
-        """Iterations of a solve to a relative tolerance that this hierarchy is given; None where it is of this x."""
+        """Return the most iterations of a solve to a relative tolerance with this hierarchy.
+
+        Return None for a hierarchy of the present positions.
+        """
         return (
             None
             if self.is_new or self.pace is None
-            else int(self.pace * _digits(rtol) + PATIENCE - self.wasted)
+            else int(self.pace * _digits(rtol) + PATIENCE - self.excess)
         )
 
     def learn(self, its: int, rtol: float) -> None:
-        """Take note of the iterations that a linear solve took to a relative tolerance.
+        """Count the iterations of a linear solve to a relative tolerance.
 
-        A hierarchy is kept until what it has cost would have paid for a new one: at worst that is twice the least.
+        A hierarchy is kept until its excess iterations have cost as much as a new hierarchy. The
+        total cost is at most twice the least.
         """
         if its == 0:
             return
         digits = _digits(rtol)
         if self.pace is None:
             self.pace = its / digits
-        self.wasted += max(its - self.pace * digits, 0.0)
-        self.is_stale |= self.wasted > WORTH
+        self.excess += max(its - self.pace * digits, 0.0)
+        self.is_stale |= self.excess > WORTH
 
     def _build(self, q: Positions, contact: Rows, surface: SurfaceHessian | None) -> None:
         with HIERARCHY:
@@ -168,24 +187,31 @@ class LatticePreconditioner:
         self.pace = None
         if self.is_first:
             self.pace = USUAL_PACE
-        self.wasted = 0.0
+        self.excess = 0.0
         self.is_first = self.is_stale = False
 
     def _is_free(self, q: Positions, contact: Contact | None) -> bool:
-        """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
+        """Return whether no obstacle presses on a node at positions q (l, 3) [m].
+
+        Translations are then resisted by mass alone.
+        """
         if self.translations is None or contact is None:
             return self.translations is not None
         surface = contact.surface
         alone = len(self.multigrid.bodies.free) == 1 and not (
             surface and surface.contacts.obstacles.total
         )
+        # The self-contact of a lone body moves its centre no more than springs do
         if surface and not alone and surface.presses(q):
-            return False  # of one body alone it moves the middle no more than springs do
+            return False
         pressed = any(len(nodes) for nodes, _ in contact.hessian(q))
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """Hessian of obstacles (owned, 9) at q, friction's by its secant; (0, 9) if there are none."""
+        """Return the Hessian of obstacles (owned, 9) at q, with friction's secant.
+
+        (0, 9) without.
+        """
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
         for nodes, added in contact.hessian(q, contact.no_duals()) if contact else ():
@@ -193,6 +219,7 @@ class LatticePreconditioner:
         return blocks
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Write P^-1 x to y by a cycle."""
         with CYCLE:
             if self.translations and self.is_free:
                 self.translations.around(self.pc, x, y)
@@ -204,62 +231,72 @@ class LatticePreconditioner:
         return self.multigrid.fine.by_blocks(r, np.empty_like(r))
 
     def forget(self) -> None:
-        """Forget the hierarchy: the next step builds a new one."""
+        """Forget the hierarchy, so that the next step builds another."""
         self.is_stale = self.is_first = True
         self.multigrid.contact.destroy()
 
     def destroy(self) -> None:
+        """Destroy all PETSc objects (collective)."""
         self.multigrid.destroy()
 
 
 def _digits(rtol: float) -> float:
+    """Return the digits that a solve to this tolerance gains, at least 0.1."""
     return max(-float(np.log10(rtol)), 0.1)
 
 
 def expected_iterations(ratio: float) -> float:
-    """Iterations that Jacobi's takes where the greatest t^2 k / m of a node is ``ratio``."""
+    """Return Jacobi's iterations if the greatest t^2 k / m of a node is ``ratio``."""
     return float(0.5 * np.sqrt(2 * (1 + ratio)) * np.log(2 / USUAL))
 
 
 @dataclass(eq=False)
 class StepPreconditioner:
-    """Preconditioner of a step's solves, of A or of the Hessian (a PCPYTHON context). Collective.
+    """Preconditioner of a step's solves, of A or of the Hessian (a context of PCPYTHON).
 
-    make_of_matrix, make_multigrid : make them where they are needed
-    chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
+    All methods are collective.
+
+    make_of_matrix, make_multigrid : make the two on first use
+    kind    : -pc_type; multigrid is taken if it is mg
+    chooses : choose between the two by ``ratio`` and by the iterations of solves
+    ratio   : greatest t^2 k / m of a node
+    nodes   : number of free nodes on all ranks
     """
 
     make_of_matrix: Callable[[], Preconditioner]
     make_multigrid: Callable[[], LatticePreconditioner]
-    kind: str  # -pc_type; multigrid is taken where that is mg
+    kind: str
     chooses: bool
     ratio: float
-    nodes: int  # free ones, on all ranks
+    nodes: int
 
     def __post_init__(self) -> None:
         self.is_searching = False
         self.for_searches: LatticePreconditioner | None = None
         self.of_matrix: Preconditioner | None = None
         self.multigrid: LatticePreconditioner | None = None
-        self.is_chosen = self.kind == MULTIGRID  # multigrid, for the steps
+        # Whether multigrid is chosen for the steps
+        self.is_chosen = self.kind == MULTIGRID
         expected = expected_iterations(self.ratio)
         if self.is_chosen:
             self.multigrid = self.make_multigrid()
         elif self.chooses and expected > LONG:
             self._choose(
-                f"t^2 k / m = {self.ratio:.3g}: Jacobi's would take some {expected:.0f} iterations a solve"
+                f"t^2 k / m = {self.ratio:.3g}: "
+                f"Jacobi's would take some {expected:.0f} iterations a solve"
             )
         else:
             self.of_matrix = self.make_of_matrix()
 
     @property
     def in_use(self) -> Preconditioner | LatticePreconditioner:
+        """Preconditioner of the steps."""
         chosen = self.multigrid if self.is_chosen else self.of_matrix
         assert chosen is not None
         return chosen
 
     def prepare(self, q: Positions, contact: Contact | None) -> bool:
-        """Take positions q (l, 3) [m]; whether that changed what is preconditioned with."""
+        """Prepare for positions q (l, 3) [m]; return whether the preconditioner changed."""
         if (
             self.chooses
             and not self.is_chosen
@@ -272,12 +309,12 @@ class StepPreconditioner:
 
     @property
     def is_uniform(self) -> bool:
-        """Whether smooth errors fade as fast as rough ones."""
+        """Whether smooth errors fade as fast as rough errors."""
         return self.is_chosen or self.is_searching
 
     @property
     def products(self) -> int:
-        """Products with the Hessian so far."""
+        """Products with the Hessian so far, on multigrid's finest level."""
         return sum(
             lattice.multigrid.fine.products
             for lattice in (self.multigrid, self.for_searches)
@@ -288,7 +325,8 @@ class StepPreconditioner:
     def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
         """Switch to multigrid, built at positions q (l, 3) [m], for a long search in a large body.
 
-        Smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it.
+        Smooth modes, which converge last with Jacobi's, then converge at once. The hierarchy is
+        not that of the steps.
         """
         if self.is_chosen or not self.chooses or self.nodes < LARGE:
             yield
@@ -304,7 +342,8 @@ class StepPreconditioner:
 
     def _choose(self, reason: str) -> None:
         self.is_chosen = True
-        if self.multigrid is None:  # else it was chosen before, and forgotten
+        # It may have been chosen before and forgotten
+        if self.multigrid is None:
             log.info(
                 "preconditioner: multigrid on the lattice (%s; -pc_type jacobi keeps to it)", reason
             )
@@ -312,30 +351,36 @@ class StepPreconditioner:
 
     @property
     def to_balance(self) -> LatticePreconditioner | None:
-        """The multigrid that moves free bodies as wholes to where forces balance; None where there is none."""
+        """Multigrid that translates free bodies to the balance of forces; None without any."""
         multigrid = self.multigrid if self.is_chosen else None
         return multigrid if multigrid and multigrid.translations else None
 
     def most_iterations(self, rtol: float) -> int | None:
-        """Iterations that a linear solve to a relative tolerance is given; None: what PETSc's options say."""
+        """Return the most iterations of a solve to a tolerance; None for PETSc's option."""
         return self.multigrid.most_iterations(rtol) if self.multigrid and self.is_chosen else None
 
     def learn(self, its: int, rtol: float, reached: float) -> None:
-        """Take note of the iterations that a linear solve took to a relative tolerance, and of what it has reached."""
+        """Count the iterations of a linear solve.
+
+        rtol    : relative tolerance of the solve
+        reached : reduction of the residual in the natural norm
+        """
         if self.multigrid and self.is_chosen:
             self.multigrid.learn(its, rtol)
         elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / reached):
             self._choose(f"Jacobi's took {its} iterations a solve")
 
     def setFromOptions(self, _: PETSc.PC) -> None:
+        """Take the options -pc_... (PCSetFromOptions calls it)."""
         if not self.is_chosen:
             self.in_use.pc.setFromOptions()
 
     def setUp(self, _: PETSc.PC) -> None:
+        """Set up the preconditioner in use (PCSetUp calls it)."""
         self.in_use.pc.setUp()
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        """Show the preconditioner of A, or multigrid and a table of its levels (PCView calls it)."""
+        """Show the preconditioner of A, or multigrid and its levels (PCView calls it)."""
         if self.multigrid and self.is_chosen:
             for line in repr(self.multigrid.multigrid).splitlines():
                 viewer.printfASCII(f"    {line}\n")
@@ -343,24 +388,30 @@ class StepPreconditioner:
 
     @property
     def applied(self) -> Preconditioner | LatticePreconditioner:
+        """Preconditioner of the steps or of the search in progress."""
         return self.for_searches if self.is_searching and self.for_searches else self.in_use
 
     def apply(self, _: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Write P^-1 x to y (PCApply calls it)."""
         self.applied.apply(x, y)
 
     def least_norm(self, r: PETSc.Vec) -> float:
-        """Return a lower bound of |r|_(H^-1) that P has no part in: H is no more than 2 D, or 4 D where it changed."""
+        """Return a lower bound of |r|_(H^-1) that does not depend on P.
+
+        With D the diagonal, H is at most 2 D, or 4 D since D may be of earlier positions.
+        """
         columns = self.applied.unknowns.columns(r)
         square = float(np.vdot(columns, self.applied.by_diagonal(columns)))
         return 0.5 * float(np.sqrt(max(self.applied.unknowns.comm.allreduce(square), 0.0)))
 
     def forget(self) -> None:
-        """Forget what earlier steps showed: a preconditioner that was chosen by its iterations is chosen anew."""
+        """Forget earlier steps, so that a choice by iterations is made anew."""
         self.is_chosen = self.of_matrix is None
         if self.multigrid:
             self.multigrid.forget()
 
     def destroy(self, _: PETSc.PC) -> None:
+        """Destroy all PETSc objects (PCDestroy calls it)."""
         for owned in (self.of_matrix, self.multigrid, self.for_searches):
             if owned:
                 owned.destroy()

@@ -1,5 +1,4 @@
-"""One implicit step: the minimum of g, found by a method (solve.presets), examined, and looked for again where it is
-none."""
+"""Implicit step: minimise g by a method (solve.presets), then examine the result."""
 
 import ctypes
 from contextlib import ExitStack
@@ -14,6 +13,7 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.nonlinear.carried_start import CarriedStart
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import (
     DEFAULT_ERROR,
@@ -26,7 +26,6 @@ from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
-from msmpetsc.solve.nonlinear.led_start import LedStart
 from msmpetsc.solve.nonlinear.local_global import LocalGlobal
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.newton import SOFTER, Newton
@@ -36,11 +35,11 @@ from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
-# Doubts about where a step has come to: saddles, and errors larger than they had seemed
+# Most doubts in a step: saddles, and errors larger than estimated
 DOUBTS = 100
-# Options of SNES that the loop of Newton's method (nonlinear.newton) has no use for
+# Options of SNES that the loop of Newton's method (nonlinear.newton) does not use
 OF_SNES = ("snes_type", "snes_linesearch", "snes_ksp_ew", "npc_snes")
-# PETSc's names of this loop, which a run that goes on from another method may give
+# PETSc's names of that loop, which a run that goes on from another method may give
 LOOP = {"snes_type": "newtonls", "snes_linesearch_type": "bt"}
 
 
@@ -48,35 +47,48 @@ LOOP = {"snes_type": "newtonls", "snes_linesearch_type": "bt"}
 class StepResult:
     """Result of one step.
 
-    explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
-    swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
-    time_error : estimated error of the trajectory so far; NaN where there is no estimate
-    problem    : that was solved, of F = M (x - y) + tau^2 (grad E - f_ext); None of explicit steps. Statics have no M
-    slack      : energy [J]: as far as g is convex, x is within the error asked for where g / tau^2 is no more above its
-        least
-    viscous    : forces of viscosity (owned, 3) [N]; its work is what it took in of this rank's cells [J]
+    position     : (l, 3) [m], ghosts included
+    previous     : (l, 3) [m], such that the velocity is (position - previous) / t
+    cost         : work of the step
+    work         : work of obstacles that struck this rank's nodes [J]
+    explicit     : whether the step was taken in explicit substeps; ``work`` then includes all that
+                   moved or pushed
+    swing        : change of the recoverable energy of this rank's nodes (solve.energy_balance) [J]
+    static       : whether the result is an equilibrium, not a motion
+    time_error   : estimated error of the trajectory so far; NaN without an estimate
+    problem      : F = M (x - y) + tau^2 (grad E - f_ext), without M in statics; None if explicit
+    energy_tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
+    tau          : [s]
+    viscous      : forces of viscosity (owned, 3) [N]
+    viscous_work : energy that viscosity took in of this rank's cells [J]
     """
 
-    position: Positions  # (l, 3) [m], ghosts included
-    previous: Positions  # (l, 3) [m], such that the velocity is (position - previous) / t
-    cost: Work  # of the step
-    work: float = 0.0  # of obstacles that struck this rank's nodes [J]
+    position: Positions
+    previous: Positions
+    cost: Work
+    work: float = 0.0
     explicit: bool = False
     swing: float = 0.0
-    static: bool = False  # a state of equilibrium, not a motion
+    static: bool = False
     time_error: float = np.nan
     problem: StepProblem | None = None
-    slack: float = 0.0
-    tau: float = np.inf  # [s]
+    energy_tolerance: float = 0.0
+    tau: float = np.inf
     viscous: Rows | None = None
     viscous_work: float = 0.0
 
 
 @dataclass(eq=False)
 class Stepper:
-    """Solver of the steps of one lattice and time step; all PETSc objects it makes are destroyed by ``destroy``.
+    """Solver of the steps of one lattice and time step.
 
-    Raises InputError for options that do not go together, on all ranks.
+    ``destroy`` destroys all PETSc objects that it creates.
+
+    touches : whether steps may have a ``contact``
+    prefix  : of the PETSc options
+    static  : whether steps are equilibria; M then weighs errors only
+
+    Raises InputError for options that contradict each other, on all ranks.
     """
 
     comm: MPI.Comm
@@ -85,21 +97,23 @@ class Stepper:
     preset: Preset
     error: float | None = None
     max_iterations: int | None = None
-    touches: bool = False  # whether steps may have a ``contact``
-    prefix: str = ""  # of its PETSc options
-    static: bool = False  # what is looked for is an equilibrium: M weighs errors and nothing else
+    touches: bool = False
+    prefix: str = ""
+    static: bool = False
 
     def __post_init__(self) -> None:
         self.budget = self.max_iterations or 0
         if self.error is None and not self.budget:
             self.budget = self.preset.iterations or 0
-        self.before = Work()  # of the steps before the present one
+        # Work of all steps before the present step
+        self.before = Work()
         self.owned = ExitStack()
         self.unknowns = Unknowns(self.comm, self.lattice, self.static)
         self.owned.callback(self.unknowns.destroy)
         elasticity = Elasticity(self.lattice)
         of_rank = elasticity.solid.stiffest if elasticity.solid else 0.0
-        self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)  # lambda of a cell, in mu
+        # Greatest lambda / mu of a cell
+        self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)
         self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
         self.owned.callback(self.functional.vectors.destroy)
         self.first_guess = FirstGuess(self.functional, self.preset.iterations is None)
@@ -113,7 +127,7 @@ class Stepper:
                 self.control, self.minimum = self._create_control()
                 self.method = self._create_method()
                 take = self.functional.vectors.take
-                self.led_start = LedStart(
+                self.carried_start = CarriedStart(
                     self.functional, self.jacobian, self.ksp, (take(), take(), take())
                 )
         except InputError:
@@ -121,11 +135,12 @@ class Stepper:
             raise
 
     def _keep(self, owned: PETSc.Object) -> PETSc.Object:
+        """Return an object that ``destroy`` will destroy."""
         self.owned.callback(owned.destroy)
         return owned
 
     def _create_solvers(self) -> tuple[PETSc.SNES, PETSc.KSP]:
-        """Create SNES, and the KSP of its own or of the SNES that preconditions it."""
+        """Create the SNES, and return its KSP or the KSP of the SNES that preconditions it."""
         snes, prefix = self._keep(PETSc.SNES().create(self.comm)), self.prefix
         snes.setOptionsPrefix(prefix)
         # A plain iteration that preconditions SNES
@@ -136,9 +151,8 @@ class Stepper:
         ksp = self._keep(inner.getKSP())
         ksp.setOptionsPrefix(prefix)
         pc = self._keep(ksp.getPC())
-        pc.setOptionsPrefix(
-            f"{prefix}three_columns_"
-        )  # leaves the bare -pc_ to the preconditioner of A
+        # The preconditioner of A has the bare -pc_
+        pc.setOptionsPrefix(f"{prefix}three_columns_")
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
         snes.setFromOptions()
@@ -148,7 +162,7 @@ class Stepper:
         return snes, ksp
 
     def _refuse_of_snes(self) -> None:
-        """Raise InputError for options of SNES that Newton's method has no use for."""
+        """Raise InputError for options of SNES that Newton's method does not use."""
         given = PETSc.Options().getAll().items()
         options = {
             name.removeprefix(self.prefix): value
@@ -158,8 +172,8 @@ class Stepper:
         for name, value in options.items():
             if name.startswith(OF_SNES) and LOOP.get(name) != value:
                 raise InputError(
-                    f"-{self.prefix}{name}: newton's presets have a loop and a line search of their own; "
-                    "presets anderson and lbfgs take it"
+                    f"-{self.prefix}{name}: newton's presets have a loop and a line search of "
+                    "their own; presets anderson and lbfgs take it"
                 )
 
     def _create_control(self) -> tuple[ErrorControl, Minimum]:
@@ -179,8 +193,8 @@ class Stepper:
 
     def _create_method(self) -> Newton | LocalGlobal:
         given = (
-            self.functional, self.jacobian, self.snes, self.ksp, self.control, self.preset, self.options, self.budget,
-            self.spent,
+            self.functional, self.jacobian, self.snes, self.ksp, self.control, self.preset,
+            self.options, self.budget, self.spent,
         )  # fmt: skip
         if self.preset.true_hessian:
             method: Newton | LocalGlobal = Newton(*given)
@@ -191,25 +205,24 @@ class Stepper:
         return method
 
     def set_up(self) -> None:
-        """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.
+        """Build the preconditioner before the first step; Cholesky factorises here.
 
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
-            self.jacobian.hessian.linearise(
-                self.lattice.nodes, None
-            )  # Chebyshev's method tries it, for eigenvalues
+            # Chebyshev's method applies it for eigenvalue bounds
+            self.jacobian.hessian.linearise(self.lattice.nodes, None)
             self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
             self.ksp.setOperators(self.jacobian.operator)
             self.ksp.setUp()
 
     def step(self, problem: StepProblem, start: Rows | None = None) -> StepResult:
-        """Solve one step.
+        """Return the result of one step.
 
-        start : a first guess (l, 3) [m]; the best of several if None
+        start : first guess (l, 3) [m]; None for the best of several
 
-        Raises StepFailed on all ranks, StepStopped where a signal asks for it, and InputError where PETSc's options do
-        not go together.
+        Raises StepFailed on all ranks, StepStopped after a signal, and InputError if PETSc's
+        options contradict each other.
         """
         with petsc_errors("PETSc cannot take a step with these options", self._abandon):
             self.before = self.work_so_far()
@@ -222,25 +235,29 @@ class Stepper:
             distance = self.functional.distance(now.q)
             error = self.control.rounding.step_error(verdict.error, distance, outcome.at_rounding)
             cost = replace(self.spent(), step_error=error)
-            slack = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
-            return StepResult(now.q, problem.q, cost, problem=problem, slack=slack)
+            energy_tolerance = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
+            return StepResult(
+                now.q, problem.q, cost, problem=problem, energy_tolerance=energy_tolerance
+            )
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> Iterate:
-        """Begin a step; return the iterate that it starts from."""
+        """Begin a step and return its first iterate."""
         self.functional.begin(problem)
         self.control.rounding.refuse_loads()
         self.method.begin()
         self.control.estimate.convexity = 1.0
         guess = self.first_guess.best() if start is None else start
         if start is None or self.static:
-            guess = self.led_start.reach(self.first_guess.with_fixed(guess), self.first_guess.drift)
+            guess = self.carried_start.find(
+                self.first_guess.with_fixed(guess), self.first_guess.drift
+            )
         with LOCAL:
             now = self.functional.at(guess)
         multigrid = self.jacobian.preconditioner.to_balance
         return self._balanced(now, multigrid) if start is None and multigrid else now
 
     def _balanced(self, now: Iterate, multigrid: LatticePreconditioner) -> Iterate:
-        """Return an iterate with bodies moved as wholes to where their forces balance, as far as they do not meet."""
+        """Return an iterate whose free bodies are translated to the balance of forces."""
         x = self.functional.vectors.take()
         now.x.copy(x)
         multigrid.balance(now.q, self.functional.problem.contact, now.f, x)
@@ -251,9 +268,11 @@ class Stepper:
         )
 
     def _first(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
-        """Bring F down to the goal from a step's start (collective). Raises StepFailed and InputError.
+        """Reduce F to the goal from the start of a step (collective).
 
-        If the first iteration of a static state overshoots, solids of a smaller lambda lead on to the solution.
+        If the first iteration of a static state overshoots, solids of a smaller lambda come first.
+
+        Raises StepFailed and InputError.
         """
         newton = self.method
         if not (
@@ -272,11 +291,14 @@ class Stepper:
         )
 
     def _softened(self, newton: Newton, now: Iterate) -> Iterate:
-        """Return the iterate of the greatest lambda below the solid's own. Raises StepFailed.
+        """Return the solution with the greatest lambda below the solid's own.
 
-        Lambda is mu, then more and more of it. The greater lambda, the shorter a straight way until it has changed
-        volumes; from solution to solution they change little. The first Hessian of each has the pressure of the one
-        before: with its own lambda, what lacks of volume would bend everything.
+        Lambda is mu at first, then grows by SOFTER from solution to solution. A straight way to the
+        solution changes volumes more the greater lambda is; between these solutions volumes change
+        little. The first Hessian of each solve has the pressure of the solution before it, since
+        the pressure of its own lambda would bend everything.
+
+        Raises StepFailed.
         """
         solid = self.functional.elasticity.solid
         ratio = 1.0
@@ -291,14 +313,17 @@ class Stepper:
         return self.functional.at(now.q)
 
     def forget(self, modes: bool = True) -> None:
-        """Forget what earlier steps showed, so that the next step does not depend on it; modes: the lowest mode too."""
+        """Forget earlier steps, so that the next step does not depend on them.
+
+        modes : forget lowest modes, too
+        """
         self.first_guess.forget()
         self.jacobian.preconditioner.forget()
         self.control.forget(modes)
         self.minimum.curvature.forget(modes)
 
     def work_so_far(self) -> Work:
-        """Work of all steps so far, of their estimates and searches for negative curvature."""
+        """Return the work of all steps so far, with estimates and searches for modes."""
         of_estimates = total_iterations(self.control.estimate.ksp)
         ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
@@ -315,26 +340,28 @@ class Stepper:
         return self.work_so_far() - self.before
 
     def examine(self, now: Iterate, outcome: Outcome) -> Verdict:
-        """Return whether an iterate is a minimum, and how far from it (collective)."""
+        """Return whether an iterate is a minimum, and its error (collective)."""
         control = self.control
         outcome = control.with_compression(now, outcome)
         assert outcome.compression is not None
-        # A budget may end where g is no parabola yet
+        # A budget may end far from the minimum
         if outcome.compression.least_curvature > 0 and not self.budget:
             return Verdict(outcome.error, now, is_minimum=True)
         enough = control.target * self.functional.distance(now.q) if control.target else np.inf
         verdict = self.minimum.examine(now, outcome, enough)
-        will_do = verdict.error <= control.target or (
+        is_good = verdict.error <= control.target or (
             outcome.at_rounding and not np.isinf(verdict.error)
         )
-        return replace(verdict, is_minimum=bool(self.budget) or will_do)
+        return replace(verdict, is_minimum=bool(self.budget) or is_good)
 
     def _leave(
         self, now: Iterate, verdict: Verdict, outcome: Outcome
     ) -> tuple[Iterate, Outcome] | None:
-        """Return an iterate of lower g to go on from, and its outcome so far (collective).
+        """Return an iterate of lower g and its outcome so far (collective).
 
-        None where g has no digits left to tell the two apart: the step is as good as the verdict says.
+        Return None if g has no digits left to tell the iterates apart. The error of the step is
+        then that of the verdict.
+
         Raises StepFailed.
         """
         lower = self.minimum.lower_iterate(now, verdict)
@@ -344,11 +371,11 @@ class Stepper:
         return (lower or now, doubted) if doubted else None
 
     def _abandon(self) -> None:
-        """Keep PETSc's objects for ever: after an error they may crash when they are destroyed."""
+        """Keep PETSc's objects for ever: destroying them after an error may crash."""
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
         self.owned = ExitStack()
 
     def destroy(self) -> None:
-        """Collective, and in the same order on all ranks; the garbage collector's would differ."""
+        """Destroy all PETSc objects, in the same order on all ranks (collective)."""
         self.owned.close()
         self.options.withdraw()

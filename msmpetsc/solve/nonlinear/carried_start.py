@@ -1,16 +1,17 @@
-"""Start of a step whose anchors or obstacles move: a way to their places on which the surface crosses nothing.
+"""Start of a step with moving anchors or obstacles: a way to their places that crosses nothing.
 
-The share s of their way, 0 where the step begins and 1 where it ends, is an unknown beside x with the target 1.
-Newton's direction towards the minimum of g at s = 1 carries both,
+The share s of the way of anchors and obstacles is an unknown beside x: s = 0 at the beginning of
+the step, and s = 1 is the target. Newton's direction towards the minimum of g at s = 1 moves both,
 
     H(x, s) dx = -F(x, s) - (1 - s) dF/ds(x, s),      ds = 1 - s,
 
-and both follow it until two triangles would meet. So bodies give way to the obstacles that press them, as to the
-moving boundaries of Li et al. (2020, Incremental Potential Contact). Obstacles push from farther off meanwhile
-(Barrier.cushioned): gaps are wide enough for a way, and contact is soft. The minimisation begins at s = 1, with the
-usual barrier. H has no negative parts, and no line search asks for g: the way only has to lead to the end.
+until two triangles would cross. So bodies give way to the obstacles that press them, as to the
+moving boundaries of Li et al. (2020, Incremental Potential Contact). Meanwhile obstacles push from
+a larger distance (Barrier.cushioned), which keeps gaps wide and contact soft. The minimisation
+begins at s = 1 with the usual barrier. H is projected, and no line search evaluates g, since the
+way only has to arrive.
 
-Nodes that go with the obstacles near them need no such solve, and are tried first.
+A start without a linear solve is tried first: nodes move with the obstacles near them.
 """
 
 from collections.abc import Callable
@@ -31,21 +32,24 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 
 Vectors: TypeAlias = tuple[PETSc.Vec, PETSc.Vec, PETSc.Vec]
 
-# Directions between looks at the progress: a press takes 5 to 30
+# Directions between checks of the progress; a press takes 5 to 30
 PATIENCE = 20
-# Progress in s between looks: with less, the step is refused
+# Least progress in s between checks; with less progress the step is refused
 PROGRESS = 0.1
-# Directions at fixed s after each share: a direction doubles a gap that the share has closed
+# Corrections at fixed s after each share; a correction doubles a gap that the share has
+# closed
 CORRECTIONS = 2
-# ksp_rtol of a direction: the way only has to lead to the end
+# ksp_rtol of a direction, which only has to arrive
 RTOL = 1e-2
 
 
-class LedStart:
-    """Way from where a step begins to a start at its end. All methods are collective.
+class CarriedStart:
+    """Start of steps that carries bodies along with anchors and obstacles.
+
+    All methods are collective.
 
     ksp     : solves with the Jacobian
-    vectors : three of unknowns, that are written to
+    vectors : three vectors of unknowns for temporary values
     """
 
     def __init__(
@@ -54,11 +58,12 @@ class LedStart:
         self.functional, self.jacobian, self.ksp, self.vectors = functional, jacobian, ksp, vectors
         self.most_its = ksp.getTolerances()[3]
 
-    def reach(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:
-        """Return the guess (l, 3) [m], or a start that the surface reaches without crossing anything.
+    def find(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:
+        """Return the guess (l, 3) [m], or a start that the surface reaches without a crossing.
 
-        drift : mean displacement of a free body that moves so (l, 3) [m]
-        Raises StepFailed where anchors and obstacles cannot reach the end of the step.
+        drift : returns the mean displacement of a free body from displacements (l, 3) [m]
+
+        Raises StepFailed if anchors and obstacles cannot reach their places.
         """
         functional, problem = self.functional, self.functional.problem
         contacts = functional.surface.contacts if functional.surface else None
@@ -73,19 +78,22 @@ class LedStart:
             return problem.q + share * moved + (1 - share) * still
         for way in (moved, 0 * moved):
             if obstacles.total:
-                way = self._carried(contacts, way)
+                way = self._moved_with_obstacles(contacts, way)
             carried = np.where(functional.lattice.pinned[:, None], problem.fixed, problem.q + way)
             if functional.free_share(problem.q, carried, contacts.begin) == 1.0:
                 return carried
         obstacles.straight = contacts.begin, end
         try:
             with contacts.cushioned(self._cushion(contacts)):
-                return self._lead(contacts, end)
+                return self._carry(contacts, end)
         finally:
             contacts.time, functional.problem, obstacles.straight = end, problem, None
 
-    def _carried(self, contacts: Contacts, moved: Rows) -> Rows:
-        """Return how far nodes go in the step, (l, 3) [m]: with obstacles that they touch, or by ``moved``."""
+    def _moved_with_obstacles(self, contacts: Contacts, moved: Rows) -> Rows:
+        """Return displacements (l, 3) [m] of nodes.
+
+        of obstacles that they touch, else ``moved``.
+        """
         functional, q = self.functional, self.functional.problem.q
         owned = contacts.points.distances(q, contacts.begin) - contacts.law.distance
         distances, times = (
@@ -95,24 +103,24 @@ class LedStart:
         return contacts.obstacles.carried(q, moved, times, distances, functional.lattice.cell_size)
 
     def _cushion(self, contacts: Contacts) -> float:
-        """Return the distance [m] from which obstacles push bodies that are led: the farthest way of a held part."""
+        """Return the distance [m] from which obstacles push: the longest way of a moving part."""
         problem, obstacles = (
             self.functional.problem,
             contacts.obstacles.way(contacts.begin, contacts.time),
         )
-        held = self.functional.comm.allreduce(greatest(np.abs(problem.fixed - problem.q)), MPI.MAX)
-        return float(max(held, greatest(np.abs(obstacles)), contacts.law.distance))
+        fixed = self.functional.comm.allreduce(greatest(np.abs(problem.fixed - problem.q)), MPI.MAX)
+        return float(max(fixed, greatest(np.abs(obstacles)), contacts.law.distance))
 
-    def _lead(self, contacts: Contacts, end: float) -> Positions:
-        """Return the start at s = 1. Raises StepFailed."""
+    def _carry(self, contacts: Contacts, end: float) -> Positions:
+        """Return the start at s = 1 by Newton's directions. Raises StepFailed."""
         functional, problem, begin = self.functional, self.functional.problem, contacts.begin
-        is_held, still = functional.lattice.pinned[:, None], np.zeros((1, 3))
+        is_fixed, still = functional.lattice.pinned[:, None], np.zeros((1, 3))
         q, s, gained = problem.q, 0.0, 1.0
         while gained > PROGRESS:
             begun = s
             for _ in range(PATIENCE):
                 now = begin + s * (end - begin)
-                left = np.where(is_held, (1 - s) * (problem.fixed - problem.q), 0.0)
+                left = np.where(is_fixed, (1 - s) * (problem.fixed - problem.q), 0.0)
                 contacts.time, functional.problem = (
                     now,
                     replace(problem, prescribed=problem.fixed - left),
@@ -129,15 +137,16 @@ class LedStart:
             gained = s - begun
         contacts.time = begin + s * (end - begin)
         raise StepFailed(
-            f"cannot lead anchors and obstacles on: after {s:.0%} of their way {contacts.nearest(q)}; "
+            f"cannot lead anchors and obstacles on: "
+            f"after {s:.0%} of their way {contacts.nearest(q)}; "
             'try other paths, or safety.on_failure = "substep"',
             "contact",
         )
 
-    def _direction(self, q: Positions, held: Rows, obstacles: Rows) -> Rows:
-        """Return Newton's direction (l, 3) [m] at q (l, 3) [m], held nodes included.
+    def _direction(self, q: Positions, fixed: Rows, obstacles: Rows) -> Rows:
+        """Return Newton's direction (l, 3) [m] at q (l, 3) [m], with the fixed nodes.
 
-        held, obstacles : how far held nodes (l, 3) and obstacles' points (o, 3) go along it [m]
+        fixed, obstacles : displacements of fixed nodes (l, 3) and obstacles' points (o, 3) [m]
         """
         functional, unknowns, (x, change, f) = (
             self.functional,
@@ -151,7 +160,7 @@ class LedStart:
         unknowns.from_nodes(q, x)
         functional.evaluate(x, f)
         self.jacobian.linearise(q, contact, True, contact.no_duals())
-        forces = self.jacobian.hessian.forces(held)
+        forces = self.jacobian.hessian.forces(fixed)
         contact.surface.add_change_of_gradient(q, obstacles, forces)
         unknowns.scaled_sum(np.zeros_like(q), functional.t2, forces, change)
         f.axpy(1.0, change)
@@ -161,6 +170,6 @@ class LedStart:
         self.ksp.solve(f, x)
         self.ksp.setTolerances(*tolerances)
         x.scale(-1.0)
-        way = held.copy()
+        way = fixed.copy()
         unknowns.to_nodes(x, way)
         return way

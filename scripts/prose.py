@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Check the English of docstrings and comments:  scripts/prose.py [files or folders]
+"""Check the English of docstrings and comments:  scripts/prose.py [--quiet] [files or folders]
 
-Print each offence with its place, then the rates of each folder. Exit with status 1 if a sentence
-is too long or begins badly, if a comment stands at the end of a line of code or is too wide, or if
-a folder has more of the vague words than a reader bears.
+Print each offence with its place, then the rates of each folder. With --quiet print faults alone.
+Exit with status 1 if a sentence is too long or begins badly, if a comment stands behind code or is
+too wide, or if a folder has more of the vague words than a reader bears.
 """
 
 import ast
@@ -43,7 +43,7 @@ def comments(source: str) -> Iterator[tuple[int, str, bool, int]]:
         text = token.string[1:].strip()
         if token.type != tokenize.COMMENT or text.startswith(MARKS):
             continue
-        (line, column), behind = token.start, bool(token.line[: token.start[1]].strip())
+        line, behind = token.start[0], bool(token.line[: token.start[1]].strip())
         if block and not behind and block[-1][0] + block[-1][1].count("\n") + 1 == line:
             begin, before, _, width = block.pop()
             block.append((begin, f"{before}\n{text}", False, max(width, token.end[1])))
@@ -86,19 +86,23 @@ def offences(path: Path, counts: Counter[str]) -> Iterator[tuple[int, str]]:
 
 def main(names: list[str]) -> int:
     """Print the offences in these files; return the exit status."""
+    quiet = "--quiet" in names
+    names = [name for name in names if name != "--quiet"]
     paths = [Path(name) for name in names] or [ROOT / "msmpetsc"]
     files = [file for path in paths for file in (sorted(path.rglob("*.py")) or [path])]
     failed, folders = False, defaultdict[Path, Counter[str]](Counter)
     for file in files:
         for line, fault in sorted(offences(file, folders[file.parent])):
             failed |= not fault.startswith("(")
-            print(f"{file}:{line}: {fault}")
+            if not (quiet and fault.startswith("(")):
+                print(f"{file}:{line}: {fault}")
     for folder, counts in folders.items():
         rates = {vague: 1000 * counts[vague] / max(counts["words"], 1) for vague in VAGUE}
         over = any(rate > VAGUE[vague] for vague, rate in rates.items())
         failed |= over and counts["words"] > 200
         shown = ", ".join(f"{rate:.1f} of {vague!r}" for vague, rate in rates.items())
-        print(f"{folder}: {counts['words']} words; in 1,000: {shown}{' - too many' * over}")
+        if not quiet or over:
+            print(f"{folder}: {counts['words']} words; in 1,000: {shown}{' - too many' * over}")
     return int(failed)
 
 

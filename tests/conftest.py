@@ -1,13 +1,16 @@
 """What several test files share: real MPI runs, and a small closed body."""
 
+import json
 import os
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 import trimesh
 from forked import run_forked, run_ranks
@@ -34,28 +37,26 @@ ENVIRONMENT = {
     **ONE_MACHINE,
 }
 
-# three minutes: a file of each room, what any change may break
-SMOKE = {
-    "test_cages", "test_contact", "test_export", "test_fill_fractions", "test_keys", "test_lattice",
-    "test_layers", "test_open", "test_process", "test_python", "test_scene", "test_sheet", "test_springs",
-    "test_static", "test_step", "test_writer",
-}  # fmt: skip
-
-# the files that take longest, which are begun first: what is left for the end is short
-LONGEST = [
-    "test_readme", "test_scenes", "test_agreement", "test_kills", "test_recovery", "test_resume", "test_tunnelling",
-    "test_sizing", "test_adaptive", "test_cycle_options", "test_extras", "test_new", "test_cli", "test_bodies",
-    "test_bodies_contact", "test_run", "test_cycle", "test_check", "test_grids", "test_going_on", "test_on_gpu",
-    "test_anchor", "test_cages",
-]  # fmt: skip
+# Seconds that each test file took, all its tests together; scripts/test --record-durations
+# writes them
+DURATIONS = Path(__file__).parent / "durations.json"
+# Seconds of a file up to which its tests are in the smoke run, which takes three minutes in all
+SMOKE = 3.0
 
 HANGS = 500.0  # [s]: what takes longer will not end; a loaded machine was seen to take ten times as long as another
 
 Run = Callable[..., subprocess.CompletedProcess]
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that records the durations of test files."""
+    parser.addoption(
+        "--record-durations", action="store_true", help=f"write {DURATIONS.name} after all tests"
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """All tests are all but the slow ones, unless tests are chosen: by their file, by -m or by -k."""
+    """Leave out slow tests unless tests are chosen by their file, by -m or by -k."""
     options = config.option
     if (
         config.args_source is not config.ArgsSource.ARGS
@@ -63,15 +64,41 @@ def pytest_configure(config: pytest.Config) -> None:
         and not options.keyword
     ):
         options.markexpr = "not slow"
+    if options.record_durations and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Recorder())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of a few files as smoke, so that `-m smoke` means them; put the longest files first."""
-    place = {name: number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+    """Put the longest files first, and mark the tests of short files as smoke."""
+    seconds = json.loads(DURATIONS.read_text())
+    items.sort(key=lambda item: -seconds.get(file_of(item.nodeid), 0.0))
     for item in items:
-        if item.path.stem in SMOKE and not item.get_closest_marker("slow"):
+        is_short = seconds.get(file_of(item.nodeid), np.inf) <= SMOKE
+        if is_short and not item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.smoke)
+
+
+def file_of(test: str) -> str:
+    """Return the file of a test's id."""
+    return test.partition("::")[0]
+
+
+class Recorder:
+    """Recorder of the seconds that each test file takes."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = json.loads(DURATIONS.read_text())
+        self.run: Counter[str] = Counter()
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Add the seconds of a set-up, a test or a tear-down."""
+        self.run[file_of(report.nodeid)] += report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        """Write the seconds of all files, of files that were not run as they were."""
+        seconds = self.seconds | {file: round(took, 1) for file, took in self.run.items()}
+        lines = json.dumps(dict(sorted(seconds.items())), indent=0)
+        DURATIONS.write_text(f"{lines}\n")
 
 
 def run(ranks: int, *arguments: object, status: int | None = None) -> subprocess.CompletedProcess:

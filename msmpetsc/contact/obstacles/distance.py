@@ -1,4 +1,4 @@
-"""Solids known by the distance to their surface: of closed meshes, and of functions of the user's own."""
+"""Solids given by a signed distance: closed meshes and functions of the user."""
 
 from abc import abstractmethod
 from weakref import finalize
@@ -13,15 +13,25 @@ from msmpetsc.errors import InputError
 from msmpetsc.extensions import DistanceFunction
 from msmpetsc.geometry.surface import Surface
 
-POINTS = 65  # of the grid that shows a function's surface, along each axis
-BEYOND = 1.0  # around the bodies, of their longest side: so far it is shown
-NEAR = 1e-4  # of the depth: over a shorter way a depth's slope gives more digits of its change than two depths
-ON_AN_EDGE = 1e-9  # barycentric
-ROUNDED = 1e-14  # of the largest coordinate: a nearest point that is no farther gives no direction
+# Grid points along each axis that show the surface of a function
+POINTS = 65
+# Margin around the bodies within which the surface is shown, in their longest side
+BEYOND = 1.0
+# Displacement over depth below which the slope gives the change of depth with more
+# digits
+NEAR = 1e-4
+# Barycentric coordinate below which a point is on an edge
+ON_AN_EDGE = 1e-9
+# Distance to the nearest point, over the largest coordinate, below which it has no
+# direction
+ROUNDED = 1e-14
 
 
 class DistanceSolid(Solid):
-    """A solid given by distances, on the CPU; a step often needs the same positions again."""
+    """Solid given by distances, on the CPU.
+
+    the last depths are kept, as a step asks for them again.
+    """
 
     def __init__(self) -> None:
         self._last: tuple[Positions, Floats, Indices] | None = None
@@ -37,10 +47,11 @@ class DistanceSolid(Solid):
         return like(q, self._behind(to_host(q), to_host(face))[1])
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m].
+        """Return the change of depth (n,) [m] of inner positions over displacements ``moved`` (n,
+        3).
 
-        Over a short way it comes by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the
-        surface bends by 1 / r.
+        A small change is found by the trapezoidal rule, with an error of |moved|^3 / (12 r^2) at a
+        surface of curvature 1 / r.
         """
         face, way = to_host(face), to_host(moved)
         (depth, normal), (depth_before, normal_before) = (
@@ -53,19 +64,19 @@ class DistanceSolid(Solid):
 
     @abstractmethod
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return its surface, for pictures, around bodies that are between two corners (3,) [m]."""
+        """Return the surface, for pictures, around bodies between two corners (3,) [m]."""
 
     @abstractmethod
     def _find(self, q: Positions) -> tuple[Floats, Indices]:
-        """Return depths and faces (n,) of positions (n, 3)."""
+        """Return depths (n,) [m] and faces (n,) of positions (n, 3) [m]."""
 
     @abstractmethod
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        """Return how far positions (n, 3) within lie behind faces (n,), (n,) [m], and the unit normals (n, 3)."""
+        """Return depths (n,) [m] of positions (n, 3) behind faces (n,), and normals (n, 3)."""
 
 
 class FunctionSolid(DistanceSolid):
-    """The solid in which a signed distance function of the user's is negative.
+    """Solid in which a signed distance function of the user is negative.
 
     key : of its table in the scene, for messages
     """
@@ -77,11 +88,12 @@ class FunctionSolid(DistanceSolid):
     def distances(self, q: Positions) -> tuple[Floats, Rows]:
         """Return the signed distances (n,) [m] of positions (n, 3) [m], and their gradients (n, 3).
 
-        Raises InputError where the function returns anything else.
+        Raises InputError if the function returns other shapes or numbers that are not finite.
         """
         if not len(q):
             return np.zeros(0), np.zeros((0, 3))
-        with np.errstate(all="warn"):  # it is the user's own
+        # Warnings of the user's function are the user's
+        with np.errstate(all="warn"):
             answer = self.function(q.copy())
         try:
             distance, gradient = (np.asarray(part, float) for part in answer)
@@ -91,25 +103,27 @@ class FunctionSolid(DistanceSolid):
             )
         except (TypeError, ValueError):
             raise InputError(
-                f"{self.key}.function: returned no distances of shape {(len(q),)} and gradients of shape {q.shape}"
+                f"{self.key}.function: returned no distances of shape {(len(q),)} and "
+                f"gradients of shape {q.shape}"
             ) from None
         if not (np.isfinite(distance).all() and np.isfinite(gradient).all()):
             raise InputError(f"{self.key}.function: returned numbers that are not finite")
         return distance, gradient
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return its surface by marching cubes, open where it goes on beyond what is shown."""
+        """Return the surface by marching cubes, open at the end of the part that is shown."""
         import igl
 
         margin = BEYOND * (high - low).max()
         axes = [
             np.linspace(*ends, POINTS) for ends in zip(low - margin, high + margin, strict=True)
         ]
+        # x runs first
         grid = (
             np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
             .transpose(2, 1, 0, 3)
             .reshape(-1, 3)
-        )  # x runs first
+        )
         distance = np.ascontiguousarray(self.distances(grid)[0])
         points, triangles, _ = igl.marching_cubes(distance, grid, POINTS, POINTS, POINTS)
         return Surface(points.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
@@ -123,14 +137,15 @@ class FunctionSolid(DistanceSolid):
 
 
 class MeshSolid(DistanceSolid):
-    """The inside of a closed surface; its face is the nearest triangle.
+    """Inside of a closed surface; the face of a point is the nearest triangle.
 
-    The pseudonormal of the nearest triangle, edge or corner tells what is inside (Baerentzen and
-    Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal).
+    A point is inside by the pseudonormal of the nearest triangle, edge or corner
+    (Baerentzen and Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal).
     """
 
     def __init__(self, surface: Surface):
-        import igl  # which other scenes do not need
+        # Other scenes do not need igl
+        import igl
 
         super().__init__()
         mesh = trimesh.Trimesh(surface.points, surface.triangles, process=True, validate=True)
@@ -142,19 +157,17 @@ class MeshSolid(DistanceSolid):
             self.triangles,
             igl.PerEdgeNormalsWeightingType.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM,
         )
-        self._of_edges = (
-            normals[of_edge].reshape(3, -1, 3).swapaxes(0, 1)
-        )  # of each triangle, facing its corners
+        # Normals of the edges opposite to the corners of each triangle
+        self._of_edges = normals[of_edge].reshape(3, -1, 3).swapaxes(0, 1)
         self._bounds = np.array(mesh.bounds)
         tree = igl.AABB()
         tree.init(self.points, self.triangles)
         self._trees = [tree]
-        finalize(
-            self, self._trees.clear
-        )  # at the end of Python, too, where igl's binding complains of what is left
+        # igl's binding complains of trees that are left at the end of Python
+        finalize(self, self._trees.clear)
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return the whole mesh, each triangle wound outwards."""
+        """Return the mesh, all triangles wound outwards."""
         return Surface(self.points, self.triangles)
 
     def _find(self, q: Positions) -> tuple[Floats, Indices]:
@@ -178,7 +191,7 @@ class MeshSolid(DistanceSolid):
         return depth, np.where(on_surface[:, None], self._normals[face], normals)
 
     def _pseudonormals(self, on_surface: Positions, face: Indices) -> Rows:
-        """Return directions (n, 3) outwards at points (n, 3) of triangles (n,)."""
+        """Return outward directions (n, 3) at points (n, 3) of triangles (n,)."""
         corners = self.points[self.triangles[face]]
         weights = points_to_barycentric(corners, on_surface)  # type: ignore[no-untyped-call]  # trimesh's
         zero = weights < ON_AN_EDGE

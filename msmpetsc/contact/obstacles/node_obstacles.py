@@ -13,15 +13,16 @@ from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
 from msmpetsc.lattice.lattice import Lattice
 
-Placed = tuple[Positions, Indices | None]  # q (owned, 3) [m] and sides (o, owned or more), if any
+# q (owned, 3) [m] and sides (o, owned or more); None without sides
+Placed = tuple[Positions, Indices | None]
 
 
 class NodeObstacles:
-    """Obstacles that act on nodes: penalties, which press, and exchanges, which nodes bounce off.
+    """Obstacles that act on nodes: penalties, which press, and exchanges, which reverse velocities.
 
-    Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and
-    ``time_step`` [s] its length; ``sides`` (o, l) tell of each obstacle by which face each node is
-    in contact (faces.side_of): the penalties' first, then the exchanges'.
+    Positions are local, (l, 3) [m], with ghosts. ``time`` [s] is the end of a step and
+    ``time_step`` [s] its length. ``sides`` (o, l) are the faces by which nodes are in contact with
+    each obstacle (solids.side_of), first of the penalties, then of the exchanges.
     """
 
     def __init__(
@@ -30,10 +31,8 @@ class NodeObstacles:
         self.lattice, self.penalties, self.exchanges = lattice, penalties, exchanges
         self.all = [p.obstacle for p in penalties] + [e.obstacle for e in exchanges]
         self.has_sides = any(obstacle.solid.has_sides for obstacle in self.all)
-        self.pressing, self.exchanging = (
-            slice(len(penalties)),
-            slice(len(penalties), None),
-        )  # rows of sides
+        # Rows of sides
+        self.pressing, self.exchanging = slice(len(penalties)), slice(len(penalties), None)
         self.strikes = bool(exchanges) or any(p.restitution is not None for p in penalties)
         self.has_friction = any(p.friction > 0 for p in penalties)
         nodes = lattice.nodes
@@ -48,12 +47,12 @@ class NodeObstacles:
         before: Indices | None,
         held: Mask,
     ) -> Indices:
-        """Return the sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step.
+        """Return the sides (o, n) of nodes that move straight from q to ``end`` (n, 3) in a step.
 
-        A plane has but one face, which needs no name.
+        Obstacles of a single face have no sides.
 
-        before : (o, n) the sides when the step began
-        held   : (n,) bool, the nodes that do not give way: they have no side
+        before : (o, n) sides at the start of the step
+        held   : (n,) whether a node is fixed; fixed nodes have no side
         """
         sides = np.zeros((len(self.all), len(q)), np.int8, like=q)
         for row, obstacle in enumerate(self.all):
@@ -63,14 +62,17 @@ class NodeObstacles:
         return sides
 
     def same_push(self, q: Positions, time: float, a: Indices, b: Indices) -> bool:
-        """Return whether penalties press alike on nodes at q with both sides (o, l) (collective)."""
+        """Return whether penalties press alike on nodes with sides a and b (o, l) (collective)."""
         rows = q[: self.lattice.owned]
         pressing = [row for row, p in enumerate(self.penalties) if p.obstacle.acts_at(time)]
         pushed = ([self._pushed(row, (rows, side), time) for row in pressing] for side in (a, b))
         return bool(self.lattice.table.comm.allreduce(all(map(np.array_equal, *pushed)), MPI.LAND))
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
-        """Return the contact with penalties at a time, without friction; None if no penalty acts."""
+        """Return the contact with penalties at a time, without friction.
+
+        None if no penalty acts.
+        """
         states = [
             p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)
         ]
@@ -85,10 +87,11 @@ class NodeObstacles:
         sides: Indices | None,
         before: Contact | None,
     ) -> list[ContactState]:
-        """Return the penalties that press in a step from q, with friction that goes on from the contact ``before``.
+        """Return the states of the penalties that act in a step from q.
 
-        last, end : as Environment.contact has them
-        step      : the time of its end and its length [s]
+        last, end : see Environment.contact
+        step      : end and length of the step [s]
+        before    : contact of the last step, whose friction goes on
         """
         (time, time_step), owned, states = step, self.lattice.owned, []
         held = before.states if before else []
@@ -111,7 +114,7 @@ class NodeObstacles:
     ) -> None:
         """Apply friction of obstacles at a time, for a ``duration`` [s], to this rank's nodes.
 
-        substep : its begin and end [s], between which an obstacle carries nodes along
+        substep : begin and end [s], between which an obstacle carries nodes along
         """
         begin, end = substep
         for p, side in self._pressing(time, sides):
@@ -125,10 +128,12 @@ class NodeObstacles:
     def contact_stiffness_bound(
         self, q: Positions, speed: float, start: float, time: float, sides: Indices
     ) -> Floats:
-        """Bound the stiffness (owned,) [N/m] that obstacles add to each node from start to ``time``.
+        """Return a bound (owned,) [N/m] of the stiffness that obstacles add from start to ``time``.
 
-        q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
-            makes good is counted as inside already
+        A node counts as inside from twice its possible way on.
+
+        q     : (owned, 3) [m] at the start
+        speed : bound of all nodes' speeds [m/s]
         """
         stiffness = np.zeros(len(q), like=q)
         for p, side in zip(self.penalties, sides[self.pressing], strict=True):
@@ -140,9 +145,9 @@ class NodeObstacles:
         return stiffness
 
     def power(self, q: Positions, time: float, begin: float, end: float, sides: Indices) -> float:
-        """Return the power [W] of penalties' push at ``time`` on this rank's nodes (owned, 3) [m].
+        """Return the power [W] of penalties on this rank's nodes q (owned, 3) [m] at ``time``.
 
-        begin, end : the substep [s] as in which obstacles move
+        begin, end : substep [s] that gives the velocities of obstacles
         """
         power = 0.0
         for p, side in self._pressing(time, sides):
@@ -155,7 +160,7 @@ class NodeObstacles:
     def energy_of_new_obstacles(
         self, q: Positions, begin: float, end: float, sides: Indices
     ) -> float:
-        """Return the energy [J], at a substep's end, of the push of penalties that were not there when it began."""
+        """Return the energy [J] at a substep's end of penalties that began to act within it."""
         new = [
             p.state_at(end, side)
             for p, side in self._pressing(end, sides)
@@ -166,9 +171,12 @@ class NodeObstacles:
     def friction_work_bound(
         self, before: Placed, after: Placed, time: float, time_step: float, frame: Floats
     ) -> float:
-        """Return no less than the work [J] that friction of moving obstacles does on this rank's nodes in a step.
+        """Return a bound of the work [J] of friction of moving obstacles on this rank's nodes in a
+        step.
 
-        It is mu N times how far they go, seen from a frame that goes by ``frame`` (3,) [m] itself.
+        The bound is mu N times the displacement of each obstacle relative to a frame.
+
+        frame : (3,) displacement of the frame [m]
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
@@ -183,21 +191,23 @@ class NodeObstacles:
         return work
 
     def way_of_pressing(self, state: Placed, time: float, time_step: float) -> tuple[float, Floats]:
-        """Return the push of penalties on this rank's nodes [N], and the sum (3,) [N m] of each push times its way."""
+        """Return the force of penalties on this rank's nodes [N], and its products with
+        displacements.
+
+        The second is the sum (3,) [N m] over obstacles of force times displacement in the step.
+        """
         push, led = 0.0, np.zeros(3)
         for row, p in enumerate(self.penalties):
             if p.obstacle.acts_at(time):
                 share = p.stiffness * float(self._pushed(row, state, time).sum())
-                push, led = (
-                    push + share,
-                    led + share * p.obstacle.path.displacement_between(time - time_step, time),
-                )
+                way = p.obstacle.path.displacement_between(time - time_step, time)
+                push, led = push + share, led + share * way
         return push, led
 
     def change_of_push(
         self, before: Placed, after: Placed, time: float, time_step: float
     ) -> Floats:
-        """Return how much penalties' push on this rank's nodes changes in a step, (owned,) [N]."""
+        """Return the change (owned,) [N] of penalty forces on this rank's nodes in a step."""
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
             deeper = np.zeros_like(change)
@@ -208,12 +218,13 @@ class NodeObstacles:
         return change
 
     def _pushed(self, row: int, state: Placed, time: float) -> Floats:
-        """Return how deep nodes (owned,) of a state are in a penalty's obstacle at a time [s], 0 outside [m]."""
+        """Return the depths (owned,) [m] of nodes in a penalty's obstacle, 0 outside."""
         q, sides = state
         side = (self.no_sides if sides is None else sides)[row, : len(q)]
         return np.maximum(self.penalties[row].state_at(time, side).depths(q)[0], 0)
 
     def _pressing(self, time: float, sides: Indices | None) -> list[tuple[Penalty, Indices]]:
+        """Return the penalties that act at a time [s], each with the sides of its nodes."""
         sides = (self.no_sides if sides is None else sides)[self.pressing]
         return [
             (p, side)
@@ -224,12 +235,12 @@ class NodeObstacles:
     def strike(
         self, q: Positions, q_previous: Positions, step: StepTaken, held: Mask
     ) -> tuple[Positions, Positions, float]:
-        """Return q_n and q_(n-1) after obstacles that nodes bounce off, and their work [J] on this rank's nodes.
+        """Return q_n and q_(n-1) after strikes, and the obstacles' work [J] on this rank's nodes.
 
-        The arrays are the very same if nothing is struck.
+        The arrays are the same objects if no node strikes.
 
         step : with the sides (o, l) of all obstacles
-        held : (l,) bool, the nodes that do not give way
+        held : (l,) whether a node is fixed
         """
         free, work = ~held[:, None], 0.0
         sides = self.no_sides if step.sides is None else step.sides
@@ -251,7 +262,10 @@ class NodeObstacles:
         return q, q_previous, work
 
     def _impulse_work(self, obstacle: Obstacle, change: Rows, step: StepTaken) -> float:
-        """Return an obstacle's work [J] that changes velocities: the impulse times its velocity."""
+        """Return the work [J] of an obstacle that changes velocities.
+
+        impulse times its velocity.
+        """
         if not obstacle.path.leads_away:
             return 0.0
         way = obstacle.path.displacement_between(step.time - step.length, step.time)

@@ -1,12 +1,13 @@
-"""What a node does that strikes an obstacle: it loses speed (``slowed``), or, as the paper has it
-(section 5), its last two positions are exchanged (``Exchange``).
+"""Change of velocity of nodes that strike an obstacle.
 
-There is no velocity in the state, only q_n and q_(n-1). A node that strikes gets e times its normal
-velocity by another q_(n-1): it stays where the springs want it, and no energy comes in. The push of
-the face then turns it round, so that it leaves with e times the speed that it came with.
+A state has no velocity, only q_n and q_(n-1).
 
-The paper reverses a velocity, v_(n+1) = -v_n, by q_(n+1) = q_(n-1). The obstacle thereby moves
-nodes against their springs, which adds energy during the impact; it is not a conservative contact.
+- ``slowed`` changes q_(n-1), so that the normal velocity becomes e times itself. The node stays in
+  place, and no energy comes in. The penalty of the face then turns the node round, so that it
+  leaves with e times its speed.
+- ``Exchange`` reverses a velocity, v_(n+1) = -v_n, by q_(n+1) = q_(n-1) (paper section 5). The
+  obstacle thereby moves nodes against their springs, which adds energy: the contact is not
+  conservative.
 """
 
 from dataclasses import dataclass
@@ -19,8 +20,13 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 @dataclass(frozen=True)
 class StepTaken:
-    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in
-    contact (Obstacle.sides), of several obstacles (o, n); None: by none."""
+    """Step that has been taken.
+
+    time   : of its end [s]
+    length : [s]
+    sides  : (n,) faces by which nodes are in contact (Obstacle.sides), (o, n) of several
+             obstacles; None without contact
+    """
 
     time: float
     length: float
@@ -29,7 +35,7 @@ class StepTaken:
 
 @dataclass(frozen=True)
 class Exchange:
-    """An obstacle and its restitution in [0, 1] (1: the paper)."""
+    """Obstacle with a restitution in [0, 1], 1 in the paper."""
 
     obstacle: Obstacle
     restitution: float
@@ -37,11 +43,12 @@ class Exchange:
     def exchanged(
         self, q: Positions, q_previous: Positions, step: StepTaken
     ) -> tuple[Positions, Positions]:
-        """Return q_n and q_(n-1) after contact; (n, 3) [m] each.
+        """Return q_n and q_(n-1) after contact, (n, 3) [m] each.
 
-        Where a node, on its way, has come to lie on or behind a face and its v_n = q_n - q_(n-1), as seen from
-        the obstacle, goes on into it, the normal part of q_n goes back by that of v_n, which becomes -e times itself.
-        With e = 1 and an obstacle at rest this exchanges the normal parts of q_n and q_(n-1).
+        A node strikes if it lies on or behind a face and its v_n = q_n - q_(n-1), relative to the
+        obstacle, leads further in. The normal part of q_n then goes back by that of v_n, which
+        becomes -e times itself. With e = 1 and an obstacle at rest this exchanges the normal parts
+        of q_n and q_(n-1).
         """
         rows, into = striking(self.obstacle, q, q_previous, step)
         if len(rows) == 0:
@@ -55,7 +62,7 @@ class Exchange:
 def slowed(
     obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken
 ) -> Positions:
-    """Return q_(n-1) (n, 3) [m] by which nodes that came to a face in this step have e times their velocity into it."""
+    """Return q_(n-1) (n, 3) [m] such that striking nodes have e times their normal velocity."""
     rows, into = striking(obstacle, q, q_previous, step)
     before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]
     rows, into = rows[before < 0], into[before < 0]
@@ -69,8 +76,11 @@ def slowed(
 def striking(
     obstacle: Obstacle, q: Positions, q_previous: Positions, step: StepTaken
 ) -> tuple[Indices, Rows]:
-    """Return the nodes (k,) on or behind the faces of their sides, and the part (k, 3) [m] of their way in the step
-    that goes on into it, as seen from the obstacle; nothing where that is not there."""
+    """Return the nodes (k,) on or behind faces, and their inward displacements (k, 3) [m].
+
+    Displacements are those of the step, relative to the obstacle and normal to the face. There are
+    no nodes if the obstacle does not act.
+    """
     time, path = step.time, obstacle.path
     if not obstacle.acts_at(time):
         return np.zeros(0, np.int64), np.zeros((0, 3))

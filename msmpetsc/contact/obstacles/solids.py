@@ -1,6 +1,6 @@
 """Solids that nodes stay out of: planes, boxes and balls.
 
-Each at its place at time 0; where an obstacle has moved, positions are as seen from it.
+A solid is at its place at time 0. Positions are relative to a moved obstacle.
 """
 
 from abc import ABC, abstractmethod
@@ -13,54 +13,59 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 
-TINY = 1e-300  # [m]
-OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other
-ROUNDED = 1e-12  # of a node's way: a plate as thin as that is not passed either
+# Least length [m], against division by 0
+TINY = 1e-300
+# Cosine below which two faces look away from each other
+OPPOSITE = -1 + 1e-9
+# Share of a node's way; a thinner plate is not passed either
+ROUNDED = 1e-12
 
 Send = Callable[[Array], Array]
 
 
 class Solid(ABC):
-    """A solid. Positions are (n, 3) [m]; a face is what a node comes in by, one of several or the only one, 0."""
+    """Solid with one or more faces, numbered from 0. Positions are (n, 3) [m]."""
 
     @property
     def has_sides(self) -> bool:
-        """Whether it matters by which of its faces a node came in."""
+        """Whether the face through which a node entered matters."""
         return False
 
     @abstractmethod
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """Return how deep positions lie (n,) [m], behind the face of their side (n or more,) or
-        else the nearest, and that face (n,).
+        """Return depths (n,) [m] behind the face of each side, or else the nearest, and faces (n,).
 
-        Outside it is negative, and no less than minus the distance.
+        A depth outside is negative, and no less than minus the distance.
+
+        sides : (n or more,) of the positions
         """
 
     @abstractmethod
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
+        """Return the unit normals (n, 3) of faces (n,) at inner positions."""
 
     @abstractmethod
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return how much deeper positions within lie behind faces (n,) than ``moved`` (n, 3) [m] before, (n,) [m].
+        """Return the change of depth (n,) [m] behind faces (n,) over displacements ``moved`` (n,
+        3).
 
-        A difference of depths would keep only the digits of a position.
+        A difference of depths would have only the digits of a position.
         """
 
     def sent(self, send: Send) -> "Solid":
-        """Return it with the arrays that each step works with sent where ``send`` takes them."""
+        """Return the solid with the arrays of a step moved by ``send``, to a device."""
         return self
 
 
 class Planes(NamedTuple):
-    """Planes of faces, (f, 3) each: a point [m], and the unit normal towards the free side."""
+    """Planes of faces: points (f, 3) [m] and unit normals (f, 3) towards the free side."""
 
     points: Positions
     normals: Rows
 
 
 class Depths(NamedTuple):
-    """Sides (n or more,) of nodes; their depths (n,) [m] and faces (n,), to be written to."""
+    """Sides (n or more,) of nodes, and depths (n,) [m] and faces (n,) as output."""
 
     sides: Indices
     depths: Floats
@@ -68,7 +73,7 @@ class Depths(NamedTuple):
 
 
 class Ways(NamedTuple):
-    """Ends (n, 3) [m] of nodes' ways, sides (n,) before, and after (n,), to be written to."""
+    """Ends (n, 3) [m] of nodes' ways, sides (n,) before, and sides (n,) after as output."""
 
     ends: Positions
     before: Indices
@@ -77,7 +82,7 @@ class Ways(NamedTuple):
 
 @njit(inline="always")
 def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
-    """Return how far the position q[i] (3,) lies behind a face [m]; negative in front of it."""
+    """Return the depth [m] of the position q[i] (3,) behind a face, negative in front."""
     points, normals = planes
     distance: float = -normals[face, 0] * (q[i, 0] - points[face, 0])
     distance -= normals[face, 1] * (q[i, 1] - points[face, 1])
@@ -87,9 +92,9 @@ def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
 
 @njit(inline="always")
 def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
-    """Return how deep q[i] (3,) lies behind the face of its ``side`` [m], and that face.
+    """Return the depth [m] of q[i] (3,) behind the face of its ``side``, and that face.
 
-    Without a side: how deep in the solid, not positive outside, and the nearest face.
+    Without a side return the depth in the solid, not positive outside, and the nearest face.
     """
     if side > 0:
         return behind(q, i, planes, side - 1), side - 1
@@ -103,9 +108,9 @@ def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
 
 @njit()
 def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
-    """Return whether q[i] lies behind a face and has not slid off it past another.
+    """Return whether q[i] is behind a face and has not slid off past another face.
 
-    The opposite face is left aside: that of a thin plate may be passed.
+    The opposite face is ignored, since a node may pass that of a thin plate.
     """
     if behind(q, i, planes, face) <= 0.0:
         return False
@@ -120,19 +125,20 @@ def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
 
 @njit()
 def side_of(q: Positions, end: Positions, i: int, planes: Planes, side: int) -> int:
-    """Return 1 + the face by which a node is in contact on its straight way from q[i] to end[i], 0 if it meets none.
+    """Return the side of a node on its straight way from q[i] to end[i]: 1 + its face, or 0.
 
-    side : by which it was before: it keeps that until it is out of the solid
+    The node counts here, however far it sticks out of the surface. A node with a side but without
+    depth is on its way in or out.
 
-    It is the node that counts here, however far it sticks out of the surface: with a side, but no
-    depth yet, it is on its way in, or out again.
+    side : before the way; the node keeps it until it is out of the solid
     """
     if side > 0 and _stays(q, i, planes, side - 1):
         return side
     inside, face = depth(q, i, planes, 0)
     if inside > 0.0:
         return face + 1
-    enter, leave, side = -1.0, 1.0, 0  # fractions of the way
+    # Shares of the way
+    enter, leave, side = -1.0, 1.0, 0
     for f in range(len(planes.points)):
         first, last = behind(q, i, planes, f), behind(end, i, planes, f)
         if first <= 0.0:
@@ -161,16 +167,15 @@ def _sides_of(first: int, count: int, step: int, q: Positions, planes: Planes, w
 
 @dataclass(frozen=True)
 class Faces(Solid):
-    """The points behind all faces: one face is a plane, six are a box."""
+    """Points behind all faces: one face is a plane, six faces are a box."""
 
     planes: Planes
 
     @classmethod
     def of_box(cls, low: Positions, high: Positions) -> "Faces":
         """Return the box between two corners (3,) [m]."""
-        points = np.repeat(
-            np.array([low, high], float), 3, axis=0
-        )  # the faces that meet at each of the two corners
+        # Three faces meet at each of the two corners
+        points = np.repeat(np.array([low, high], float), 3, axis=0)
         return cls(Planes(points, np.concatenate([-np.eye(3), np.eye(3)])))
 
     @property
@@ -191,7 +196,10 @@ class Faces(Solid):
         return deeper
 
     def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
-        """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3), ``before`` (n,) having sides."""
+        """Return the sides (n,) of nodes that move straight from q to ``end`` (n, 3) [m].
+
+        before : (n,) sides at q
+        """
         ways = Ways(end, before, no_sides(q))
         _sides_of(len(q), q, self.planes, ways)
         return ways.sides
@@ -202,7 +210,7 @@ class Faces(Solid):
 
 @dataclass(frozen=True)
 class BallSolid(Solid):
-    """A ball: center (3,) and radius [m]. At its very center there is no normal."""
+    """Ball of center (3,) [m] and radius [m]; at the center there is no normal."""
 
     center: Positions
     radius: float
@@ -218,7 +226,7 @@ class BallSolid(Solid):
         return normals
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return how much deeper positions within lie: |u| - |v| = (u - v) (u + v) / (|u| + |v|), (n,) [m]."""
+        """Return the change of depth (n,) [m]: |u| - |v| = (u - v) (u + v) / (|u| + |v|)."""
         u = q - self.center
         v = u - moved
         both = np.linalg.norm(u, axis=1) + np.linalg.norm(v, axis=1)
@@ -230,5 +238,5 @@ class BallSolid(Solid):
 
 
 def no_sides(q: Positions) -> Indices:
-    """Return the sides (n,) of nodes (n, 3) that are in contact with nothing."""
+    """Return the sides (n,) of nodes (n, 3) without contact."""
     return np.zeros(len(q), np.int8, like=q)

@@ -21,6 +21,7 @@ WIDEST = 88  # columns of a comment
 # most of these words in 1,000, as counted in the models of good style (PyFR, scikit-fem, lineax)
 VAGUE = {"what": 0.5, "one, ones, those, others, such": 3.6}
 MARKS = ("type:", "noqa", "fmt:", "!", "pragma", "%%")
+CITATION = re.compile(r"\([^()]*\b(?:19|20)\d\d\b[^()]*\)")
 CODE = re.compile(r"``[^`]*``|`[^`]*`|^(?: {4,}|>>>|\|).*$", re.MULTILINE)
 
 
@@ -54,7 +55,8 @@ def comments(source: str) -> Iterator[tuple[int, str, bool, int]]:
 
 
 def sentences(text: str) -> Iterator[str]:
-    """Yield the sentences of a text, its code and its tables left out."""
+    """Yield the sentences of a text without code, tables and citations."""
+    text = CITATION.sub("", text)
     for paragraph in re.split(r"\n\s*\n|\n\s*[-*] ", CODE.sub("x", text)):
         yield from re.split(r"(?<=[.!?:;])\s+", " ".join(paragraph.split()))
 

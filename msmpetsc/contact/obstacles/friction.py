@@ -84,7 +84,7 @@ class Friction:
         )
 
     def held(self, q: Positions, stick: float) -> Rows:
-        """Return the elastic slips (a, 3) [m] at q (n, 3) for a next step with e = ``stick`` [m]."""
+        """Return the elastic slips (a, 3) [m] at q (n, 3) for a step with e = ``stick`` [m]."""
         u, length = self.slip(q)
         return u * (stick / np.maximum(length, self.stick))[:, None]
 

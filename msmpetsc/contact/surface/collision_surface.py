@@ -1,4 +1,7 @@
-"""The surface that meets itself and obstacles: the bodies' own or a coarser one, but for what cuts itself."""
+"""Surface that meets itself and obstacles: the surface of the bodies or a coarser surface.
+
+Triangles that cross at rest are left out.
+"""
 
 from collections.abc import Sequence
 
@@ -23,16 +26,22 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
 from msmpetsc.scene.reading import Scene
 
-# Share of the bounding box's diagonal; the least distance, if a scene gives none.
+# Least default distance, as a share of the bounding box's diagonal
 NEAR = 3e-4
-# Share of a cell; the distance, if a scene gives none and no parts are nearer at rest. A thinner barrier gives way
-# before a cell does, and cuts Newton's directions to a few hundredths (scripts/results/impact.md).
+# Default distance, as a share of a cell. A thinner barrier gives way before a cell
+# does, and cuts Newton's directions to a few hundredths (scripts/results/impact.md)
 SHARE = 1 / 64
-MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
-LONG = 2.0  # cells
-FEWEST = 20  # triangles of a body
-HASTE = 4  # of the decimation: with its usual 7 bunny and lung were twice and four times as far off
-PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (lattice.material)
+# Most triangles that may be left out, as a share of all; with more of them left out,
+# little would keep the rest apart
+MOST_CUT = 0.1
+# Edge length beyond which a triangle is long [cells]
+LONG = 2.0
+# Fewest triangles of a body
+FEWEST = 20
+# Speed of the decimation; its default, 7, leaves two to four times the distance
+HASTE = 4
+# Young's modulus over k_1 / h (lattice.material)
+PER_EDGE = 7 / 4
 
 
 def collision_surface(
@@ -42,10 +51,14 @@ def collision_surface(
     lattice: Lattice,
     obstacles: list[Obstacle],
 ) -> CollisionSurface | None:
-    """Return the surface of all bodies that meets itself or obstacles; None where neither is asked for (collective).
+    """Return the surface of all bodies that meets itself or obstacles (collective).
+
+    Return None if the scene asks for neither.
 
     obstacles : in the scene's order
-    Raises InputError on all ranks where over a tenth of its triangles cut others at rest, and where obstacles do.
+
+    Raises InputError on all ranks if over a tenth of the triangles cross at rest, and if an
+    obstacle cuts a body.
     """
     table, comm = scene.touching, bodies[0].comm
     if table is None:
@@ -65,9 +78,10 @@ def collision_surface(
     distance = table.distance or max(
         least, off, _gap(comm, joint, widest, bodies_end, meets_itself)
     )
-    # kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells, E / h, and what its
-    # inertia adds in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness)
-    # takes both of each contact; with those of the stiffest cell it, and the energy of a state, is always the same.
+    # kappa / dhat^2 is a stiffness per area: that of a layer of full cells, E / h, plus
+    # the share of its inertia in a step, rho h / t^2. Ando (2024, A cubic barrier with
+    # elasticity-inclusive dynamic stiffness) takes both of each contact. Here both are
+    # of the stiffest cell, so that the energy of a state never changes.
     mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
     layer = (PER_EDGE * lattice.stiffest(comm) + mass / scene.time.step**2) / lattice.cell_size**2
     stick = table.friction_speed or STICK * smallest(np.array([body.bounds for body in bodies]))
@@ -85,11 +99,12 @@ def collision_surface(
 def _prepared(
     bodies: list[Surface], table: SelfContactTable, meets_itself: bool, cell_size: float
 ) -> tuple[list[Surface], float, float]:
-    """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without
-    those that cut others, the median distance [m] of their own points from them, and their edges' mean
-    length [m].
+    """Return the surfaces that meet, their distance from the bodies' surfaces, and their mean edge.
 
-    Raises InputError where too many do.
+    The surfaces have about as many triangles as the table asks for, all of them if it does not.
+    Triangles that cross are left out. The distance is the median over the bodies' points [m].
+
+    Raises InputError if too many triangles cross.
     """
     off = 0.0
     if table.surface is not None:
@@ -100,7 +115,8 @@ def _prepared(
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
         longest = max(float(np.linalg.norm(np.ptp(body.points, axis=0))) for body in bodies)
-        # Points nearer to a plane of the grid than SAME are on it: a lesser gap would be none.
+        # Points within SAME of a plane of the grid snap to it, which would close a
+        # smaller gap
         gap = max(NEAREST * (table.distance or NEAR * longest), 2 * SAME * longest)
         bodies = _without_cut(_parted(bodies, gap))
     ends = np.concatenate(
@@ -115,12 +131,13 @@ def _prepared(
 def _gap(
     comm: MPI.Comm, surface: Surface | None, widest: float, bodies: int, meets_itself: bool
 ) -> float:
-    """Return the least distance [m] at rest of parts that push each other, at most ``widest`` [m] (collective).
+    """Return the least distance [m] at rest of parts that may touch, at most ``widest``
+    (collective).
 
     A wider barrier would throw apart bodies that a scene puts side by side.
 
     surface : on rank 0
-    bodies  : number of its first points, those of bodies
+    bodies  : number of the bodies' points, which come first
     """
 
     def of_root() -> float:
@@ -135,7 +152,7 @@ def _gap(
 
 
 def _refuse_touching(surface: CollisionSurface) -> None:
-    """Raise InputError where an obstacle cuts a body at rest, or all but touches it."""
+    """Raise InputError if an obstacle cuts a body at rest, or all but touches it."""
     whole, law = surface.surface, surface.law
     if whole is None or not surface.points.obstacles.total:
         return
@@ -153,13 +170,16 @@ def _refuse_touching(surface: CollisionSurface) -> None:
 
 
 def _place(surface: Surface, triangle: int) -> str:
-    """Return where a triangle is, in words."""
+    """Return the centre of a triangle, in words."""
     middle = surface.points[surface.triangles[triangle]].mean(axis=0)
     return "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
 
 
 def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
-    """Return surfaces of bodies, drawn in by ``gap`` [m] if any two are nearer at rest: a barrier needs a distance."""
+    """Return the surfaces, drawn in by ``gap`` [m] if any two bodies are closer at rest.
+
+    The barrier needs a distance.
+    """
     whole = joined(bodies)
     assert whole is not None
     owner = np.repeat(np.arange(len(bodies)), [len(body.points) for body in bodies])
@@ -175,29 +195,33 @@ def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
 
 
 def _without_cut(bodies: list[Surface]) -> list[Surface]:
-    """Return surfaces without the triangles that cut others. Raises InputError where too many do."""
+    """Return surfaces without crossing triangles. Raises InputError if too many cross."""
     whole = joined(bodies)
     assert whole is not None
     cut = Barrier(whole, BarrierLaw(1.0, 1.0, 0.0, 1.0), len(whole.points)).crossings()
     if len(cut) == 0:
         return bodies
-    what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at "
-    what += f"{_place(whole, cut[0])} m"
+    fault = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, "
+    fault += f"the first at {_place(whole, cut[0])} m"
     ends = np.cumsum([len(body.triangles) for body in bodies])[:-1]
     if len(of := np.unique(np.searchsorted(ends, cut, side="right"))) > 1:
-        what += f" (of {', '.join(f'body.{number}' for number in of)}, which must be parted if they overlap)"
+        names = ", ".join(f"body.{number}" for number in of)
+        fault += f" (of {names}, which must be parted if they overlap)"
     if len(cut) > MOST_CUT * len(whole.triangles):
         raise InputError(
-            f'{what}, too many to leave out: mesh.prepare = ["union"] or ["repair"] may mend the mesh'
+            f"{fault}, too many to leave out: "
+            'mesh.prepare = ["union"] or ["repair"] may mend the mesh'
         )
-    log.warning("%s: they are left out, and may be crossed", what)
+    log.warning("%s: they are left out, and may be crossed", fault)
     of_body = np.split(~np.isin(np.arange(len(whole.triangles)), cut), ends)
     return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)]
 
 
 def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:
-    """Return the median distance [m] of the bodies' points from the coarser surfaces, and say the
-    greatest, of which a part that was lost makes much."""
+    """Return the median distance [m] of the bodies' points from the coarser surfaces.
+
+    Warn of the greatest distance, which shows a part that was lost.
+    """
     import igl
 
     squares = [
@@ -207,28 +231,37 @@ def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> floa
     off = np.sqrt(np.concatenate(squares))
     if off.max() > distance:
         log.warning(
-            "self_contact.surface: the surface drawn is off the one of %d triangles that meets itself by up to %.2g m, "
-            "half of it by more than %.2g m: where it touches, it may cross by as much; more triangles bring it nearer",
-            sum(len(coarse.triangles) for coarse in coarser), off.max(), np.median(off),
-        )  # fmt: skip
+            "self_contact.surface: the surface drawn is off the surface of %d triangles that meets "
+            "itself by up to %.2g m, half of it by more than %.2g m: where it touches, it may "
+            "cross by as much; more triangles bring it nearer",
+            sum(len(coarse.triangles) for coarse in coarser),
+            off.max(),
+            np.median(off),
+        )
     return float(np.median(off))
 
 
 def _warn_of_long_triangles(longest: float, length: float) -> None:
-    """Warn of an edge that is much longer than a length [m]: contact is known where the surface has points.
+    """Warn of an edge that is much longer than a length [m].
 
-    Two cubes of twelve triangles touch at their corners, and what bulges between passes.
+    Only the points of the surface follow the body. Two cubes of twelve triangles touch at their
+    corners, and bulges between the corners pass through each other.
     """
     if longest > LONG * length:
         log.warning(
-            "self_contact: a triangle is %.2g m long in cells of %.2g m: what bulges between its points may pass "
-            "unseen; mesh.prepare = [{ refine = 0.05 }] splits those longer than a twentieth of the body",
-            longest, length,
-        )  # fmt: skip
+            "self_contact: a triangle is %.2g m long in cells of %.2g m: what bulges between its "
+            "points may pass unseen; mesh.prepare = [{ refine = 0.05 }] splits those longer than a "
+            "twentieth of the body",
+            longest,
+            length,
+        )
 
 
 def _coarser(surface: Surface, triangles: int) -> Surface:
-    """Return a surface of about so many triangles with its points on the given one, so that they lie in its cells."""
+    """Return a surface of about so many triangles with its points on the given surface.
+
+    So its points lie in the cells of the body.
+    """
     import igl
 
     reduced = simplify(surface, triangles, HASTE)

@@ -1,8 +1,9 @@
-"""Pairs of a surface's parts in its creases, which push each other from smaller distances than others do.
+"""Pairs of a surface's parts in its creases, which push each other from smaller distances.
 
-Parts nearer than dhat at rest, a few rings of triangles apart at the most, are one piece of surface. Each of their
-pairs pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that is no more than half of its distance at rest:
-there it does nothing, and yet it does not cross. Others as near at rest do push.
+Parts that are closer than dhat at rest and at most a few rings of triangles apart are one piece of
+surface. Each of their pairs pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that is at
+most half of its distance at rest. So the pair does nothing at rest and still cannot cross. Parts
+farther apart on the surface push from dhat, however close they are at rest.
 """
 
 from collections.abc import Mapping
@@ -16,17 +17,23 @@ from msmpetsc.backend.arrays import Indices, Positions
 if TYPE_CHECKING:
     import ipctk
 
-RINGS = 3  # of triangles that neighbours are apart at the most
-FINER = 4  # a distance over the next smaller one
-ROOM = 2.0  # of a pair at rest, in distances that it pushes from
-NEAREST = 1e-3  # of dhat: pairs nearer than that at rest may cross
+# Most rings of triangles between neighbours
+RINGS = 3
+# Ratio of successive distances
+FINER = 4
+# Distance of a pair at rest, over the distance from which it pushes
+ROOM = 2.0
+# Share of dhat; pairs that are closer at rest may cross
+NEAREST = 1e-3
 
 
 def neighbours(
     candidates: "ipctk.Candidates", mesh: "ipctk.CollisionMesh", points: Positions, distance: float
 ) -> Mapping[tuple[int, int], bool]:
-    """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than
-    ``distance`` [m] at rest."""
+    """Return {(i, j): False}, i < j, for points of neighbours, which push from smaller distances.
+
+    Neighbours are candidate pairs closer than ``distance`` [m] at rest.
+    """
     of_points = _cross_pairs(
         candidates.fv_candidates, mesh, points, distance, [(0, 1), (0, 2), (0, 3), (0, 3)]
     )
@@ -52,8 +59,11 @@ def neighbours(
 def _cross_pairs(
     kind: list[Any], mesh: Any, points: Positions, distance: float, cross: list[Any]
 ) -> Indices:
-    """Return of each near candidate the pairs (k, 4, 2) of a point of the first and one of the
-    second part, by their places in ``cross``: of a point and a triangle there are three, one twice."""
+    """Return pairs (k, 4, 2) of points, one of either part, for each candidate closer than
+    ``distance``.
+
+    cross : places of the points in a candidate; a point and a triangle have three pairs, one twice
+    """
     points, edges, faces = np.asfortranarray(points), mesh.edges, mesh.faces
     near = [
         c.vertex_ids(edges, faces)
@@ -69,9 +79,11 @@ def creases(
     points: Positions,
     distance: float,
 ) -> tuple[dict[float, "ipctk.Candidates"], int]:
-    """Return by distance [m], the greatest first, the pairs that are left out, and how many are too near for any.
+    """Return the pairs of creases by their distance [m], and the number of pairs too close for any.
 
-    apart    : {(i, j): False} of the points that may not meet
+    The greatest distance comes first.
+
+    apart    : {(i, j): False} of the points of neighbours
     points   : (p, 3) [m] at rest
     distance : dhat [m]
     """
@@ -98,8 +110,10 @@ def creases(
 def _left_out(
     apart: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
 ) -> list["ipctk.FaceVertexCandidate | ipctk.EdgeEdgeCandidate"]:
-    """Return the pairs that share no point and of which no point of one may meet any of the other:
-    a point and a triangle, and two edges."""
+    """Return the pairs of a point and a triangle and of two edges that are neighbours altogether.
+
+    All points of one part are neighbours of all points of the other part.
+    """
     import ipctk
 
     if not apart:
@@ -108,7 +122,8 @@ def _left_out(
     met = coo_array(
         (np.ones(2 * ends.shape[1]), np.hstack([ends, ends[::-1]])), shape=(points, points)
     ).tocsr()
-    corners = []  # (k, points): which of the points are corners of triangles, and of edges
+    # (k, points) incidence of points in triangles, and in edges
+    corners = []
     for part in (mesh.faces, mesh.edges):
         rows = np.repeat(np.arange(len(part)), part.shape[1])
         corners.append(

@@ -1,4 +1,4 @@
-"""Surfaces of obstacles that bodies meet as they meet each other: triangles that move and turn as the scene says."""
+"""Surfaces of barrier obstacles: triangles that move and turn as the scene says."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,23 +13,28 @@ from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
 
-EDGES = 4.0  # of the bodies' surface: the longest of an obstacle, whose larger triangles would push stiffly
-MOST = 10_000  # triangles of an obstacle, from which on it is not split
-ROUND = 4  # times that an icosahedron's triangles are split: half a thousandth of its radius off the ball
-# Cells, or ways where these are longer, beyond which nodes pass from an obstacle's way to their own
+# Longest edge of an obstacle, in edges of the bodies; larger triangles would push
+# stiffly
+EDGES = 4.0
+# Triangles of an obstacle beyond which it is not split
+MOST = 10_000
+# Subdivisions of an icosahedron; it is then 5e-4 of its radius off the ball
+ROUND = 4
+# Distance from an obstacle beyond which nodes change to their own way [cells, or longer
+# ways]
 BESIDE = 4.0
-# Cells: the least distance that inverse distances are of
+# Least distance of inverse distances [cells]
 TOUCHING = 1e-9
 
 
 @dataclass
 class ObstacleSurfaces:
-    """Surfaces of obstacles, on all ranks, one after the other.
+    """Surfaces of obstacles, on all ranks, in a single sequence of points.
 
     numbers   : (k,) of the obstacles in the scene
-    obstacles : these, and their paths
-    solids    : their surfaces at time 0
-    straight  : times [s] between which points go straight, whatever their paths; None: nowhere
+    obstacles : with their paths
+    solids    : surfaces of the obstacles at time 0
+    straight  : times [s] between which points move straight, whatever their paths; None: never
     """
 
     numbers: list[int]
@@ -39,11 +44,11 @@ class ObstacleSurfaces:
 
     @cached_property
     def total(self) -> int:
-        """The number of their points."""
+        """Number of all points."""
         return sum(len(solid.points) for solid in self.solids)
 
     def moves(self, begin: float, end: float) -> bool:
-        """Return whether any is not at one time [s] where it is at another."""
+        """Return whether any obstacle moves between two times [s]."""
         return any((o.path.value_at(begin) != o.path.value_at(end)).any() for o in self.obstacles)
 
     def points_at(self, time: float) -> Positions:
@@ -61,7 +66,10 @@ class ObstacleSurfaces:
         )
 
     def way(self, begin: float, end: float) -> Rows:
-        """Return how far the points go from one time [s] to another, (o, 3) [m]; (1, 3), nowhere, if none moves."""
+        """Return displacements (o, 3) [m] of the points between two times [s].
+
+        (1, 3) zeros if at rest.
+        """
         return (
             self.points_at(end) - self.points_at(begin)
             if self.moves(begin, end)
@@ -69,24 +77,25 @@ class ObstacleSurfaces:
         )
 
     def sums(self, forces: Rows) -> Rows:
-        """Return the sums (k, 3) [N] of forces (o, 3) [N] on the points of each."""
+        """Return the total force (k, 3) [N] on each obstacle, by forces (o, 3) [N] on points."""
         owner = np.repeat(np.arange(len(self.solids)), [len(solid.points) for solid in self.solids])
         return np.stack([np.bincount(owner, along, len(self.solids)) for along in forces.T], axis=1)
 
     def distances(self, x: Positions, time: float) -> Rows:
-        """Return lower bounds (n, k) [m] of the distances of x (n, 3) [m] from the obstacles at a time [s]."""
+        """Return lower bounds (n, k) [m] of the distances of x (n, 3) from the obstacles."""
         seen = [(o.solid, o.path.unmoved(x, o.path.value_at(time))) for o in self.obstacles]
         return np.maximum(np.stack([-solid.depths(at)[0] for solid, at in seen], axis=1), 0.0)
 
     def carried(
         self, q: Positions, moved: Rows, times: tuple[float, float], distances: Rows, cell: float
     ) -> Rows:
-        """Return how far nodes q (n, 3) [m] go between two times [s], (n, 3) [m]: with obstacles or by ``moved``.
+        """Return displacements (n, 3) [m] of nodes q (n, 3) between two times [s], with obstacles.
 
-        Nodes at an obstacle keep their place beside it. Between obstacles the ways are interpolated by inverse
-        distances, so that a plate and a floor squeeze a body evenly; farther off, nodes pass to their own way.
+        Nodes at an obstacle move with it. Between obstacles displacements are interpolated by
+        inverse distances, so that a plate and a floor squeeze a body evenly. Farther off, nodes
+        change to ``moved`` (n, 3) [m].
 
-        distances : of each node from each obstacle (n, k) [m]; nodes at 0 keep their place
+        distances : of each node from each obstacle (n, k) [m]
         """
         weights, near = np.zeros((len(q), 1)), np.zeros((len(q), 1))
         way = np.zeros_like(q)
@@ -103,7 +112,7 @@ class ObstacleSurfaces:
 
 
 def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> ObstacleSurfaces:
-    """Return the surfaces that bodies meet whose own has edges of this mean length [m]."""
+    """Return the surfaces of barrier obstacles, for bodies with edges of this mean length [m]."""
     numbers = [number for number, table in enumerate(scene.obstacle) if table.response == BARRIER]
     met = [obstacles[number] for number in numbers]
     whole = (_surface_of(scene.obstacle[number], obstacles[number]) for number in numbers)
@@ -111,7 +120,7 @@ def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> O
 
 
 def _surface_of(table: ObstacleTable, obstacle: Obstacle) -> Surface:
-    """Return a mesh as it is, and a box and a ball of few triangles."""
+    """Return the surface of a mesh as it is, of a box or of a ball with few triangles."""
     if isinstance(obstacle.solid, DistanceSolid):
         return obstacle.solid.surface(*np.zeros((2, 3)))
     if table.radius is not None:
@@ -122,7 +131,10 @@ def _surface_of(table: ObstacleTable, obstacle: Obstacle) -> Surface:
 
 
 def _split(surface: Surface, longest: float) -> Surface:
-    """Return a surface with no edge longer than this [m], or of MOST triangles: halved is the longest of each."""
+    """Return a surface with no edge longer than this [m], or of MOST triangles.
+
+    The longest edge of each triangle is halved.
+    """
     points = surface.points
     triangles = surface.triangles
     while len(triangles) < MOST:
@@ -137,7 +149,6 @@ def _split(surface: Surface, longest: float) -> Surface:
         points = np.concatenate([points, points[ends].mean(axis=0)])
         halves = np.transpose([[a, middle, c], [middle, b, c]], (0, 2, 1)).reshape(-1, 3)
         triangles = np.concatenate([triangles[~long], halves])
-    whole = trimesh.Trimesh(
-        points, triangles
-    )  # an edge halved twice, from either side, has one middle again
+    # Merge the middles of edges that were halved from both sides
+    whole = trimesh.Trimesh(points, triangles)
     return Surface(np.array(whole.vertices, float), np.array(whole.faces, np.int64))

@@ -1,7 +1,7 @@
-"""Points of the surfaces that meet: S = W q of the bodies', as the nodes carry them, and after these the obstacles'.
+"""Points of the surfaces that meet: first S = W q of the bodies, then of obstacles.
 
-Each rank has the columns of W that belong to its nodes, so that S is the sum of what the ranks send to rank 0, and a
-force f on the points is W^T f on each rank's nodes. Rank 0 has the whole of S, as it has the surface mesh.
+Each rank has the columns of W of its nodes. S is the sum of the ranks' contributions on rank 0,
+which has the surface mesh. A force f on the points is W^T f on each rank's nodes.
 """
 
 import numpy as np
@@ -15,12 +15,14 @@ from msmpetsc.lattice.lattice import Lattice
 
 
 class SurfacePoints:
-    """W by columns. All methods but ``carried`` are collective.
+    """Matrix W by columns. All methods but ``carried`` are collective.
 
-    bodies : number of points that nodes carry; ``total`` with the obstacles'
-    spread : greatest sum of the sizes of a point's weights: no point moves farther than that times the farthest node
-    rows   : (k,) the points that nodes of this rank carry, ascending; ``weights`` (k, owned) theirs
-    sums   : (total, s) on rank 0 sums what all send of these, in the order of the ranks
+    bodies  : number of points of bodies
+    total   : number of points, obstacles included
+    spread  : greatest sum of a point's absolute weights, a bound of its displacement over a node's
+    rows    : (k,) points that nodes of this rank carry, ascending
+    weights : (k, owned) of these points
+    sums    : (total, s) adds the contributions of all ranks, in their order, on rank 0
     """
 
     def __init__(
@@ -46,21 +48,25 @@ class SurfacePoints:
         self.sums = csr_array(sums, shape=(self.total if comm.rank == 0 else 0, len(sent)))
 
     def __call__(self, q: Positions, time: float) -> Positions:
-        """Return the points (total, 3) [m] of positions q (owned or more, 3) at a time [s] on rank 0; else none."""
+        """Return the points (total, 3) [m] at q (owned or more, 3) and a time [s], on rank 0."""
         points = self.moved(q)
         if self.obstacles.total and len(points):
             points[self.bodies :] = self.obstacles.points_at(time)
         return points
 
     def moved(self, v: Rows) -> Rows:
-        """Return W v (total, 3) of nodes' v (owned or more, 3), 0 for obstacles, on rank 0; (0, 3) on the others."""
+        """Return W v (total, 3) of v (owned or more, 3), 0 for obstacles, on rank 0.
+
+        else (0, 3).
+        """
         points: Rows = self.sums @ self.to_root.send(self.weights @ v[: self.weights.shape[1]])
         return points
 
     def distances(self, q: Positions, time: float) -> Rows:
-        """Return the least distances (owned, k) [m] from the obstacles of the points that each node carries.
+        """Return the least distance (owned, k) [m] from each obstacle of the points of each node.
 
-        A node that carries no point has its own. So a light node that swings far out belongs to its points.
+        A node without points has its own distance. A light node may swing far out of its surface,
+        so its points stand for it.
         """
         points = self(q, time)[: self.bodies]
         of_points = self.comm.bcast(self.obstacles.distances(points, time) if len(points) else None)
@@ -71,7 +77,7 @@ class SurfacePoints:
         return np.where(np.isinf(least), self.obstacles.distances(q[:owned], time), least)
 
     def carried(self, numbers: Indices) -> csr_array:
-        """Return the weights (k, owned) of this rank's nodes in points with these numbers (k,)."""
+        """Return the weights (k, owned) of this rank's nodes in points (k,)."""
         row = np.searchsorted(self.rows, numbers)
         at = np.flatnonzero(np.append(self.rows, -1)[row] == numbers)
         chosen = csr_array((np.ones(len(at)), (at, row[at])), shape=(len(numbers), len(self.rows)))

@@ -16,7 +16,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask
 from msmpetsc.backend.kernel import njit
 
 # entry of the middle cell
-ITSELF = 13
+MIDDLE = 13
 CELL_STRIDE = np.array([9, 3, 1])
 NODE_STRIDE = np.array([16, 4, 1])
 # entry for every cell outside the block

@@ -138,8 +138,8 @@ def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows
     cells = np.empty((4 * len(triangles) + 16, 3), np.int64)
     values = np.empty((len(cells), SUMS))
     used = 0
-    rooms = np.empty((4, 12, 3))
-    work, across, along, piece = rooms[0], rooms[1], rooms[2], rooms[3]
+    buffers = np.empty((4, 12, 3))
+    work, across, along, piece = buffers[0], buffers[1], buffers[2], buffers[3]
     for triangle in triangles:
         i0, i1 = _layers(triangle, 3, 0, low, high)
         for i in range(i0, i1):

@@ -1,9 +1,9 @@
 """Compare two results frame by frame, without MPI and without PETSc.
 
 Results on the same lattice are compared in all fields. The error of a field is its largest
-difference at a frame divided by the field's scale (results/README.md), a value over both runs and
-all compared frames. Differences below the rounding of the coarser stored type are 0. Two NaN are
-equal, and so are two infinities of the same sign.
+difference at a frame, divided by the field's scale. The scale (results/README.md) is taken over
+both runs and all compared frames. Differences below the rounding of the coarser stored type are 0.
+Two NaN are equal, and so are two infinities of the same sign.
 
 Results on different lattices of the same mesh are compared in their surfaces, point by point.
 Both have the same points, so nothing is projected or interpolated. The weight of a point is a third
@@ -284,7 +284,7 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
         raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
     worst = np.empty(len(pairs), int)
     greatest, rms = np.empty((2, len(pairs)))
-    moved = 0.0
+    displacement = 0.0
     for number, (of_run, of_reference) in enumerate(pairs):
         true = np.asarray(reference.frames.surface[of_reference], float)
         distance = np.linalg.norm(run.frames.surface[of_run] - true, axis=1)
@@ -292,13 +292,14 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
         rms[number] = np.sqrt(area @ distance**2 / area.sum())
         worst[number] = np.argmax(distance)
         greatest[number] = distance[worst[number]]
-        moved = max(moved, float(np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0)))
-    if moved <= LEAST_STRAIN * longest_side(rest, reference.body_of("surface")):
+        largest = np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0)
+        displacement = max(displacement, float(largest))
+    if displacement <= LEAST_STRAIN * longest_side(rest, reference.body_of("surface")):
         # a smaller displacement is rounding
-        moved = 0.0
-    scale = moved or 1.0
-    surface = FieldError("surface", "m", moved, greatest / scale, worst)
-    mean = FieldError(MEAN, "m", moved, rms / scale, worst)
+        displacement = 0.0
+    scale = displacement or 1.0
+    surface = FieldError("surface", "m", displacement, greatest / scale, worst)
+    mean = FieldError(MEAN, "m", displacement, rms / scale, worst)
     return Comparison(pairs, times[pairs[:, 0]], [surface, mean], [])
 
 

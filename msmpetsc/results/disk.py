@@ -17,8 +17,7 @@ from msmpetsc.errors import InputError, one_line
 # numbers of temporary files [-]; threads may write the same file, and USD remembers the
 # name of a failed file
 PARTS = count()
-# letters of a name kept in its temporary name [-]; file systems limit a name to 255
-# bytes
+# letters of a name kept in its temporary name [-]; file systems limit its length
 LONGEST_STEM = 50
 
 
@@ -131,7 +130,7 @@ class Lock:
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
                     return
-            # the last holder has removed the name meanwhile: another run may hold a new file
+            # the last holder has removed the name: another run may lock a new file
             os.close(self._file)
 
     def free(self) -> None:

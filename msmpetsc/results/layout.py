@@ -64,20 +64,20 @@ class Layout:
 
     frames  : number of planned frames, frame 0 included
     nodes   : number of nodes of all ranks
-    also    : number of rows of all ranks in the optional fields, by name: {"surface": 1000}
+    optional : number of rows of all ranks in the optional fields, by name: {"surface": 1000}
     rows    : shape of a node's values in each of the checkpoint's datasets, by name
     numbers : names of the checkpoint's numbers
     """
 
     frames: int
     nodes: int
-    also: dict[str, int]
+    optional: dict[str, int]
     rows: dict[str, tuple[int, ...]]
     numbers: tuple[str, ...]
 
     def plans(self) -> Iterator[Plan]:
         """Yield the datasets in the order in which they are created."""
-        counts = {"position": self.nodes, **self.also}
+        counts = {"position": self.nodes, **self.optional}
         for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: of_ranks(item[0])):
             if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
                 continue

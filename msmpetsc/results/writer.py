@@ -134,7 +134,7 @@ class ResultFile:
         if kind is None:
             self.close()
         else:
-            # Nothing collective is called, because other ranks may be elsewhere. After a
+            # Nothing collective is called, as other ranks may be elsewhere. After a
             # failed write the disk may be full, and then metadata must not change.
             with suppress(InputError), plain_errors(self.path):
                 self._finish(trim=not self._failed)
@@ -147,7 +147,7 @@ class ResultFile:
             unlink_inode(path, inode)
 
     def write(self, name: str, rows: Array) -> None:
-        """Store the rows of all ranks, (n_local, ...) each, in order as dataset `name` (collective).
+        """Store the rows of all ranks, (n_local, ...) each, in order in a dataset (collective).
 
         name : "lattice/nodes"; a file written in place has the dataset already
 
@@ -381,7 +381,7 @@ class ResultFile:
         name: str,
         index: int | None = None,
     ) -> None:
-        """Write the ranks' rows, `counts` each, to dataset `name` or its row `index` (collective)."""
+        """Write the ranks' rows, `counts` each, to a dataset or its row `index` (collective)."""
         rows = np.ascontiguousarray(rows, dtype)
         if self._descriptor is not None and index is not None:
             self._write_directly(self._descriptor, rows, counts, name, index)

@@ -67,13 +67,13 @@ class BodySurface:
 class Cages:
     """Valid cells of bodies, distributed over the ranks in Morton order.
 
-    table : keys of the cells (geometry.grid)
-    kind  : (n_local,) uint8, BOUNDARY or INTERIOR
-    share : (n_local, 2, 2, 2) fill of the cells' corners, from LEAST_SHARE to 1
-            (geometry.fill_fractions) [-]; None if all cells count as full
-    squares : (n_local, 3) second moments of the material in the cells about their middles
-            (geometry.fill_fractions) [cells^5]; None if all cells count as full
-    fills : for each body, whether its boundary cells are weighted by their fill
+    table   : keys of the cells (geometry.grid)
+    kind    : (n_local,) uint8, BOUNDARY or INTERIOR
+    share   : (n_local, 2, 2, 2) fill of the cells' corners, from LEAST_SHARE to 1 [-]
+              (geometry.fill_fractions); None if all cells count as full
+    squares : (n_local, 3) second moments of the material about the cells' middles [cells^5];
+              None if all cells count as full
+    fills   : for each body, whether its boundary cells are weighted by their fill
     """
 
     grids: BodyGrids
@@ -131,7 +131,8 @@ def fill(
 
     Raises InputError if there would be more than ``max_cells`` cells, or more than memory holds.
     """
-    comm, grids = bodies[0].comm, BodyGrids.covering([body.bounds for body in bodies], cell_size)
+    comm = bodies[0].comm
+    grids = BodyGrids.covering([body.bounds for body in bodies], cell_size)
     slabs = slabs_of_all(bodies, grids, max_cells, boundary)
     refuse_beyond_memory(comm, sum(cells.count(comm) for cells in slabs))
     parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, slabs, strict=True)]
@@ -182,8 +183,8 @@ def _cells_of(
 def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | None:
     """Return fills and second moments of boundary cells (collective).
 
-    Warn and return None if triangles are wound against each other. Raising a corner's fill to
-    LEAST_SHARE or lowering it to 1 changes mass at that corner, so the second moments change too.
+    Warn and return None if triangles are wound against each other. Clipping a corner's fill to
+    LEAST_SHARE or 1 changes the mass at that corner, so the second moments change too.
     """
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
@@ -224,17 +225,18 @@ def slabs_of_all(
 ) -> list[SlabCells]:
     """Return the valid cells of each body in this rank's slab (collective)."""
     slabs: list[SlabCells] = []
-    comm, before = bodies[0].comm, 0
+    comm = bodies[0].comm
+    total = 0
     for body, grid in zip(bodies, grids.grids, strict=True):
         # lower bounds of the body's cells by its volume and its area
         by_volume = abs(body.report.volume) / grid.cell_size**3 / 2
         by_area = body.report.area / grid.cell_size**2 / 8
-        least = before + max(by_volume, by_area)
-        _refuse_above(max_cells, least, grid)
-        refuse_beyond_memory(comm, least)
+        lower_bound = total + max(by_volume, by_area)
+        _refuse_above(max_cells, lower_bound, grid)
+        refuse_beyond_memory(comm, lower_bound)
         slabs.append(_slab_cells(body, grid, boundary))
-        before += slabs[-1].count(comm)
-        _refuse_above(max_cells, before, grid)
+        total += slabs[-1].count(comm)
+        _refuse_above(max_cells, total, grid)
     return slabs
 
 
@@ -276,9 +278,9 @@ def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
     needed = cells * CELL_BYTES / comm.size
     with together(comm):
         if needed > memory:
-            has = f"this machine has {memory / 1e9:.3g} GB"
             raise InputError(
-                f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, and {has}"
+                f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, "
+                f"and this machine has {memory / 1e9:.3g} GB"
             )
 
 
@@ -288,6 +290,7 @@ def _axes(body: BodySurface) -> Indices:
 
 
 def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
+    """Raise InputError if a grid gives more than ``max_cells`` cells."""
     if cells > max_cells:
         raise InputError(
             f"cages: a cell size of {grid.cell_size:.3g} m gives {cells:.3g} cells or more, "
@@ -332,7 +335,8 @@ def _gaps_by_winding(
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
     marked = packed(boundary)
-    first, last = slab.first * shape[1] * shape[2], slab.last * shape[1] * shape[2]
+    plane = shape[1] * shape[2]
+    first, last = slab.first * plane, slab.last * plane
     gaps = [np.empty((0, 4), np.int64)]
     for start in range(first, last, CHUNK):
         cells = np.stack(
@@ -360,7 +364,8 @@ def choose_cell_size(
     """
     if count > max_cells:
         raise InputError(f"cages.count: {count} is more than cages.max_cells = {max_cells}")
-    comm, bounds = bodies[0].comm, [body.bounds for body in bodies]
+    comm = bodies[0].comm
+    bounds = [body.bounds for body in bodies]
     refuse_beyond_memory(comm, count)
     # excess[log(size)] = log(cells / count)
     excess = {}

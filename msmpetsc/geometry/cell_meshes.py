@@ -38,7 +38,8 @@ class Kind(NamedTuple):
         """Return the triangles (c, t, 3) of a face of cells (c, k)."""
         ring = [int(corner) for corner in face]
         if cells.shape[1] in self.quadratic:
-            first, edges = 1 + int(max(map(max, self.faces))), [{*edge} for edge in self.edges]
+            first = 1 + int(max(map(max, self.faces)))
+            edges = [{*edge} for edge in self.edges]
             middles = [
                 first + edges.index({*pair}) for pair in zip(face, face[1:] + face[0], strict=True)
             ]

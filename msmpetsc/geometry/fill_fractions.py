@@ -191,7 +191,8 @@ def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> N
             sums[edge] += part
             sums[SEEN + edge] += part * (z - 0.5 * z * z)
             sums[SEEN + 4 + edge] += part * 0.5 * z * z
-        part, x, y, up = area * WEIGHTS[s], x - 0.5, y - 0.5, z - 0.5
+        part = area * WEIGHTS[s]
+        x, y, up = x - 0.5, y - 0.5, z - 0.5
         sums[4] += part * x * x
         sums[5] += part * y * y
         sums[SEEN + 8] += part * x * x * z

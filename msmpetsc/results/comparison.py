@@ -274,7 +274,8 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
     Raises InputError if a file has no surface, the meshes differ or no time is common.
     """
     refuse_different_meshes(run, reference)
-    rest, area = reference["surface/points"][:], point_areas(reference)
+    rest = reference["surface/points"][:]
+    area = point_areas(reference)
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
     if reference.scene.get("time", {}).get("integrator") == "static":
@@ -305,7 +306,8 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
 
 def point_areas(run: Result) -> Array:
     """Return the area (v,) [m^2] of each surface point at rest: a third of its triangles' area."""
-    points, triangles = run["surface/points"][:], run.indices("surface/triangles")
+    points = run["surface/points"][:]
+    triangles = run.indices("surface/triangles")
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     around = np.bincount(triangles.ravel(), np.repeat(areas / 3, 3), len(points))

@@ -228,7 +228,8 @@ class Result:
 
     def indices(self, name: str) -> Indices:
         """Return a dataset of node or point numbers. Raises InputError if one is out of range."""
-        rows, count = self[name][:].astype(np.int64), len(self[NUMBERED[name]])
+        rows = self[name][:].astype(np.int64)
+        count = len(self[NUMBERED[name]])
         plural = NUMBERED[name].partition("/")[2]
         if rows.size and not 0 <= rows.min() <= rows.max() < count:
             raise InputError(

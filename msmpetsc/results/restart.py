@@ -53,7 +53,8 @@ class Earlier:
                 name: value for name, value in result.attributes.items() if isinstance(value, str)
             }
             true_error = result.attributes.get("true_error")
-            count, planned = len(result.frames.time), result.frames.time.planned[0]
+            count = len(result.frames.time)
+            planned = result.frames.time.planned[0]
             newest = _newest(result)
         step = newest[1].step if newest is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0

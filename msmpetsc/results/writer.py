@@ -155,7 +155,8 @@ class ResultFile:
         """
         rows = np.asarray(rows)
         counts, dtypes = zip(*self._comm.allgather((len(rows), rows.dtype)), strict=True)
-        dtype, shape = np.result_type(*dtypes), (sum(counts), *rows.shape[1:])
+        dtype = np.result_type(*dtypes)
+        shape = (sum(counts), *rows.shape[1:])
         with self._together():
             if self._file is not None and self._begin is Begin.IN_PLACE:
                 stored = checked_dataset(self.path, self._file, name).shape
@@ -198,7 +199,8 @@ class ResultFile:
         with self._together():
             if self._file is not None:
                 self._lay_out(self._file, layout)
-        self.finished, self._planned = self._comm.bcast(self.finished), count
+        self.finished = self._comm.bcast(self.finished)
+        self._planned = count
         if self._begin is Begin.COPY and saved is not None:
             self.write_checkpoint(saved)
         with self._together():

@@ -91,7 +91,8 @@ def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str
     The velocity is the difference between the frames before and after, at an end to the frame
     itself.
     """
-    rows, at_rest = run.frames[points].shape[1], _data(run, FRAME_FIELDS[points].at_rest)
+    rows = run.frames[points].shape[1]
+    at_rest = _data(run, FRAME_FIELDS[points].at_rest)
     moved = _function("$0 - $1", f"{rows} 3", [_slab(run, points, index), at_rest])
     before, after = max(index - 1, 0), min(index + 1, len(times) - 1)
     passed = float(times[after] - times[before])
@@ -137,7 +138,8 @@ def _slab(run: Result, name: str, index: int, first: int = 0, columns: int = 3) 
 
     VTK uses the comment as the name of the slab, by which it caches.
     """
-    size, more = f"{run.frames[name].shape[1]}" + f" {columns}" * bool(columns), columns > 0
+    more = columns > 0
+    size = f"{run.frames[name].shape[1]}" + f" {columns}" * more
     select = f"{index} 0{f' {first}' * more} 1 1{' 1' * more} 1 {size}"
     return (
         f'<DataItem ItemType="HyperSlab" Dimensions="{size}" Type="HyperSlab">'

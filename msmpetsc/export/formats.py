@@ -23,8 +23,7 @@ from msmpetsc.results.reader import Result
 FLOAT, UNSIGNED = 5126, 5125
 # targets of a glTF buffer view: vertex attributes, indices
 POINTS, TRIANGLES = 34962, 34963
-# size of the binary chunk [byte]; the file's limit of 4 GiB, with room for the JSON
-# chunk
+# size of the binary chunk [byte]; a file of 4 GiB, with room for the JSON chunk
 MOST_BYTES = 2**32 - 2**20
 # rotation by a quarter turn about x, as a quaternion (x, y, z, w)
 Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]

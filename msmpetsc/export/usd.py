@@ -25,8 +25,7 @@ SAVED = 16
 
 def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
     """Write frames as USD. Raises OSError if the library cannot."""
-    # raises a plain error if the file cannot be written; the library's error has many
-    # lines
+    # raises a plain error if the file cannot be written; the library's has many lines
     path.touch()
     try:
         stage = Usd.Stage.CreateNew(str(path))

@@ -76,9 +76,9 @@ from msmpetsc.geometry.block import (
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 
-# distance outside its cell at which a point is accepted [cells]; above rounding
+# largest distance of a point outside its cell [cells]; above rounding
 ROUNDING = 1e-9
-# distance to a face of its cell below which a point is moved onto it [cells]; rounding
+# distance from a face of its cell at which a point is moved onto it [cells]; rounding
 ON_FACE = 1e-14
 # points in a batch [-]; bounds their weights to 16 MB
 CHUNK = 1 << 15
@@ -155,8 +155,7 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
     neighbours : (p,27) bool, whether the cell at offset (dx, dy, dz) is valid, in the column
                  (dx+1)*9 + (dy+1)*3 + (dz+1)
     smoothing  : h of Eq. 9, in (0,1]; used by "cages"
-    returns    : column ix*16 + iy*4 + iz is the node at offset (ix-1, iy-1, iz-1) from the cell's
-                 low corner
+    returns    : column ix*16 + iy*4 + iz is the node at (ix-1, iy-1, iz-1) from the low corner
 
     Each row sums to 1, reproduces linear fields, and is exactly 0 at nodes of no valid cell.
 
@@ -221,8 +220,7 @@ def turn_from_plane(c: float, length2: float, dot: float, d2: float) -> float:
     """Return sign(c) (beta |c| / |e_j x e_k| - the edge's angle at p's foot in the plane).
 
     c = (e_j x e_k)_n, dot = e_j . e_k in the plane, d2 = height^2. If a triangle does not contain
-    the foot, the angles at the foot sum to 0. So these differences, each of order d2, sum to 2 m_n
-    without cancellation.
+    the foot, the angles at the foot sum to 0. So these differences, of order d2, sum to 2 m_n stably.
     """
     size = abs(c)
     cross = sqrt(c * c + length2 * d2)
@@ -373,10 +371,7 @@ def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
 
 @njit()
 def boundary_blends(u: Floats, valid: Mask, blends: Floats) -> float:
-    """Set W(v, p) of Eq. 8 in blends (8,) and return their sum.
-
-    The blend is 0 at corners of no other valid cell.
-    """
+    """Set W(v, p) of Eq. 8 in blends (8,), 0 at corners of no other cell; return their sum."""
     for v in range(8):
         mask = cells_around(v, valid)
         alone = mask & (mask - 1) == 0

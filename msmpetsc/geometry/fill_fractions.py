@@ -58,8 +58,8 @@ class Columns:
     keys    : (c,) of the cells (grid.packed)
     corners : (c, 2, 2, 2) fills of their corners; material inside two parts counts twice
     squares : (c, 3) second moments about the middle of the cell [cells^5]: 1/12 in a full cell
-    below   : (c, 2, 2) winding number below the cell, a mean over the cell's base weighted by each
-              corner's bilinear function
+    below   : (c, 2, 2) winding number below the cell: its mean over the base, weighted by the
+              bilinear function of each corner
     """
 
     keys: Indices

@@ -1,7 +1,6 @@
 """Number the cells and nodes of uniform grids (paper section 4.1), a grid for each body.
 
-In Morton order, cells and nodes near in space have near numbers, so a contiguous range of keys is
-compact.
+In Morton order, cells and nodes near in space have near numbers: a range of keys is compact.
 """
 
 from collections.abc import Sequence

@@ -252,8 +252,7 @@ def orient(surface: Surface) -> Surface:
     """Wind triangles consistently and patches outwards, or inwards if a patch bounds a cavity.
 
     A patch is connected by edges of exactly two triangles. It bounds a cavity if it lies in an odd
-    number of other patches. For an open patch, outwards is away from its middle for most of its
-    area.
+    number of other patches. An open patch is turned so that most of its area faces outwards.
 
     Raises InputError if the surface has a single side.
     """
@@ -343,10 +342,7 @@ def cached(step: Step, surface: Surface, *values: object) -> Surface:
     )
     digest.update(surface.points.tobytes() + surface.triangles.tobytes())
     path = Path(pooch.os_cache("msmpetsc"), "prepared", f"{digest.hexdigest()}.npz")
-    with (
-        suppress(OSError, ValueError, KeyError, EOFError, BadZipFile),
-        np.load(path) as arrays,
-    ):
+    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile), np.load(path) as arrays:
         return Surface(arrays["points"], arrays["triangles"])
     result = step(surface, *values)
     # the disk may be full or the home read-only

@@ -24,8 +24,7 @@ from msmpetsc.geometry.cell_meshes import labels_of, read_cells
 from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.scene.reading import lies_below
 
-# points (v, 3), faces (f, 3 or 4) or a list of polygons, and the faces of each named
-# group
+# points (v, 3), faces (f, 3 or 4) or a list of polygons, and the faces of named groups
 Arrays = tuple[Array, Any, Mapping[str, Any]]
 
 # properties of a PLY's faces that are colours, not labels

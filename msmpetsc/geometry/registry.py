@@ -57,8 +57,7 @@ class MeshFile(NamedTuple):
 def locate(source: str, folder: str | Path) -> Path:
     """Return the mesh file of a registry name, or of a path relative to ``folder``.
 
-    A name is looked up in $MSMPETSC_MESH_DIR, then in the fetched files, then in installed
-    packages.
+    A name is looked up in $MSMPETSC_MESH_DIR, in the fetched files, then in installed packages.
 
     Raises InputError if the mesh is not on this machine, or differs from the registry's.
     """

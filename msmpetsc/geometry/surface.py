@@ -165,8 +165,7 @@ def is_inside(surface: Surface, points: Positions) -> Mask:
 def merged_triangles(surface: Surface) -> Indices:
     """Return the triangles (g, 3) over merged points.
 
-    Points of equal position get the lowest of their numbers. Triangles left with fewer than three
-    corners are dropped.
+    Points of equal position get the lowest of their numbers; degenerate triangles are dropped.
     """
     triangles = first_of_equal(surface.points)[surface.triangles]
     a, b, c = triangles.T

@@ -21,8 +21,7 @@ from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import Route
 from msmpetsc.geometry.grid import LIMIT, packed
 
-# rounding of an interpolated coordinate, relative to the largest coordinate [-]; an
-# upper bound
+# rounding of an interpolated coordinate, relative to the largest [-]; an upper bound
 ROUNDING = 1e-12
 # label of the outside
 EXTERIOR = 0
@@ -91,8 +90,7 @@ def _index_range(
     """Return the first and last cell index of a part of a triangle along an axis.
 
     ``margin`` widens the part, whose points may be interpolated, up to the triangle's own corners.
-    The corners are exact, so a triangle that ends in a grid plane does not mark the layer behind
-    it.
+    The corners are exact, so a triangle that ends in a grid plane does not mark the next layer.
     """
     smallest, largest = extent(part, n, axis)
     first, last = extent(triangle, 3, axis)
@@ -211,7 +209,7 @@ def _flood(cells: Indices, slab: Slab) -> tuple[Indices, Indices]:
 
 
 def _gaps(cells: Indices) -> Indices:
-    """Return the gaps (g, 4), (i, j, k first, k last), between sorted cells (c, 3) of a column."""
+    """Return the gaps (g, 4) between sorted cells (c, 3) of the same column."""
     low, high = cells[:-1], cells[1:]
     has_gap = (low[:, :2] == high[:, :2]).all(axis=1) & (high[:, 2] - low[:, 2] > 1)
     return np.column_stack([low[has_gap, :2], low[has_gap, 2] + 1, high[has_gap, 2] - 1])

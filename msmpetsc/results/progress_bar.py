@@ -47,8 +47,7 @@ class Progress:
         """Show that a frame is finished."""
         if not self._enabled:
             return
-        # created at the first frame, so that the rate of a resumed run counts from
-        # there
+        # created at the first frame, from which the rate of a resumed run counts
         if self._bar is None:
             bar = tqdm_logging_redirect(initial=frame.index, loggers=[log], **self._style)
             self._bar = self._shown.enter_context(bar)

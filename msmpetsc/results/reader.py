@@ -1,8 +1,7 @@
 """Read result files without MPI and without PETSc: ``msmpetsc.open``.
 
 A file's claims are checked when it is opened, before any array is read. A hostile or damaged file
-ends in an InputError of a single line. In an accepted file all arrays have the shapes and types of
-`msmpetsc.fields`.
+raises an InputError of a single line. In other files all arrays are as `msmpetsc.fields` says.
 """
 
 import math
@@ -301,8 +300,7 @@ def open_result(path: str | Path) -> h5py.File:
             raise InputError(f"{path} is not an HDF5 file")
         # no chunk cache: a run may be writing the file
         try:
-            # with the default locking, because HDF5 opens a file only with the same
-            # locking again
+            # the default locking: HDF5 opens a file twice only with the same locking
             file = h5py.File(path, "r", rdcc_nbytes=0)
         except OSError:
             # the file system has no locks, or another process holds a lock
@@ -319,8 +317,7 @@ def open_result(path: str | Path) -> h5py.File:
 def refuse_deadly(path: Path) -> None:
     """Raise InputError if the HDF5 library crashes or hangs on a file.
 
-    A child process reads the file first. Use it in commands only: a process with threads must not
-    fork.
+    A child process reads the file first. Only commands may call this: threads forbid a fork.
     """
     child = os.fork()
     if child == 0:
@@ -450,8 +447,7 @@ def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
 def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     """Return a dataset, checked for type, axes and size.
 
-    Raises InputError if it is missing, invalid, larger than the file can hold, or kept in another
-    file.
+    Raises InputError if it is missing, invalid, too large for the file, or kept in another file.
     """
     dataset = object_at(path, file, name)
     if not isinstance(dataset, h5py.Dataset):

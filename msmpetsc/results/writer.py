@@ -2,9 +2,8 @@
 
 All metadata is on disk before the first frame and does not change while frames are written
 (results.layout). The data of a frame is written before its time. ``/frames/time`` starts as NaN, so
-a frame is finished if its time is finite (`finished`). The checkpoint has two slots, and the older
-slot is overwritten, with step -1 meanwhile. So a whole checkpoint always remains: the slot of the
-greatest step.
+a frame is finished if its time is finite (`finished`). The checkpoint has two slots. The older slot
+is overwritten, with step -1 meanwhile, so a whole checkpoint remains: the slot of the last step.
 
 A resumed run writes into the existing file if everything it needs is laid out there; so the
 metadata does not change either. Otherwise the run writes a new file, copies the frames to it, and

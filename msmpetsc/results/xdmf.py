@@ -13,8 +13,7 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
-# share of a run's time for updates of the XDMF file before the end [-]; hardly slows a
-# run
+# share of a run's time for updates of the XDMF file [-]; hardly slows the run
 SHARE = 0.05
 # Length of the difference of two vectors, given as pairs of components x, y, z. VTK's
 # functions know no other name of the root, and no exponents in numbers.
@@ -40,9 +39,8 @@ class GrowingXdmf:
 def write_xdmf(h5_path: str | Path) -> Path:
     """Write x.xdmf beside x.h5 for its finished frames, and return its path. Raises InputError.
 
-    The file has two temporal collections: the surface triangles and the lattice cells, with their
-    stress. Both have displacement, velocity and speed. Without a stored surface or stress the file
-    has none.
+    The file has two temporal collections: the surface triangles, if the surface was stored, and the
+    lattice cells, with any stored stress. Both have displacement, velocity and speed.
     """
     h5_path = Path(h5_path)
     with Result(h5_path) as run:
@@ -88,8 +86,7 @@ def _collection(run: Result, name: str, kind: str, elements: str, points: str) -
 def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str]:
     """Yield the attributes of a frame that readers compute as differences of positions.
 
-    The velocity is the difference between the frames before and after, at an end to the frame
-    itself.
+    The velocity is a central difference between frames, or one-sided at either end.
     """
     rows = run.frames[points].shape[1]
     at_rest = _data(run, FRAME_FIELDS[points].at_rest)

@@ -220,7 +220,7 @@ def turn_from_plane(c: float, length2: float, dot: float, d2: float) -> float:
     """Return sign(c) (beta |c| / |e_j x e_k| - the edge's angle at p's foot in the plane).
 
     c = (e_j x e_k)_n, dot = e_j . e_k in the plane, d2 = height^2. If a triangle does not contain
-    the foot, the angles at the foot sum to 0. So these differences, of order d2, sum to 2 m_n stably.
+    the foot, the angles at the foot sum to 0: these differences, of order d2, sum to 2 m_n stably.
     """
     size = abs(c)
     cross = sqrt(c * c + length2 * d2)

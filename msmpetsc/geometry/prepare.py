@@ -213,9 +213,9 @@ def _share_farther_than(surface: Surface, reference: Surface, distance: float) -
 
 @about_middle
 def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
-    """Reduce the surface to about ``faces`` triangles (quadric decimation); it stays closed.
+    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed.
 
-    aggressiveness : aggressiveness of fast_simplification: less is slower and closer to the surface
+    aggressiveness : of fast_simplification; less is slower and stays closer to the surface
     """
     surface = merge(surface)
     if faces >= len(surface.triangles):

@@ -162,7 +162,7 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 
 def _labelled(faces: Array, data: Any) -> dict[str, Array]:
-    """Return the faces (f, k) of each label in a PLY: an integer of each face that is no colour."""
+    """Return the faces (f, k) of each label in a PLY; integers that are no colours are labels."""
     names = data if isinstance(data, dict) else data.dtype.names
     # in an ASCII file such a column is (f, 1)
     columns = {name: np.ravel(data[name]) for name in names if name not in COLOURS}
@@ -209,7 +209,7 @@ def _read_obj(path: Path, data: bytes) -> Arrays:
 
 
 class _FolderResolver(FilePathResolver):
-    """Read the files that a glTF names, in its folder or below it alone, links followed."""
+    """Read the files that a glTF names, but only in its folder or below, links followed."""
 
     def get(self, name: str) -> bytes:
         """Return the content of a named file. Raises ValueError if it may not be read."""

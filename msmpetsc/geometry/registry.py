@@ -5,7 +5,7 @@ installed package, is taken as it is. A fetched original goes through the model'
 All files are checked by SHA-256, and all give single precision.
 
 The points have the same numbers too, except in lung, whose copy was reordered. The fetched dragon
-has as many triangles as its copy, but not the same: another decimator made the copy.
+has the same shape and number of triangles as its copy, but another decimator made the copy.
 """
 
 import os
@@ -31,7 +31,7 @@ MESH_DIR = "MSMPETSC_MESH_DIR"
 class NamedMesh:
     """A mesh that has a name.
 
-    copy, copy_sha256 : file name of the converted copy in $MSMPETSC_MESH_DIR
+    copy, copy_sha256 : file name and SHA-256 of the converted copy in $MSMPETSC_MESH_DIR
     downloads         : SHA-256 of the original's files by address; the first holds the mesh
     packaged          : path of the copy inside a Python package, the package's name first
     steps             : prepare steps that turn the original into the copy

@@ -9,8 +9,8 @@ from msmpetsc.backend.arrays import Array, Indices, Mask, Positions, Rows
 from msmpetsc.comm import starts
 from msmpetsc.errors import InputError
 
-# thickness of a flat body relative to its longest side [-]; ten times the rounding of
-# coordinates in single precision
+# thickness below which a body is flat, relative to its longest side [-]; ten times the
+# rounding of coordinates in single precision
 FLAT = 1e-6
 
 
@@ -77,7 +77,7 @@ class SurfaceReport:
     Edges are counted after merging points of equal position, so the loose triangles of an STL may
     be closed. Triangles that this leaves with two equal corners are dropped.
 
-    volume : [m^3], signed: negative if wound inwards; not meaningful if the surface is open
+    volume : [m^3], negative if wound inwards; not meaningful if the surface is open
     area   : [m^2]
     nonmanifold_edges  : edges of more than two triangles
     inconsistent_edges : edges along which two triangles run in the same direction

@@ -2,7 +2,7 @@
 
 All metadata is written before the first frame and then does not change, so a killed run leaves a
 readable file. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the
-start. Its chunks are allocated, and nothing is buffered.
+start, its chunks are allocated, and nothing is buffered.
 
 Rank 0, which has the file open, transfers the rows of other ranks in pieces. Alternatively each
 rank writes its own rows straight to their bytes: uncompressed chunks stay at the offsets that HDF5
@@ -62,11 +62,11 @@ class Plan(NamedTuple):
 class Layout:
     """The sizes of all datasets that are written frame by frame.
 
-    frames  : number of planned frames, frame 0 included
-    nodes   : number of nodes of all ranks
+    frames   : number of planned frames, frame 0 included
+    nodes    : number of nodes of all ranks
     optional : number of rows of all ranks in the optional fields, by name: {"surface": 1000}
-    rows    : shape of a node's values in each of the checkpoint's datasets, by name
-    numbers : names of the checkpoint's numbers
+    rows     : shape of a node's values in each of the checkpoint's datasets, by name
+    numbers  : names of the checkpoint's numbers
     """
 
     frames: int

@@ -148,7 +148,7 @@ class ResultFile:
     def write(self, name: str, rows: Array) -> None:
         """Store the rows of all ranks, (n_local, ...) each, in order in a dataset (collective).
 
-        name : "lattice/nodes"; a file written in place has the dataset already
+        name : of the dataset, "lattice/nodes"; a file written in place has it already
 
         Raises InputError if the existing dataset has another shape.
         """

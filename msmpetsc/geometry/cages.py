@@ -38,7 +38,7 @@ BOUNDARY, INTERIOR = 1, 2
 # least fill of a corner [-]; keeps a corner far from the inside from having no mass
 LEAST_SHARE = 1e-3
 # fill above which a corner counts as full [-]; the difference from 1 is rounding
-WHOLE = 1 - 1e-9
+FULL = 1 - 1e-9
 # lattice memory a cell [byte]; a lower bound, as a whole run takes four times as much
 CELL_BYTES = 1000
 # relative error of a cell count or a volume [-]; far below the lattice's own error
@@ -202,7 +202,7 @@ def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | No
         share, squares = sampled_inside(
             body.comm.bcast(body.surface), grid, cells.boundary[:, axes]
         )
-    clipped = np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
+    clipped = np.clip(np.where(share > FULL, 1.0, share), LEAST_SHARE, 1.0)
     return clipped, squares + (clipped - share).mean(axis=(1, 2, 3))[:, None] / 4
 
 

@@ -18,7 +18,7 @@ Groups = dict[str, Indices]
 # labels of an array [-]; an array with more labels numbers cells and names no groups
 MOST_LABELS = 1000
 # lines asked for past the end of a text [-]; readers of intact files ask for few
-PATIENCE = 100
+MOST_LINES_PAST_END = 100
 
 
 class Kind(NamedTuple):
@@ -117,7 +117,7 @@ class _Lines(StringIO):
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
         line = super().readline(size)
         self.lines_past_end += not line
-        if self.lines_past_end > PATIENCE:
+        if self.lines_past_end > MOST_LINES_PAST_END:
             raise EOFError("it ends too early")
         return line
 

@@ -45,16 +45,16 @@ def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
 
 
 def inside_bodies(
-    region: Region, points: Positions, bounds: Rows, body: Indices, meant: int | None
+    region: Region, points: Positions, bounds: Rows, body: Indices, target: int | None
 ) -> Mask:
     """Return whether points (n, 3) [m] of several bodies lie in a region, (n,) bool.
 
     bounds : (b, 2, 3) each body's bounding box at rest [m]
     body   : (n,) the body of each point
-    meant  : the body that the region applies to; None for all bodies
+    target : the body that the region applies to; None for all bodies
     """
     is_inside = np.zeros(len(points), bool)
-    for number in range(len(bounds)) if meant is None else (meant,):
+    for number in range(len(bounds)) if target is None else (target,):
         own = body == number
         is_inside[own] = inside(region, points[own], bounds[number])
     return is_inside

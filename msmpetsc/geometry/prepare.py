@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 # overlapping parts or double-walled tubes
 LEAST_AREA_KEPT = 0.5
 # share of the area that a repair may change without a warning [-]; too little to see
-RETOUCHED = 0.01
+MOST_CHANGED = 0.01
 # distance within which a surface is unchanged, in mean thicknesses 2 V / A [-]
-NEAR = 0.01
+UNCHANGED_DISTANCE = 0.01
 # largest coordinate that is repaired [file's unit]; MeshFix crashes on larger values
-FARTHEST = 1e12
+LARGEST_COORDINATE = 1e12
 # least number of triangles for caching a step [-]; steps on smaller meshes are fast
-LARGE = 20_000
+LEAST_CACHED = 20_000
 # files in the cache [-]; some megabytes each
 MOST_FILES = 32
 Step = Callable[..., Surface]
@@ -167,8 +167,8 @@ def repair(surface: Surface) -> Surface:
     import pymeshfix
 
     surface = merge(surface)
-    if np.abs(surface.points).max() > FARTHEST:
-        raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
+    if np.abs(surface.points).max() > LARGEST_COORDINATE:
+        raise InputError(f"coordinates beyond {LARGEST_COORDINATE:g} cannot be repaired")
     fix = pymeshfix.MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
@@ -187,12 +187,12 @@ def repair(surface: Surface) -> Surface:
 
 
 def _warn_of_change(before: Surface, after: Surface) -> None:
-    """Warn if a repair has removed, or has added, more than RETOUCHED of the surface's area."""
+    """Warn if a repair has removed, or has added, more than MOST_CHANGED of the surface's area."""
     report = examine(after)
-    near = NEAR * 2 * abs(report.volume) / report.area
+    near = UNCHANGED_DISTANCE * 2 * abs(report.volume) / report.area
     removed = _share_farther_than(before, after, near)
     added = _share_farther_than(after, before, near)
-    if max(removed, added) > RETOUCHED:
+    if max(removed, added) > MOST_CHANGED:
         log.warning(
             "prepare: 'repair' took %.0f%% of the surface's area away, and %.0f%% of the area is "
             "new: msmpetsc render draws the scene",
@@ -334,7 +334,7 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
 def cached(step: Step, surface: Surface, *values: object) -> Surface:
     """Return the result of a step; cache it on disk if the mesh is large."""
     # rotate moves groups, which the cache does not store
-    if len(surface.triangles) < LARGE or step is rotate:
+    if len(surface.triangles) < LEAST_CACHED or step is rotate:
         return step(surface, *values)
     versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
     digest = hashlib.sha256(

@@ -30,9 +30,10 @@ Arrays = tuple[Array, Any, Mapping[str, Any]]
 # properties of a PLY's faces that are colours, not labels
 COLOURS = ("red", "green", "blue", "alpha")
 
-# memory for reading a file: at least LEAST [byte], or MOST times the file's size [-];
-# an intact file needs less
-LEAST, MOST = 2**28, 50
+# memory that reading any file may take [byte]; the libraries' own memory is less
+LEAST_MEMORY = 2**28
+# memory that reading a file may take, in sizes of the file [-]; intact files need less
+MEMORY_FACTOR = 50
 
 
 def read_surface(path: str | Path) -> Surface:
@@ -47,7 +48,7 @@ def read_surface(path: str | Path) -> Surface:
     kind = _kind(path)
     data = _content(path)
     try:
-        with _silence(), _bounded_memory(max(LEAST, MOST * len(data))):
+        with _silence(), _bounded_memory(max(LEAST_MEMORY, MEMORY_FACTOR * len(data))):
             points, polygons, named = _READERS[kind](path, data)
             faces = _cut(polygons)
             groups = {name: _cut(own) for name, own in named.items()}

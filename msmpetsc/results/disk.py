@@ -16,7 +16,7 @@ from msmpetsc.errors import InputError, one_line
 
 # numbers of temporary files [-]; threads may write the same file, and USD remembers the
 # name of a failed file
-PARTS = count()
+PART_NUMBERS = count()
 # letters of a name kept in its temporary name [-]; file systems limit its length
 LONGEST_STEM = 50
 
@@ -33,7 +33,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     real = Path(os.path.realpath(path))
     part = real.with_name(
-        f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PARTS)}.part{real.suffix}"
+        f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PART_NUMBERS)}.part{real.suffix}"
     )
     try:
         with plain_errors(path):
@@ -97,7 +97,7 @@ class Storage(io.FileIO):
             return size or 0
 
     @contextmanager
-    def telling(self) -> Iterator[None]:
+    def reporting_errors(self) -> Iterator[None]:
         """Raise the first write error after the block, in place of HDF5's own error."""
         try:
             yield

@@ -44,7 +44,7 @@ def open_to_write(storage: Storage, mode: str) -> h5py.File:
     return h5py.File(storage, mode, libver="earliest", rdcc_nbytes=0, locking=False)
 
 
-def of_ranks(name: str) -> bool:
+def is_distributed(name: str) -> bool:
     """Return whether a field of frames is distributed over the ranks."""
     return bool(RANKS_SHARE.intersection(FRAME_FIELDS[name].shape))
 
@@ -78,13 +78,13 @@ class Layout:
     def plans(self) -> Iterator[Plan]:
         """Yield the datasets in the order in which they are created."""
         counts = {"position": self.nodes, **self.optional}
-        for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: of_ranks(item[0])):
+        for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: is_distributed(item[0])):
             if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
                 continue
             shape = tuple(
                 size if isinstance(size, int) else counts[name] for size in about.shape[1:]
             )
-            if of_ranks(name):
+            if is_distributed(name):
                 yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
             else:
                 yield Plan(

@@ -38,7 +38,7 @@ NUMBERED = {
     "obstacle/triangles": "obstacle/points",
 }
 # time limit for reading a file's metadata [s]; an intact file takes far less
-PATIENCE = 10
+TIME_LIMIT = 10
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 # largest compression ratio of zlib [-]
 DEFLATE_MOST = 1032
@@ -325,7 +325,7 @@ def refuse_deadly(path: Path) -> None:
             for number in (*CRASHES, signal.SIGALRM):
                 signal.signal(number, signal.SIG_DFL)
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            signal.alarm(PATIENCE)
+            signal.alarm(TIME_LIMIT)
             _read_tables(path)
         except BaseException:
             pass

@@ -55,13 +55,13 @@ class Earlier:
             true_error = result.attributes.get("true_error")
             count = len(result.frames.time)
             planned = result.frames.time.planned[0]
-            newest = _newest(result)
+            newest = _newest_checkpoint(result)
         step = newest[1].step if newest is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
         return cls(path, texts, true_error, step, count, planned)
 
 
-def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
+def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
     """Return slot, step with its numbers, and row names of the newest checkpoint, or None.
 
     Raises InputError if the checkpoint is incomplete.
@@ -101,7 +101,7 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
     """
     with opened_on_root(comm, path) as run:
         newest: tuple[int, Checkpoint, list[str]] | None = comm.bcast(
-            on_root(comm, lambda: _newest(run))
+            on_root(comm, lambda: _newest_checkpoint(run))
         )
         if newest is None:
             return None

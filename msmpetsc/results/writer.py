@@ -40,7 +40,7 @@ from msmpetsc.results.layout import (
     Layout,
     chunk_offsets,
     gather_rows,
-    of_ranks,
+    is_distributed,
     open_on_all_ranks,
     open_to_write,
     write_bytes,
@@ -55,7 +55,7 @@ from msmpetsc.results.reader import (
 )
 
 # surfaces of ranks other than rank 0
-NOTHING = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
+EMPTY_SURFACE = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
 
 
 class Begin(Enum):
@@ -186,7 +186,7 @@ class ResultFile:
         """
         rows_of_ranks = self._comm.allgather({"position": nodes, **(optional or {})})
         counts = {name: [rank[name] for rank in rows_of_ranks] for name in rows_of_ranks[0]}
-        self._rows = {name: counts[name] for name in counts if of_ranks(name)}
+        self._rows = {name: counts[name] for name in counts if is_distributed(name)}
         sizes = {
             name: sum(rows) if name in self._rows else rows[0] for name, rows in counts.items()
         }
@@ -211,7 +211,7 @@ class ResultFile:
                 self._numbers = {
                     name: dataset
                     for name, dataset in self._file["frames"].items()
-                    if name in FRAME_FIELDS and name != "time" and not of_ranks(name)
+                    if name in FRAME_FIELDS and name != "time" and not is_distributed(name)
                 }
         if self._comm.size > 1 and not self._gathers:
             self._descriptor = open_on_all_ranks(self._comm, self.path)
@@ -367,8 +367,8 @@ class ResultFile:
     def _together(self) -> Iterator[None]:
         """Raise an error of any rank on all ranks after the block (collective)."""
         try:
-            telling = self._storage.telling() if self._storage else nullcontext()
-            with together(self._comm), plain_errors(self.path), telling:
+            reporting = self._storage.reporting_errors() if self._storage else nullcontext()
+            with together(self._comm), plain_errors(self.path), reporting:
                 yield
         except InputError:
             self._failed = True
@@ -429,12 +429,12 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
         file.write("lattice/body", lattice.body[:owned].astype("i4"))
     # rank 0 has all solids
     if comm.bcast(bool(model.solids)):
-        solids = joined([*model.solids.values()]) or NOTHING
+        solids = joined([*model.solids.values()]) or EMPTY_SURFACE
         counts = [len(solid.triangles) for solid in model.solids.values()]
         file.write("obstacle/points", solids.points)
         file.write("obstacle/triangles", solids.triangles)
         file.write("obstacle/number", np.repeat(np.array([*model.solids], "i4"), counts))
-    surface, embedding = model.surface or NOTHING, model.embedding
+    surface, embedding = model.surface or EMPTY_SURFACE, model.embedding
     if embedding is None:
         return
     if several:

@@ -125,8 +125,9 @@ class BodyGrids:
 
     def nearest_nodes(self, points: Positions, body: Indices) -> Indices:
         """Return the grid indices (..., 3) of the bodies' nodes nearest to points (..., 3) [m]."""
-        nodes = np.rint((points - self._origins[body]) / self.cell_size).astype(np.int64)
-        return nodes + self.first(body)
+        cells = np.rint((points - self._origins[body]) / self.cell_size)
+        nodes: Indices = cells.astype(np.int64) + self.first(body)
+        return nodes
 
 
 @njit()

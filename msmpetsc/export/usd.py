@@ -96,10 +96,7 @@ def up_axis(scene: dict[str, Any]) -> str:
 
 
 def frames_a_second(times: Floats) -> float:
-    """Return the frames per second of times (t,) [s], by their median spacing.
-
-    Equally spaced frames are then a time code apart.
-    """
+    """Return frames per second at times (t,) [s]; equally spaced frames are a time code apart."""
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return float(f"{1 / spacing:.9g}")
 

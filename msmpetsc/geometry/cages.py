@@ -258,10 +258,7 @@ def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
 
 
 def _columns(body: BodySurface, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
-    """Return the fill of the cells that triangles cut (collective).
-
-    Return None if triangles are wound against each other.
-    """
+    """Return the fill of cut cells; None if triangles are wound against each other (collective)."""
     outwards = corners if body.report.volume > 0 else corners[:, ::-1]
     columns = Columns.crossed(outwards, *_limits(shape, slab))
     return columns if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK else None

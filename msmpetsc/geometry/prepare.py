@@ -140,10 +140,7 @@ def union(surface: Surface) -> Surface:
 
 
 def solid_of(surface: Surface) -> "manifold3d.Manifold | None":
-    """Return the inside of a surface as a solid of manifold3d (extra "mesh").
-
-    Return None if the surface is not closed, or not wound consistently.
-    """
+    """Return a surface as a solid of manifold3d; None if it is open or wound inconsistently."""
     import manifold3d
 
     triangles = np.ascontiguousarray(surface.triangles, np.uint64)
@@ -308,10 +305,7 @@ STEPS: dict[str, Step] = {
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """Run a step and keep the surface's groups.
-
-    Raises InputError with the name of the step if it fails.
-    """
+    """Run a step and keep the groups. Raises InputError with the name of the step if it fails."""
     try:
         result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:

@@ -92,10 +92,7 @@ def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
 
 
 def _kind(path: Path) -> str:
-    """Return the format of a file by the ending of its name.
-
-    Raises InputError if the path is no file, or its format is not read.
-    """
+    """Return the format by a file's ending. Raises InputError if it is not read, or no file."""
     kind = path.suffix.lower().removeprefix(".")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is a folder, a pipe or a device, not a mesh file")

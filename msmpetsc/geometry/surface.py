@@ -146,10 +146,7 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
 
 
 def is_inside(surface: Surface, points: Positions) -> Mask:
-    """Return whether points (n, 3) are inside: their winding number exceeds 1/2 in absolute value.
-
-    Source: Jacobson et al. 2013.
-    """
+    """Return which points (n, 3) have |winding number| > 1/2 (Jacobson et al. 2013)."""
     # imported here because only open surfaces and scenes with obstacles need it
     import igl
 

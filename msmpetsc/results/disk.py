@@ -107,10 +107,7 @@ class Storage(io.FileIO):
 
 
 class Lock:
-    """A lock on a file beside ``path`` while it is written.
-
-    The system releases the lock if a run is killed.
-    """
+    """A lock beside ``path`` while it is written; the system releases it if the run is killed."""
 
     def __init__(self, path: Path):
         """Take the lock. Raises InputError if another run holds it."""

@@ -254,10 +254,7 @@ def scatter_rows(
 
 
 def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
-    """Return a descriptor of the file on each rank (collective).
-
-    Return None if the ranks see different files.
-    """
+    """Return a descriptor of the file, or None if the ranks see different files (collective)."""
     descriptor = identity = None
     try:
         descriptor = os.open(path, os.O_WRONLY)

@@ -1,8 +1,8 @@
-"""The formats of exported results in one table, and the export itself.
+"""Export results: a table of the formats, and the writers of glTF and meshio's formats.
 
-glTF is written by a small writer of our own: libraries that read glTF write neither morph targets nor their animation.
-The surface moves by morph targets, one a frame, as Blender and browsers play it. The file is a JSON chunk and one
-binary chunk (the glTF 2.0 specification, 4.4); it has y up, so the node is turned.
+glTF is written here, because libraries for glTF write no animated morph targets. Each frame is a
+morph target of the surface, which Blender and browsers play. The file has a JSON chunk and a binary
+chunk (glTF 2.0 specification, 4.4). In glTF y is up, so the node is rotated.
 """
 
 import json
@@ -19,10 +19,14 @@ from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result
 
-FLOAT, UNSIGNED = 5126, 5125  # component types
-POINTS, TRIANGLES = 34962, 34963  # uses of a buffer view: vertex data, indices
-MOST_BYTES = 2**32 - 2**20  # less what is no vertex
-Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # a quarter turn about x
+# component types of glTF
+FLOAT, UNSIGNED = 5126, 5125
+# targets of a glTF buffer view: vertex attributes, indices
+POINTS, TRIANGLES = 34962, 34963
+# size of the binary chunk [byte]; a file of 4 GiB, with room for the JSON chunk
+MOST_BYTES = 2**32 - 2**20
+# rotation by a quarter turn about x, as a quaternion (x, y, z, w)
+Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 CLAY = {
     "pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0},
     "doubleSided": True,
@@ -37,25 +41,22 @@ def normals(points: Array, triangles: Indices) -> Array:
         np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T
     ]
     vectors = np.stack(sums, axis=1)
-    vectors[~vectors.any(axis=1)] = (
-        0,
-        0,
-        1,
-    )  # a point of no triangle, or of folded ones: any direction is as good
+    # no triangle, or folded triangles: any direction will do
+    vectors[~vectors.any(axis=1)] = (0, 0, 1)
     return np.divide(vectors, np.linalg.norm(vectors, axis=1, keepdims=True), dtype=np.float32)
 
 
 def middle_of(points: Positions) -> Floats:
-    """Return the middle (3,) [m] of the box around points (n, 3)."""
+    """Return the middle (3,) [m] of the bounding box of points (n, 3)."""
     middle: Floats = (points.min(axis=0) + points.max(axis=0)) / 2
     return middle
 
 
 class Chunk:
-    """The binary chunk of a glTF file, to which numbers of four bytes are added.
+    """The binary chunk of a glTF file, made of arrays of four-byte numbers.
 
-    accessors, views : as the JSON chunk lists them
-    parts, size      : its bytes so far, and how many
+    accessors, views : entries of the JSON chunk
+    parts, size      : contents so far, and their length [byte]
     """
 
     def __init__(self) -> None:
@@ -65,9 +66,10 @@ class Chunk:
         self.size = 0
 
     def add(self, rows: Array, use: int | None = None, bounds: bool = False) -> int:
-        """Add numbers (n,) or vectors (n, 3), float32 or uint32; return the accessor's number.
+        """Add numbers (n,) or vectors (n, 3), float32 or uint32; return the accessor's index.
 
-        bounds : whether to say the least and greatest values, as points, targets and times must
+        use    : target of the buffer view, POINTS or TRIANGLES
+        bounds : whether to add the minimum and maximum, as points, morph targets and times require
         """
         component = UNSIGNED if use == TRIANGLES else FLOAT
         accessor: dict[str, Any] = {
@@ -95,11 +97,11 @@ class Chunk:
 
 
 def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
-    """Write frames as glTF. Raises InputError for more bytes than the format allows."""
+    """Write frames as glTF. Raises InputError if the file would exceed the format's limit."""
     first, *others = frames
     triangles = run.indices("surface/triangles")
     start = run.surface_at(first)
-    # single precision is exact about the body's middle, where the node puts the points
+    # relative to the body's middle single precision suffices; the node adds the middle
     middle = middle_of(start)
     base = (start - middle).astype(np.float32)
     upright = normals(base, triangles)
@@ -112,7 +114,8 @@ def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
         targets.append(chunk.add_shape(points - base, normals(points, triangles) - upright))
         if chunk.size > MOST_BYTES:
             raise InputError(
-                f"{path} would be longer than 4 GiB, where glTF ends: choose fewer frames (--frames)"
+                f"{path} would be longer than 4 GiB, the limit of glTF: "
+                "choose fewer frames (--frames)"
             )
     document = _document(shape, indices, targets, run.path.stem, middle)
     if others:
@@ -136,7 +139,7 @@ def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
 def _document(
     shape: dict[str, int], indices: int, targets: list[dict[str, int]], name: str, middle: Floats
 ) -> dict[str, Any]:
-    """Return the scene of glTF's JSON chunk: one node at ``middle`` (3,) [m], z up, with one mesh."""
+    """Return the scene of the JSON chunk: a node at ``middle`` (3,) [m], z up, with a mesh."""
     x, y, z = middle.tolist()
     primitive: dict[str, Any] = {"attributes": shape, "indices": indices, "material": 0}
     mesh: dict[str, Any] = {"primitives": [primitive], "name": name}
@@ -154,7 +157,7 @@ def _document(
 
 
 def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
-    """Return the animation that blends linearly between morph targets at the frames' times (t,) [s]."""
+    """Return the animation that blends linearly between the targets at the times (t,) [s]."""
     since = (times - times[0]).astype(np.float32)
     weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
     sampler = {
@@ -167,7 +170,7 @@ def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
 
 
 def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
-    """Write frames as USD, by a library that only this format needs."""
+    """Write frames as USD by a library that only this format needs."""
     from msmpetsc.export import usd
 
     usd.write_usd(run, frames, path)
@@ -183,7 +186,8 @@ def write_one_frame(run: Result, frames: Sequence[int], path: Path) -> None:
     )
 
 
-FORMATS: dict[str, Callable[[Result, Sequence[int], Path], None]] = {  # of the surface at frames
+# writers of the surface at frames, by the ending of the file
+FORMATS: dict[str, Callable[[Result, Sequence[int], Path], None]] = {
     ".glb": write_glb,
     ".usd": write_usd,
     ".usda": write_usd,
@@ -195,17 +199,18 @@ FORMATS: dict[str, Callable[[Result, Sequence[int], Path], None]] = {  # of the 
 
 
 def export(result: str | Path, path: str | Path, frames: Frames | None = None) -> Path:
-    """Write the surface at frames of a result in the format that the path ends in; return it.
+    """Write the surface at frames of a result, in the format of the path's ending; return the path.
 
-    frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
+    frames : frame numbers, -1 for the last, or slices; by default all frames, or the last frame if
+             the format holds a single frame
 
-    Raises InputError.
+    Raises InputError if the format, the frames or the file is invalid.
     """
     path = Path(path)
     write = FORMATS.get(path.suffix.lower())
     if write is None:
         raise InputError(
-            f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}"
+            f"{path}: unknown format: name the file {', '.join(f'*{ending}' for ending in FORMATS)}"
         )
     with Result(result) as run:
         numbers = _frames(run, path, write is not write_one_frame, frames)
@@ -217,7 +222,7 @@ def export(result: str | Path, path: str | Path, frames: Frames | None = None) -
 
 
 def _frames(run: Result, path: Path, moves: bool, frames: Frames | None) -> list[int]:
-    """Return the numbers of the frames to export. Raises InputError for those there are not."""
+    """Return the numbers of the frames to export. Raises InputError for missing frames."""
     count = len(run.frames.time)
     if not count:
         raise InputError(f"{run.path} has no finished frame")

@@ -1,6 +1,7 @@
-"""USD by its own library: a mesh for each body, with a time sample of its points for each frame.
+"""Write USD by its own library: a mesh for each body, with a time sample of its points a frame.
 
-.usda is text, .usdc and .usd are binary. Normals go with the points, for without them programs draw each triangle flat.
+.usda is text, .usdc and .usd are binary. Normals are stored too, because without them programs
+shade each triangle flat.
 """
 
 from collections.abc import Sequence
@@ -16,13 +17,16 @@ from msmpetsc.export.formats import middle_of, normals
 from msmpetsc.results.reader import Result
 
 CLAY = (0.8, 0.55, 0.4)
-UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}  # the axes that USD knows as upward
-SAVED = 16  # frames: so many are in memory at a time, where the format is binary
+# USD's tokens of the axes that may be upward
+UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}
+# frames between saves of a binary file [-]; bounds the memory
+SAVED = 16
 
 
 def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
-    """Write frames as USD. Raises OSError where the library cannot."""
-    path.touch()  # or the library would say why not, in many lines
+    """Write frames as USD. Raises OSError if the library cannot."""
+    # raises a plain error if the file cannot be written; the library's has many lines
+    path.touch()
     try:
         stage = Usd.Stage.CreateNew(str(path))
         root = UsdGeom.Xform.Define(stage, f"/{Tf.MakeValidIdentifier(run.path.stem)}")
@@ -38,7 +42,8 @@ def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
         stage.SetEndTimeCode(codes[-1])
         triangles = run.indices("surface/triangles")
         of_point = run.body_of("surface")
-        # USD's points are of single precision, which is exact about the body's middle: the root puts them there
+        # Relative to the body's middle, the single precision of USD's points suffices.
+        # The root node adds the middle.
         middle = middle_of(run.surface_at(frames[0]))
         root.AddTranslateOp().Set(Gf.Vec3d(*middle))
         bodies = [
@@ -57,7 +62,7 @@ def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
 
 
 class UsdBody:
-    """The USD mesh of one body, to which frames are added."""
+    """The USD mesh of a body, to which frames are added."""
 
     def __init__(self, stage: Any, root: Any, triangles: Indices, of_point: Indices, number: int):
         """Define the constant parts: triangles and colour."""
@@ -66,7 +71,8 @@ class UsdBody:
         self._triangles = np.searchsorted(self._rows, own)
         name = "body" if of_point.max() == 0 else f"body_{number}"
         self._mesh = UsdGeom.Mesh.Define(stage, root.AppendChild(name))
-        self._mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)  # or it would be rounded off
+        # without subdivision, which would round the mesh off
+        self._mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         self._mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(own), 3))
         self._mesh.CreateFaceVertexIndicesAttr(
             Vt.IntArray.FromNumpy(self._triangles.ravel().astype(np.int32))
@@ -75,7 +81,7 @@ class UsdBody:
         self._mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
 
     def add(self, points: Array, code: float) -> None:
-        """Add a sample at a time code, of the points (v, 3) [m] of all bodies from the root."""
+        """Add a sample at a time code: points (v, 3) [m] of all bodies relative to the root."""
         own = points[self._rows]
         corners = np.array([own.min(axis=0), own.max(axis=0)])
         self._mesh.CreatePointsAttr().Set(_vectors(own), code)
@@ -90,13 +96,11 @@ def up_axis(scene: dict[str, Any]) -> str:
 
 
 def frames_a_second(times: Floats) -> float:
-    """Return the frames a second of times (t,) [s].
-
-    Of equally spaced ones a frame is one time code.
-    """
+    """Return frames per second at times (t,) [s]; equally spaced frames are a time code apart."""
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return float(f"{1 / spacing:.9g}")
 
 
 def _vectors(rows: Array) -> Any:
+    """Return rows (n, 3) as an array of USD's single-precision vectors."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rows, np.float32))

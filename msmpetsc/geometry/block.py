@@ -1,11 +1,13 @@
-"""Numbering of the 3x3x3 cells around a cell, and of their nodes, squares and edges, as tables.
+"""Number the 3x3x3 cells around a cell, and their nodes, squares and edges, in tables.
 
-Lengths are in units of the cell size, with the cell's low corner at 0. Cell (x,y,z), each 0..2, of the block is
-entry 9x + 3y + z and lies at offset (x-1, y-1, z-1): the cell itself is 13. Node (x,y,z), each 0..3, is entry
-16x + 4y + z at offset (x-1, y-1, z-1). Corner v = 0..7 of the cell has the bits (v>>2 & 1, v>>1 & 1, v & 1).
+Lengths are in cell sizes, and the middle cell's low corner is at 0.
 
-A square is (axis, plane, j, k): normal to its axis, at node `plane` 0..3 along it, at cells j, k along the next two
-axes in cyclic order. An edge is (axis, i, j, k): cell i along its axis, nodes j, k along the next two.
+- Cell (x,y,z), each 0..2, is entry 9x + 3y + z, at offset (x-1, y-1, z-1). The middle cell is 13.
+- Node (x,y,z), each 0..3, is entry 16x + 4y + z, at offset (x-1, y-1, z-1).
+- Corner v = 0..7 of the middle cell has the coordinates (v>>2 & 1, v>>1 & 1, v & 1).
+- Square (axis, plane, j, k) is normal to ``axis`` at node ``plane`` 0..3 along it. Its position is
+  cell j, k along the next two axes in cyclic order.
+- Edge (axis, i, j, k) is at cell i along its axis, and at node j, k along the next two axes.
 """
 
 import numpy as np
@@ -13,40 +15,48 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Mask
 from msmpetsc.backend.kernel import njit
 
-ITSELF = 13  # entry of the cell among its 27
+# entry of the middle cell
+MIDDLE = 13
 CELL_STRIDE = np.array([9, 3, 1])
 NODE_STRIDE = np.array([16, 4, 1])
-OUTSIDE = 27  # stands for every cell out of the block
+# entry for every cell outside the block
+OUTSIDE = 27
 
 
 def _entry(stride: Indices, axis: Indices, i: Indices, j: Indices, k: Indices) -> Indices:
+    """Return the entries of cells or nodes at i along ``axis`` and j, k along the next two axes."""
     entry: Indices = i * stride[axis] + j * stride[(axis + 1) % 3] + k * stride[(axis + 2) % 3]
     return entry
 
 
 def _edge(axis: Indices, i: Indices, j: Indices, k: Indices) -> Indices:
+    """Return the entry in ``EDGE`` of edges (axis, i, j, k)."""
     return ((axis % 3 * 3 + i) * 4 + j) * 4 + k
 
 
 _axis, _plane, _j, _k = np.indices((3, 4, 3, 3)).reshape(4, -1)
 _x, _y, _z = np.indices((2, 2, 2)).reshape(3, -1, 1)
 
-SQUARE = np.stack([_axis, _plane, _j, _k], 1)  # (108,4)
-NODES = np.stack(  # (108,4) corner nodes, as (a,b): 00, 10, 11, 01
+# (108, 4) axis, plane, j, k of each square
+SQUARE = np.stack([_axis, _plane, _j, _k], 1)
+# (108, 4) corner nodes of each square, in the order (a,b) = 00, 10, 11, 01
+NODES = np.stack(
     [
         _entry(NODE_STRIDE, _axis, _plane, _j + a, _k + b)
         for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
     ],
     1,
 )
-CELLS = np.stack(  # (108,2) cells below and above
+# (108, 2) cells below and above each square
+CELLS = np.stack(
     [
         np.where(_plane > 0, _entry(CELL_STRIDE, _axis, _plane - 1, _j, _k), OUTSIDE),
         np.where(_plane < 3, _entry(CELL_STRIDE, _axis, _plane, _j, _k), OUTSIDE),
     ],
     1,
 )
-EDGES = np.stack(  # (108,4) edges 00-10, 10-11, 01-11, 00-01
+# (108, 4) edges 00-10, 10-11, 01-11, 00-01 of each square
+EDGES = np.stack(
     [
         _edge(_axis + 1, _j, _k, _plane),
         _edge(_axis + 2, _k, _plane, _j + 1),
@@ -55,13 +65,14 @@ EDGES = np.stack(  # (108,4) edges 00-10, 10-11, 01-11, 00-01
     ],
     1,
 )
-EDGE = np.indices((3, 3, 4, 4)).reshape(4, -1).T.copy()  # (144,4): axis, i, j, k
-AROUND = np.zeros((8, 28), bool)  # the 8 cells around each corner of the middle cell
+# (144, 4) axis, i, j, k of each edge
+EDGE = np.indices((3, 3, 4, 4)).reshape(4, -1).T.copy()
+# (8, 28) whether a cell is among the 8 around a corner of the middle cell
+AROUND = np.zeros((8, 28), bool)
 for _dx, _dy, _dz in np.ndindex(2, 2, 2):
     AROUND[np.arange(8)[:, None], 9 * (_x + _dx) + 3 * (_y + _dy) + _z + _dz] = True
-OF_CORNER = (
-    np.nonzero(AROUND[:, CELLS].any(2))[1].reshape(8, 36).copy()
-)  # the squares of those cells
+# (8, 36) squares of the 8 cells around each corner
+OF_CORNER = np.nonzero(AROUND[:, CELLS].any(2))[1].reshape(8, 36).copy()
 
 
 @njit()
@@ -78,7 +89,7 @@ def corner_node(v: int) -> int:
 
 @njit()
 def cells_around(v: int, valid: Mask) -> int:
-    """Return a bit mask of the valid cells around corner v: bit 4i + 2j + k of the cell (i,j,k)."""
+    """Return the valid cells around corner v as a bit mask: bit 4i + 2j + k is cell (i,j,k)."""
     first = 9 * corner_bit(v, 0) + 3 * corner_bit(v, 1) + corner_bit(v, 2)
     mask = 0
     for bit in range(8):
@@ -89,7 +100,7 @@ def cells_around(v: int, valid: Mask) -> int:
 
 @njit()
 def smoothstep(z: float) -> float:
-    """Return z^2 (3 - 2z) on [0,1], constant beyond: its slope is 0 at both ends."""
+    """Return z^2 (3 - 2z), with z clipped to [0,1]: the slope is 0 at both ends."""
     z = min(max(z, 0.0), 1.0)
     return z * z * (3.0 - 2.0 * z)
 
@@ -98,10 +109,9 @@ def smoothstep(z: float) -> float:
 def corner_blend(v: int, u: Floats) -> float:
     """Return W(v, p) of Eq. 8: the product over the axes of smoothstep(1 - distance to v).
 
-    It sums to 1 over the 8 corners.
-
-    On a face of the cell only its 4 corners count, and no W changes along the face's normal: two cells that share
-    the face and agree on what a corner says (L_v of Eq. 8) therefore agree in position and in slope.
+    The 8 values sum to 1. On a face of the cell only its 4 corners have a weight, and the normal
+    derivative of each W is 0. So if two cells share the face and have the same L_v of Eq. 8 at its
+    corners, position and slope are continuous across it.
     """
     product = 1.0
     for axis in range(3):

@@ -1,8 +1,8 @@
-"""Surfaces filled with uniform grid cells, the cages (paper section 4.1).
+"""Fill the bodies' surfaces with uniform grid cells, the cages (paper section 4.1).
 
-Rank 0 holds the surfaces; each rank finds the cells of one slab of each grid, then the cells are
-spread over the ranks in Morton order. The three kinds of cell are external (not kept), boundary
-and interior; the last two are the valid ones.
+A cell is external, boundary or interior. Boundary and interior cells are valid and are kept.
+Rank 0 holds the surfaces. Each rank finds the valid cells in its slab of each grid, and then
+the cells are distributed over the ranks in Morton order.
 """
 
 import os
@@ -35,20 +35,24 @@ from msmpetsc.geometry.valid_cells import (
 )
 
 BOUNDARY, INTERIOR = 1, 2
-LEAST_SHARE = 1e-3  # of a corner that the inside is far from
-WHOLE = 1 - 1e-9  # a share above this is rounding away from 1
-LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
-# share of a wanted number of cells, or of a volume, that need not be met
+# least fill of a corner [-]; keeps a corner far from the inside from having no mass
+LEAST_SHARE = 1e-3
+# fill above which a corner counts as full [-]; the difference from 1 is rounding
+FULL = 1 - 1e-9
+# lattice memory a cell [byte]; a lower bound, as a whole run takes four times as much
+CELL_BYTES = 1000
+# relative error of a cell count or a volume [-]; far below the lattice's own error
 TOLERANCE = 0.01
-# cells across the mean thickness of a thin body, as advised: a strip then bends by 3% too little, with one cell by
-# 16%, with half a cell by 61%
+# cells across the mean thickness of a body [-]; a strip of 2 cells bends 3% too little,
+# a strip of 1 cell 16% too little
 ACROSS = 2
-SEARCH_LIMIT = 30  # sizes tried; a real model needs three to six
+# cell sizes tried [-]; real models need 3 to 6
+SEARCH_LIMIT = 30
 
 
 @dataclass(frozen=True)
 class BodySurface:
-    """What all ranks know of a surface, and on rank 0 the surface itself.
+    """A surface on rank 0, with its measures on all ranks.
 
     bounds : (2, 3) bounding box [m]
     """
@@ -61,14 +65,15 @@ class BodySurface:
 
 @dataclass(frozen=True)
 class Cages:
-    """Valid cells of bodies, each rank's share in Morton order.
+    """Valid cells of bodies, distributed over the ranks in Morton order.
 
-    table : keys of the cells (geometry.grid)
-    kind  : (n_local,) uint8, BOUNDARY or INTERIOR
-    share : (n_local, 2, 2, 2) of the cells' corners, LEAST_SHARE to 1 (geometry.fill_fractions) [-]; None where all
-            are whole
-    squares : (n_local, 3) of what is inside them, from their middles (geometry.fill_fractions) [cells^5]; None as share
-    fills : of each body, whether its boundary cells count by their fill
+    table   : keys of the cells (geometry.grid)
+    kind    : (n_local,) uint8, BOUNDARY or INTERIOR
+    share   : (n_local, 2, 2, 2) fill of the cells' corners, from LEAST_SHARE to 1 [-]
+              (geometry.fill_fractions); None if all cells count as full
+    squares : (n_local, 3) second moments of the material about the cells' middles [cells^5];
+              None if all cells count as full
+    fills   : for each body, whether its boundary cells are weighted by their fill
     """
 
     grids: BodyGrids
@@ -84,17 +89,20 @@ class Cages:
         return decode_morton(self.table.keys)
 
     def of_cells(self, ijk: Indices, rows: Rows | None) -> Rows | None:
-        """Return the rows, those of ``share`` or ``squares``, of valid cells (c, 3) of any rank (collective)."""
+        """Return rows of ``share`` or ``squares`` for valid cells (c, 3) of any rank (collective).
+
+        If ``rows`` is None, return None.
+        """
         return None if rows is None else self.table.rows_of(encode_morton(ijk), rows)
 
 
 @dataclass(frozen=True)
 class SlabCells:
-    """Valid cells in a rank's slab of the grid, whose axes are cycled so that the longest is first.
+    """Valid cells in a rank's slab of the grid, whose axes are cycled to put the longest first.
 
     boundary : (b, 3) cells that the surface touches
     gaps     : (g, 4) interior cells (geometry.valid_cells)
-    columns  : what the triangles cut out of cells; None where that was not asked for or the surface does not tell
+    columns  : fill of the boundary cells; None if not asked for, or if the winding is inconsistent
     """
 
     boundary: Indices
@@ -119,13 +127,15 @@ def fill(
 ) -> Cages:
     """Return the valid cells of side ``cell_size`` [m] of all bodies (collective).
 
-    boundary : "fill": a boundary cell counts for the share of it that is inside; "whole", as in the paper
-    raises   : InputError if there would be more than ``max_cells``
+    boundary : "fill" weights a boundary cell by its fill; "whole" counts it as full (the paper)
+
+    Raises InputError if there would be more than ``max_cells`` cells, or more than memory holds.
     """
-    comm, grids = bodies[0].comm, BodyGrids.covering([body.bounds for body in bodies], cell_size)
-    found = slabs_of_all(bodies, grids, max_cells, boundary)
-    refuse_beyond_memory(comm, sum(cells.count(comm) for cells in found))
-    parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, found, strict=True)]
+    comm = bodies[0].comm
+    grids = BodyGrids.covering([body.bounds for body in bodies], cell_size)
+    slabs = slabs_of_all(bodies, grids, max_cells, boundary)
+    refuse_beyond_memory(comm, sum(cells.count(comm) for cells in slabs))
+    parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, slabs, strict=True)]
     keys = encode_morton(
         np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(parts)])
     )
@@ -133,73 +143,80 @@ def fill(
     route = Route(comm, table.owner(keys))
     order = np.argsort(route.send(keys))
     kind = np.concatenate([kind for _, kind, _ in parts])
-    fills = tuple(inside is not None for _, _, inside in parts)
+    fills = tuple(cut is not None for _, _, cut in parts)
     share = squares = None
     if any(fills):
-        of_bodies = [_whole(len(kind)) if inside is None else inside for _, kind, inside in parts]
+        of_bodies = [_full_cells(len(kind)) if cut is None else cut for _, kind, cut in parts]
         share, squares = (
             route.send(np.concatenate(rows))[order] for rows in zip(*of_bodies, strict=True)
         )
     return Cages(grids, table, route.send(kind)[order], share, squares, fills)
 
 
-Inside = tuple[Rows, Rows]  # shares (n, 2, 2, 2) of cells' corners, and their squares (n, 3)
+# fills (n, 2, 2, 2) of the cells' corners, and second moments (n, 3)
+Fill = tuple[Rows, Rows]
 
 
-def _whole(count: int) -> Inside:
+def _full_cells(count: int) -> Fill:
+    """Return the fills and second moments of full cells."""
     return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
 
 
 def _cells_of(
     body: BodySurface, grid: Grid, cells: SlabCells, boundary: str
-) -> tuple[Indices, Array, Inside | None]:
-    """Return grid index (n, 3), kind (n,), shares and squares of a rank's cells (collective)."""
+) -> tuple[Indices, Array, Fill | None]:
+    """Return grid index (n, 3), kind (n,), fills and second moments of a rank's cells (collective).
+
+    The last is None if the cells count as full.
+    """
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(cells.boundary), len(interior)])
-    cut = _inside(body, grid, cells) if boundary == "fill" else None
+    cut = _boundary_fill(body, grid, cells) if boundary == "fill" else None
     if cut is None:
         return ijk, kind, None
-    share, squares = (np.concatenate(rows) for rows in zip(cut, _whole(len(interior)), strict=True))
+    full = _full_cells(len(interior))
+    share, squares = (np.concatenate(rows) for rows in zip(cut, full, strict=True))
     return ijk, kind, (share, squares)
 
 
-def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
-    """Return shares and squares of boundary cells; None, with a warning, where none are defined.
+def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | None:
+    """Return fills and second moments of boundary cells (collective).
 
-    A share that is raised to the least, or lowered to 1, is mass put into or taken out of that very corner, which then
-    counts in the squares, too.
+    Warn and return None if triangles are wound against each other. Clipping a corner's fill to
+    LEAST_SHARE or 1 changes the mass at that corner, so the second moments change too.
     """
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
         share, squares = cells.columns.inside(cells.boundary)
-        held = np.clip(share, 0, 1).mean(axis=(1, 2, 3)).sum() + cells.interior
-        _warn_of_parts(abs(body.report.volume), body.comm.allreduce(held) * grid.cell_size**3)
+        filled = np.clip(share, 0, 1).mean(axis=(1, 2, 3)).sum() + cells.interior
+        _warn_of_parts(abs(body.report.volume), body.comm.allreduce(filled) * grid.cell_size**3)
         share, squares = share.transpose(0, *(1 + axes)), squares[:, axes]
     elif body.report.closed:
         log.warning(
-            'triangles are wound against each other, so boundary cells count whole: prepare = ["orient"]'
+            "triangles are wound against each other, so boundary cells count whole: "
+            'prepare = ["orient"]'
         )
         return None
     else:
         share, squares = sampled_inside(
             body.comm.bcast(body.surface), grid, cells.boundary[:, axes]
         )
-    counted = np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
-    return counted, squares + (counted - share).mean(axis=(1, 2, 3))[:, None] / 4
+    clipped = np.clip(np.where(share > FULL, 1.0, share), LEAST_SHARE, 1.0)
+    return clipped, squares + (clipped - share).mean(axis=(1, 2, 3))[:, None] / 4
 
 
-def _warn_of_parts(enclosed: float, held: float) -> None:
-    """Warn if cells hold another volume [m^3] than the mesh, in which each part counts with its sign."""
-    if abs(held - enclosed) > TOLERANCE * enclosed:
+def _warn_of_parts(enclosed: float, filled: float) -> None:
+    """Warn if the volume [m^3] of the cells differs from the mesh, a sum of signed parts."""
+    if abs(filled - enclosed) > TOLERANCE * enclosed:
         remedy = (
             'some parts are wound inwards, which prepare = ["orient"] mends'
-            if held > enclosed
-            else 'parts overlap or lie in each other; prepare = ["union"] joins them, ["orient"] makes cavities of '
-            "inner parts"
+            if filled > enclosed
+            else 'parts overlap or lie in each other; prepare = ["union"] joins them, '
+            '["orient"] makes cavities of inner parts'
         )
         log.warning(
-            "the mesh encloses %.4g m^3, its cells hold %.4g m^3: %s", enclosed, held, remedy
+            "the mesh encloses %.4g m^3, its cells hold %.4g m^3: %s", enclosed, filled, remedy
         )
 
 
@@ -207,17 +224,20 @@ def slabs_of_all(
     bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str
 ) -> list[SlabCells]:
     """Return the valid cells of each body in this rank's slab (collective)."""
-    found: list[SlabCells] = []
-    comm, before = bodies[0].comm, 0
+    slabs: list[SlabCells] = []
+    comm = bodies[0].comm
+    total = 0
     for body, grid in zip(bodies, grids.grids, strict=True):
-        of_volume = abs(body.report.volume) / grid.cell_size**3 / 2
-        least = before + max(of_volume, body.report.area / grid.cell_size**2 / 8)
-        _refuse_above(max_cells, least, grid)
-        refuse_beyond_memory(comm, least)
-        found.append(_slab_cells(body, grid, boundary))
-        before += found[-1].count(comm)
-        _refuse_above(max_cells, before, grid)
-    return found
+        # lower bounds of the body's cells by its volume and its area
+        by_volume = abs(body.report.volume) / grid.cell_size**3 / 2
+        by_area = body.report.area / grid.cell_size**2 / 8
+        lower_bound = total + max(by_volume, by_area)
+        _refuse_above(max_cells, lower_bound, grid)
+        refuse_beyond_memory(comm, lower_bound)
+        slabs.append(_slab_cells(body, grid, boundary))
+        total += slabs[-1].count(comm)
+        _refuse_above(max_cells, total, grid)
+    return slabs
 
 
 def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
@@ -231,42 +251,43 @@ def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
         return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
     gaps = enclosed_gaps(body.comm, touched, slab)
     columns = _columns(body, corners, grid.shape[axes], slab) if boundary == "fill" else None
-    if columns is not None:  # a cave that a surface of its own bounds is enclosed, but not inside
+    # a cavity bounded by its own surface is enclosed but lies outside the body
+    if columns is not None:
         gaps = gaps[columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > OUTSIDE]
     return SlabCells(touched, gaps, columns)
 
 
 def _columns(body: BodySurface, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
-    """Return the cells that triangles cut; None if those are wound inconsistently (collective)."""
+    """Return the fill of cut cells; None if triangles are wound against each other (collective)."""
     outwards = corners if body.report.volume > 0 else corners[:, ::-1]
     columns = Columns.crossed(outwards, *_limits(shape, slab))
     return columns if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK else None
 
 
 def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
-    """Return the first cell of a slab, and the one after its last, along each axis."""
+    """Return the first cell of a slab, and the cell after its last, along each axis."""
     return np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
 
 
 def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
-    """Raise InputError for a lattice whose parts cannot fit into memory (collective)."""
-    memory, needed = (
-        os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        cells * LEAST_OF_A_CELL / comm.size,
-    )
+    """Raise InputError if a lattice of so many cells cannot fit into memory (collective)."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    needed = cells * CELL_BYTES / comm.size
     with together(comm):
         if needed > memory:
-            has = f"this machine has {memory / 1e9:.3g} GB"
             raise InputError(
-                f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, and {has}"
+                f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, "
+                f"and this machine has {memory / 1e9:.3g} GB"
             )
 
 
 def _axes(body: BodySurface) -> Indices:
+    """Return the axes (3,) of the grid, cycled so that the body's longest axis is first."""
     return np.roll([0, 1, 2], -int(np.argmax(body.bounds[1] - body.bounds[0])))
 
 
 def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
+    """Raise InputError if a grid gives more than ``max_cells`` cells."""
     if cells > max_cells:
         raise InputError(
             f"cages: a cell size of {grid.cell_size:.3g} m gives {cells:.3g} cells or more, "
@@ -280,8 +301,8 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     if body.surface is not None:
         corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
     planes = np.floor(corners[:, :, 0]).astype(np.int64)
-    reached = [planes.min(axis=1), planes.max(axis=1)]
-    first, last = np.searchsorted(edges[1:], reached, side="right")
+    extents = [planes.min(axis=1), planes.max(axis=1)]
+    first, last = np.searchsorted(edges[1:], extents, side="right")
     copies = last - first + 1
     rank = (
         np.repeat(first, copies)
@@ -303,15 +324,16 @@ def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:
 def _gaps_by_winding(
     body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices
 ) -> Indices:
-    """Return the interior cells of an open surface, by the winding numbers of their centres.
+    """Return the interior cells (g, 4) of an open surface, by the winding numbers of their centres.
 
-    (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
-    An open surface has no slabs of its own meaning: every rank needs all of it.
+    The time grows with the bounding box, the memory does not. Every rank needs the whole surface
+    (collective). Source: Jacobson et al. 2013.
     """
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
     marked = packed(boundary)
-    first, last = slab.first * shape[1] * shape[2], slab.last * shape[1] * shape[2]
+    plane = shape[1] * shape[2]
+    first, last = slab.first * plane, slab.last * plane
     gaps = [np.empty((0, 4), np.int64)]
     for start in range(first, last, CHUNK):
         cells = np.stack(
@@ -321,7 +343,8 @@ def _gaps_by_winding(
         centres = np.empty(cells.shape)
         centres[:, axes] = cells + 0.5
         inside = cells[is_inside(surface, grid.node_positions(centres))]
-        gaps.append(inside[:, [0, 1, 2, 2]])  # a gap of one cell each
+        # each cell is a gap of length 1
+        gaps.append(inside[:, [0, 1, 2, 2]])
     return np.concatenate(gaps)
 
 
@@ -330,37 +353,41 @@ def choose_cell_size(
 ) -> float:
     """Return the cell size [m] that gives ``count`` cells within 1% (collective).
 
-    The number of cells falls about as a power of the size, so this is a secant search in logarithms,
-    kept inside a bracket: the number is a step function and not quite monotone. Where it has no such
-    size the nearest is taken, with a warning.
+    The number of cells is about a power of the size, so a secant search runs in logarithms. A
+    bracket guards it, because the number is a step function and not quite monotone. If no size
+    meets the tolerance, the nearest is returned with a warning.
 
-    raises : InputError if ``count`` is more than ``max_cells``, or than memory can hold
+    Raises InputError if ``count`` is more than ``max_cells``, or more than memory holds.
     """
     if count > max_cells:
         raise InputError(f"cages.count: {count} is more than cages.max_cells = {max_cells}")
-    comm, bounds = bodies[0].comm, [body.bounds for body in bodies]
+    comm = bodies[0].comm
+    bounds = [body.bounds for body in bodies]
     refuse_beyond_memory(comm, count)
-    excess = {}  # log(size) -> log(cells / count)
+    # excess[log(size)] = log(cells / count)
+    excess = {}
     guess = np.log(estimated_size(bodies, count))
     for _ in range(SEARCH_LIMIT):
         grids = BodyGrids.covering(bounds, np.exp(guess))
-        found = slabs_of_all(bodies, grids, 20 * max_cells, boundary)
-        excess[guess] = np.log(sum(cells.count(comm) for cells in found) / count)
+        slabs = slabs_of_all(bodies, grids, 20 * max_cells, boundary)
+        excess[guess] = np.log(sum(cells.count(comm) for cells in slabs) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
         if abs(np.expm1(excess[nearest])) <= TOLERANCE:
             return float(np.exp(nearest))
         guess = _next_guess(excess, nearest)
-    taken = round(count * np.exp(excess[nearest]))
     log.warning(
         "cages.count: no cell size was found that gives %d cells within 1%%; taking %d",
         count,
-        taken,
+        round(count * np.exp(excess[nearest])),
     )
     return float(np.exp(nearest))
 
 
 def estimated_cells(bodies: Sequence[BodySurface], cell_size: float) -> float:
-    """Return about how many cells of side h [m] fill bodies: V / h^3 + 3/4 A / h^2, as boundary cells stick out."""
+    """Estimate the number of cells of side h [m] in bodies as V / h^3 + 3/4 A / h^2.
+
+    The second term is the part of the boundary cells outside the surface.
+    """
     return sum(
         abs(body.report.volume) / cell_size**3 + 0.75 * body.report.area / cell_size**2
         for body in bodies
@@ -368,32 +395,32 @@ def estimated_cells(bodies: Sequence[BodySurface], cell_size: float) -> float:
 
 
 def estimated_size(bodies: Sequence[BodySurface], count: float) -> float:
-    """Return about the cell size [m] that gives ``count`` cells."""
-    area, volume = (
-        sum(body.report.area for body in bodies),
-        sum(abs(body.report.volume) for body in bodies),
-    )
+    """Estimate the cell size [m] that gives ``count`` cells."""
+    area = sum(body.report.area for body in bodies)
+    volume = sum(abs(body.report.volume) for body in bodies)
     roots = np.roots([count, 0, -0.75 * area, -volume])
     return float(roots.real.max())
 
 
 def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float) -> None:
-    """Warn of bodies whose mean thickness 2 V / A is less than a cell [m]: they are too stiff in bending."""
+    """Warn of bodies too stiff in bending: their mean thickness 2 V / A is less than a cell [m]."""
     for number, body in enumerate(bodies):
         thickness = 2 * abs(body.report.volume) / body.report.area
         if body.report.closed and thickness < cell_size:
-            enough = thickness / ACROSS
+            advised = thickness / ACROSS
             log.warning(
-                "%s is %.3g m thick on average (2 V / A), %.2g of a cell, and so too stiff in bending: "
-                "cages.count = %d or cages.cell_size = %.2g puts %d cells there",
-                f"body.{number}" if len(bodies) > 1 else "the body", thickness, thickness / cell_size,
-                float(f"{estimated_cells(bodies, enough):.2g}"), enough, ACROSS,
+                "%s is %.3g m thick on average (2 V / A), %.2g of a cell, and so too stiff in "
+                "bending: cages.count = %d or cages.cell_size = %.2g puts %d cells there",
+                f"body.{number}" if len(bodies) > 1 else "the body",
+                thickness, thickness / cell_size,
+                float(f"{estimated_cells(bodies, advised):.2g}"), advised, ACROSS,
             )  # fmt: skip
 
 
 def _next_guess(excess: dict[float, float], nearest: float) -> float:
-    """Return the zero of the secant through the two best tries, else the middle of the bracket."""
-    slope = -2.5  # between that of a shell and that of a solid
+    """Return the root of the secant through the two best sizes, or else the bracket's middle."""
+    # first slope: between -2 of a shell and -3 of a solid
+    slope = -2.5
     if len(excess) > 1:
         second = min(
             (size for size in excess if size != nearest), key=lambda size: abs(excess[size])

@@ -1,4 +1,4 @@
-"""Files of meshio: the boundary of their cells, and the sets of cells and points that they name."""
+"""Read meshes of cells by meshio: their boundary, and their named sets of cells and points."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
@@ -12,20 +12,21 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions
 if TYPE_CHECKING:
     import meshio
 
-Groups = dict[str, Indices]  # by name, triangles (f, 3)
+# triangles (f, 3) by the name of their group
+Groups = dict[str, Indices]
 
-# distinct labels of an array [-]; one that has more numbers cells, and names no parts
+# labels of an array [-]; an array with more labels numbers cells and names no groups
 MOST_LABELS = 1000
-# lines behind a text's end [-]; a reader that comes to its end asks for few
-PATIENCE = 100
+# lines asked for past the end of a text [-]; readers of intact files ask for few
+MOST_LINES_PAST_END = 100
 
 
 class Kind(NamedTuple):
     """A kind of cell, with corners, edges and faces as VTK numbers them.
 
     faces     : corners of each face, in order around it
-    edges     : corners of each edge, in the order of the nodes at their middles
-    quadratic : numbers of nodes of cells that have nodes on their edges; meshio has no such wedge
+    edges     : corners of each edge, in the order of the mid-edge nodes
+    quadratic : node counts of the cells with mid-edge nodes; meshio has no such wedge
     """
 
     dimension: int
@@ -34,10 +35,11 @@ class Kind(NamedTuple):
     quadratic: tuple[int, ...] = ()
 
     def triangles(self, cells: Indices, face: str) -> Indices:
-        """Return the triangles (c, t, 3) of one face of cells (c, k)."""
+        """Return the triangles (c, t, 3) of a face of cells (c, k)."""
         ring = [int(corner) for corner in face]
         if cells.shape[1] in self.quadratic:
-            first, edges = 1 + int(max(map(max, self.faces))), [{*edge} for edge in self.edges]
+            first = 1 + int(max(map(max, self.faces)))
+            edges = [{*edge} for edge in self.edges]
             middles = [
                 first + edges.index({*pair}) for pair in zip(face, face[1:] + face[0], strict=True)
             ]
@@ -59,7 +61,7 @@ KINDS = {
         (20, 27),
     ),
 }
-# Triangles of a face by how many nodes are around it; of 6 and 8 every second is an edge's middle.
+# triangles of a face by its number of nodes; of 6 or 8 nodes every second is mid-edge
 CUTS = {
     3: [[0, 1, 2]],
     4: [[0, 1, 2], [2, 3, 0]],
@@ -68,23 +70,22 @@ CUTS = {
 }
 
 
-Blocks = Sequence[tuple[Kind | None, Indices]]  # cells (c, k); of no kind if they have no face
+# kind and cells (c, k) of each block; None for vertices and lines
+Blocks = Sequence[tuple[Kind | None, Indices]]
 
 
 def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
     """Return points (v, 3), triangles (f, 3) and named triangles of a file that meshio reads.
 
-    The triangles are the boundary of the cells that have a volume, or else the triangles and quads.
+    The triangles are the boundary of the volume cells; if there are none, the triangles and quads.
     """
-    # a slow import for formats that few scenes name
+    # imported here because it is slow and few scenes need it
     import meshio
 
     if path.suffix.lower() == ".inp" and b"*INCLUDE" in data.upper():
         raise ValueError("it includes other files, which are not read")
-    texts, binary = (
-        {".inp": meshio.abaqus, ".bdf": meshio.nastran},
-        {".vtu": meshio.vtu, ".vtk": meshio.vtk},
-    )
+    texts = {".inp": meshio.abaqus, ".bdf": meshio.nastran}
+    binary = {".vtu": meshio.vtu, ".vtk": meshio.vtk}
     if reader := texts.get(path.suffix.lower()):
         mesh = reader.read(_Lines(data.decode(errors="replace")))
     else:
@@ -95,33 +96,36 @@ def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
         if cells.size and not 0 <= cells.min() <= cells.max() < len(points):
             raise ValueError(f"a cell names a point outside 0..{len(points) - 1}")
     solid = any(kind and kind.dimension == 3 for kind, _ in blocks)
-    triangles = boundary(points, blocks) if solid else _flat(blocks)
+    triangles = boundary(points, blocks) if solid else _shell_triangles(blocks)
     groups: dict[str, list[Indices]] = {}
     for name, rows in _sets(mesh, blocks):
-        named = [(kind, cells[own]) for (kind, cells), own in zip(blocks, rows, strict=True)]
-        groups.setdefault(name, []).extend((boundary(points, named), _flat(named)))
+        named = [(kind, cells[chosen]) for (kind, cells), chosen in zip(blocks, rows, strict=True)]
+        groups.setdefault(name, []).extend((boundary(points, named), _shell_triangles(named)))
     for name, numbers in mesh.point_sets.items():
         groups.setdefault(name, []).append(triangles[np.isin(triangles, numbers).all(axis=1)])
     return points, triangles, {name: np.concatenate(parts) for name, parts in groups.items()}
 
 
 class _Lines(StringIO):
-    """A text that is an error to readers which ask for more and more lines behind its end."""
+    """A text that raises EOFError if a reader asks for many lines past its end.
 
-    behind = 0
+    meshio's readers of damaged texts would otherwise not return.
+    """
+
+    lines_past_end = 0
 
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
         line = super().readline(size)
-        self.behind += not line
-        if self.behind > PATIENCE:
+        self.lines_past_end += not line
+        if self.lines_past_end > MOST_LINES_PAST_END:
             raise EOFError("it ends too early")
         return line
 
 
 def _kind(name: str) -> Kind | None:
-    """Return the kind of cell of meshio's name, "tetra10".
+    """Return the kind of cell of meshio's name, "tetra10"; None for vertices and lines.
 
-    Raises ValueError if it is not read.
+    Raises ValueError for any other cell.
     """
     base = name.rstrip("0123456789")
     if base not in KINDS and base not in ("vertex", "line"):
@@ -130,10 +134,10 @@ def _kind(name: str) -> Kind | None:
 
 
 def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indices]]]:
-    """Yield the name and the rows of each block of the sets of cells that a mesh names or labels."""
+    """Yield the name of each named or labelled set of cells, and its rows in each block."""
     for name, rows in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
-            yield name, [np.asarray(own, np.int64) for own in rows]
+            yield name, [np.asarray(of_block, np.int64) for of_block in rows]
     arrays = {
         key: np.concatenate(parts)
         for key, parts in mesh.cell_data.items()
@@ -143,10 +147,10 @@ def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indic
         [kind.dimension if kind else 0 for kind, _ in blocks], [len(cells) for _, cells in blocks]
     )
     ends = np.cumsum([len(cells) for _, cells in blocks])
-    for key, label, usual in labels_of(
+    for key, label, default_name in labels_of(
         {key: each for key, each in arrays.items() if each.shape == dimensions.shape}
     ):
-        # in which a name is of a label and a dimension, and 0 is no group
+        # gmsh names a pair of label and dimension, and label 0 means no group
         is_gmsh = key == "gmsh:physical"
         names = (
             {(int(tag), int(size)): name for name, (tag, size) in mesh.field_data.items()}
@@ -154,15 +158,15 @@ def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indic
             else {}
         )
         for dimension in (2, 3) if label or not is_gmsh else ():
-            own = (arrays[key] == label) & (dimensions == dimension)
+            in_group = (arrays[key] == label) & (dimensions == dimension)
             yield (
-                names.get((label, dimension), usual),
-                [*map(np.flatnonzero, np.split(own, ends[:-1]))],
+                names.get((label, dimension), default_name),
+                [*map(np.flatnonzero, np.split(in_group, ends[:-1]))],
             )
 
 
 def labels_of(arrays: Mapping[str, Array]) -> Iterator[tuple[str, int, str]]:
-    """Yield array, label and name of each label in arrays of whole numbers.
+    """Yield array, label and name of each label in arrays of integers.
 
     The name is "3", or "array:3" if there are several arrays.
     """
@@ -173,17 +177,17 @@ def labels_of(arrays: Mapping[str, Array]) -> Iterator[tuple[str, int, str]]:
             yield key, label, str(label) if len(whole) == 1 else f"{key}:{label}"
 
 
-def _flat(blocks: Blocks) -> Indices:
-    """Return the triangles (f, 3) of cells without volume."""
-    flat = [(kind, cells) for kind, cells in blocks if kind and kind.dimension == 2]
-    parts = [kind.triangles(cells, kind.faces[0]).reshape(-1, 3) for kind, cells in flat]
+def _shell_triangles(blocks: Blocks) -> Indices:
+    """Return the triangles (f, 3) of triangle and quad cells."""
+    shells = [(kind, cells) for kind, cells in blocks if kind and kind.dimension == 2]
+    parts = [kind.triangles(cells, kind.faces[0]).reshape(-1, 3) for kind, cells in shells]
     return np.concatenate([np.zeros((0, 3), np.int64), *parts])
 
 
 def boundary(points: Positions, blocks: Blocks) -> Indices:
-    """Return the faces of one cell only as triangles (f, 3), wound outwards.
+    """Return the faces that belong to a single cell as triangles (f, 3), wound outwards.
 
-    The cell itself may be inverted.
+    Faces of an inverted cell are turned.
     """
     solid = [
         (kind, cells, _volumes(points, kind, cells) < 0)
@@ -196,32 +200,32 @@ def boundary(points: Positions, blocks: Blocks) -> Indices:
         *(_key(cells[:, [*map(int, face)]]) for face, _, cells, _ in faces),
     ]
     ordered = np.concatenate(keys)[order := np.lexsort(np.concatenate(keys).T)]
-    same = (ordered[1:] == ordered[:-1]).all(axis=1)
+    shared = (ordered[1:] == ordered[:-1]).all(axis=1)
     outer = np.ones(len(order), bool)
-    outer[order[1:][same]] = outer[order[:-1][same]] = False
-    parts, ends = [np.zeros((0, 3), np.int64)], np.cumsum([len(key) for key in keys])
-    for (face, kind, cells, inverted), own in zip(
+    outer[order[1:][shared]] = outer[order[:-1][shared]] = False
+    parts = [np.zeros((0, 3), np.int64)]
+    ends = np.cumsum([len(key) for key in keys])
+    for (face, kind, cells, inverted), is_outer in zip(
         faces, np.split(outer, ends[:-1])[1:], strict=True
     ):
-        triangles = kind.triangles(cells[own], face)
-        parts.append(
-            np.where(inverted[own][:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3)
-        )
+        triangles = kind.triangles(cells[is_outer], face)
+        turned = inverted[is_outer][:, None, None]
+        parts.append(np.where(turned, triangles[:, :, ::-1], triangles).reshape(-1, 3))
     triangles = np.concatenate(parts)
-    whole: Indices = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
-    return whole
+    proper: Indices = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    return proper
 
 
 def _key(corners: Indices) -> Indices:
-    """Return the corners of faces in order, (f, 4), each once, with -1 in front of fewer."""
+    """Return the distinct corners of faces in ascending order, (f, 4), padded with -1 in front."""
     key = np.sort(corners, axis=1)
-    # a collapsed cell has a corner twice
+    # a collapsed cell repeats a corner
     key[:, 1:][key[:, 1:] == key[:, :-1]] = -1
     return np.pad(np.sort(key, axis=1), ((0, 0), (4 - key.shape[1], 0)), constant_values=-1)
 
 
 def _volumes(points: Positions, kind: Kind, cells: Indices) -> Floats:
-    """Return the signed volume (c,) of cells, negative if they are inverted [m^3]."""
+    """Return the signed volume [m^3] of cells, (c,): negative if a cell is inverted."""
     volumes = np.zeros(len(cells))
     for face in kind.faces:
         a, b, c = np.moveaxis(

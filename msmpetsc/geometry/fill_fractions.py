@@ -1,20 +1,22 @@
-"""Shares of a cell and of its corners that lie inside the surface, by which boundary cells weigh.
+"""Compute the fill of cut cells and of their corners, and the second moments of their material.
 
-The share of a corner is 8 times the integral of its trilinear function N over the part of the cell that is inside:
-1 in a whole cell, and on average over the corners the share of the volume. A mean of N alone would spread what a cell
-holds evenly, further out than it is, which makes thin limbs too stiff.
+The fill of a corner is 8 times the integral of its trilinear function N over the inside part of
+the cell: 1 in a full cell. The mean over the 8 corners is the fill of the cell's volume. The fills
+alone spread the material too far out, so thin limbs become too stiff; second moments correct this.
 
-Of a closed surface it is exact. A ray is inside a body from where it enters to where it leaves, so an integral along
-the ray, within the body and a cell, is a sum over the places z where it crosses the surface, in the cell or above it,
+For a closed surface the fill is exact. A ray is inside the body between entering and leaving.
+The integral of N along the ray, within body and cell, is a sum over crossings with the surface.
+A crossing lies in the cell, at height z, or above it:
 
-    sum_in sign S(z) + sum_above sign S(1),      sign = 1 where the ray leaves, -1 where it enters, S' = N(z), S(0) = 0.
+    sum_in sign S(z) + sum_above sign S(1),   S' = N(z), S(0) = 0.
 
-Over all rays that is an integral over pieces of triangles as seen along the ray: the divergence theorem for the body
-within the cell. So are the squares, the integrals of x^2, y^2 and z^2 from the middle of the cell. Of an open
-surface they are counted in samples by the generalized winding number (Jacobson et al. 2013).
+The sign is 1 if the ray leaves and -1 if it enters. The integral over all rays is an integral over
+the triangles' pieces projected along the ray: the divergence theorem for the body within the cell.
+The second moments, integrals of x^2, y^2, z^2 from the middle of the cell, are computed alike.
+For an open surface samples of the winding number are counted (Jacobson et al. 2013).
 
-All is in cell units, axes cycled as in geometry.cages. Rays run along the last axis, so a slab of
-the first has its columns whole.
+All lengths are in cells, with axes cycled as in geometry.cages. Rays run along the last axis, so
+a slab of the first axis has whole columns of cells.
 """
 
 from dataclasses import dataclass
@@ -27,13 +29,18 @@ from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
 from msmpetsc.geometry.surface import Surface, is_inside
 from msmpetsc.geometry.valid_cells import clip_between, extent, grown
 
-SAMPLES = 6  # a side of a cell of an open surface: a plane through a cell is seen to 0.6% of the cell, rms
-OUTSIDE = 0.5  # a winding number below this
-LEAK = 1e-6  # windings left below a column: above rounding, far below what one triangle wound the wrong way leaves
+# samples along an axis of a cut cell [-]; a plane through the cell errs by 0.6% rms
+SAMPLES = 6
+# winding number below which a cell is outside [-]; halfway between outside and inside
+OUTSIDE = 0.5
+# winding number below a column that shows a bad winding [-]; far above rounding, far
+# below the effect of a single triangle
+LEAK = 1e-6
 
-SEEN, SUMS = 6, 17  # sums of a piece: those that count for the cells below it too, and all
+# sums of a piece [-]; the first 6 also count for the cells below it
+SEEN, SUMS = 6, 17
 
-# barycentric coordinates and weights that integrate polynomials of degree 4 over a triangle (Dunavant 1985)
+# barycentric coordinates and weights of a rule of degree 4 on triangles (Dunavant 1985)
 POINTS = np.array(
     [
         np.roll([1 - 2 * a, a, a], turn)
@@ -46,12 +53,13 @@ WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 @dataclass(frozen=True)
 class Columns:
-    """The cells that triangles cross, in lexicographic order.
+    """Fill of the cells that triangles cross, in lexicographic order.
 
     keys    : (c,) of the cells (grid.packed)
-    corners : (c, 2, 2, 2) shares of their corners; what is inside twice counts twice
-    squares : (c, 3) integrals of x^2, y^2, z^2 over what is inside, from the middle of the cell: 1/12 in a whole one
-    below   : (c, 2, 2) winding number below the cell, a mean over its base weighted by each corner's bilinear function
+    corners : (c, 2, 2, 2) fills of their corners; material inside two parts counts twice
+    squares : (c, 3) second moments about the middle of the cell [cells^5]: 1/12 in a full cell
+    below   : (c, 2, 2) winding number below the cell: its mean over the base, weighted by the
+              bilinear function of each corner
     """
 
     keys: Indices
@@ -61,13 +69,14 @@ class Columns:
 
     @classmethod
     def crossed(cls, triangles: Rows, low: Indices, high: Indices) -> "Columns":
-        """Return the columns of triangles (f, 3, 3) within low <= cell < high, (3,) int."""
+        """Return the columns of triangles (f, 3, 3) in the cells low <= cell < high, (3,) int."""
         starts = range(0, max(1, len(triangles)), CHUNK)
         pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
         parts = [_sums_of_keys(packed(cells), values) for cells, values in pieces]
         keys = np.unique(np.concatenate([of_part for of_part, _ in parts]))
         sums = np.zeros((len(keys), SUMS))
-        for of_part, values in parts:  # whose keys are distinct, each
+        # each part has distinct keys
+        for of_part, values in parts:
             sums[np.searchsorted(keys, of_part)] += values
         above = _sums_above(keys // LIMIT, sums[:, :SEEN])
         below = 4 * above[:, :4].reshape(-1, 2, 2)
@@ -82,28 +91,27 @@ class Columns:
 
     @property
     def leak(self) -> float:
-        """The greatest winding number below a column: 0 of a closed surface wound one way."""
+        """Largest winding number below a column: 0 for a closed, consistently wound surface."""
         lowest = np.diff(self.keys // LIMIT, prepend=-1) != 0
         return float(np.abs(self.below[lowest]).max(initial=0.0))
 
     def inside(self, cells: Indices) -> tuple[Rows, Rows]:
-        """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3), and their squares (k, 3)."""
+        """Return the fills (k, 2, 2, 2) and second moments (k, 3) of any cells (k, 3)."""
         if len(self.keys) == 0:
             return np.zeros((len(cells), 2, 2, 2)), np.zeros((len(cells), 3))
         keys = packed(cells)
         place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
-        found = self.keys[place]
-        is_above = (found >= keys) & (found // LIMIT == keys // LIMIT)
+        next_cut = self.keys[place]
+        is_above = (next_cut >= keys) & (next_cut // LIMIT == keys // LIMIT)
         uncut = np.where(is_above[:, None, None], self.below[place], 0.0)
-        is_cut = found == keys
+        is_cut = next_cut == keys
         share = np.where(is_cut[:, None, None, None], self.corners[place], uncut[..., None])
-        return share, np.where(
-            is_cut[:, None], self.squares[place], uncut.mean(axis=(1, 2))[:, None] / 12
-        )
+        uncut_squares = uncut.mean(axis=(1, 2))[:, None] / 12
+        return share, np.where(is_cut[:, None], self.squares[place], uncut_squares)
 
 
 def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
-    """Return the distinct keys (c,), ascending, and the sums (c, k) of the rows (p, k) of each."""
+    """Return the distinct keys (c,), ascending, and the sums (c, k) of their rows (p, k)."""
     distinct, place = np.unique(keys, return_inverse=True)
     sums: Rows = np.empty((len(distinct), values.shape[1]))
     for column, rows in enumerate(values.T):
@@ -123,15 +131,15 @@ def _sums_above(column: Indices, values: Rows) -> Rows:
 
 @njit()
 def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows]:
-    """Cut triangles into cells.
+    """Cut triangles into pieces by cells.
 
-    returns : cell (p, 3) of each piece, and its sums (p, SUMS) of ``_add_sums``
+    returns : cell (p, 3) of each piece, and its sums (p, SUMS) from ``_add_sums``
     """
     cells = np.empty((4 * len(triangles) + 16, 3), np.int64)
     values = np.empty((len(cells), SUMS))
     used = 0
-    rooms = np.empty((4, 12, 3))
-    work, across, along, piece = rooms[0], rooms[1], rooms[2], rooms[3]
+    buffers = np.empty((4, 12, 3))
+    work, across, along, piece = buffers[0], buffers[1], buffers[2], buffers[3]
     for triangle in triangles:
         i0, i1 = _layers(triangle, 3, 0, low, high)
         for i in range(i0, i1):
@@ -153,7 +161,7 @@ def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows
 
 @njit()
 def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tuple[int, int]:
-    """Return the first cell index that a polygon reaches along an axis, and that after its last."""
+    """Return the first cell index of a polygon along an axis, and the index after its last."""
     if n == 0:
         return 0, 0
     smallest, largest = extent(polygon, n, axis)
@@ -162,11 +170,15 @@ def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tu
 
 @njit()
 def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> None:
-    """Add the integrals over a triangle of a cell, as seen along the last axis, to ``sums`` (SUMS,).
+    """Add the integrals over a triangle in a cell, seen along the last axis, to ``sums`` (SUMS,).
 
-    With z the height in the cell and N_ab the bilinear function of the edge at (a, b) of its base, they are of N_ab and
-    of x^2 and y^2 from the middle; then of N_ab S for the lower corner, S = z - z^2/2, of N_ab S for the upper one,
-    S = z^2/2, and of the three squares' S; 2 a + b is the place among four.
+    z is the height in the cell, N_ab the bilinear function of the vertical edge at (a, b), which is
+    number 2 a + b. The sums are, in this order, the integrals of
+
+    - N_ab (4), and x^2 and y^2 from the middle (2),
+    - N_ab S with S = z - z^2/2, of the lower corners (4),
+    - N_ab S with S = z^2/2, of the upper corners (4),
+    - S of the second moments in x, y and z (3).
     """
     area = 0.5 * ((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
     for s in range(len(WEIGHTS)):
@@ -179,7 +191,8 @@ def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> N
             sums[edge] += part
             sums[SEEN + edge] += part * (z - 0.5 * z * z)
             sums[SEEN + 4 + edge] += part * 0.5 * z * z
-        part, x, y, up = area * WEIGHTS[s], x - 0.5, y - 0.5, z - 0.5
+        part = area * WEIGHTS[s]
+        x, y, up = x - 0.5, y - 0.5, z - 0.5
         sums[4] += part * x * x
         sums[5] += part * y * y
         sums[SEEN + 8] += part * x * x * z
@@ -188,15 +201,14 @@ def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> N
 
 
 def sampled_inside(surface: Surface, grid: Grid, cells: Indices) -> tuple[Rows, Rows]:
-    """Return shares and squares of cells (c, 3) as ``Columns.inside``, by samples."""
+    """Return fills and second moments of cells (c, 3), as ``Columns.inside`` does, from samples."""
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    along = np.stack([1 - at, at]) / SAMPLES  # the two linear functions of an axis
+    # the two linear functions of an axis at the samples
+    along = np.stack([1 - at, at]) / SAMPLES
     middles = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
-    shares, squares, step = (
-        np.empty((len(cells), 2, 2, 2)),
-        np.empty((len(cells), 3)),
-        max(1, CHUNK // len(middles)),
-    )
+    shares = np.empty((len(cells), 2, 2, 2))
+    squares = np.empty((len(cells), 3))
+    step = max(1, CHUNK // len(middles))
     for start in range(0, len(cells), step):
         points = grid.node_positions(cells[start : start + step, None, :] + middles).reshape(-1, 3)
         inside = is_inside(surface, points).reshape(-1, SAMPLES, SAMPLES, SAMPLES)

@@ -1,6 +1,6 @@
-"""Uniform grid of a body (paper section 4.1), and the Morton order of its cells and nodes.
+"""Number the cells and nodes of uniform grids (paper section 4.1), a grid for each body.
 
-In Morton order, cells and nodes near in space are near in number, so a contiguous range of keys is compact.
+In Morton order, cells and nodes near in space have near numbers: a range of keys is compact.
 """
 
 from collections.abc import Sequence
@@ -13,17 +13,25 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.errors import InputError
 
-LIMIT = 1 << 21  # cells along an axis: three times 21 bits fill 63 of a key
+# cells along an axis [-]; three indices of 21 bits fill 63 bits of a key
+LIMIT = 1 << 21
 PACK = np.array([LIMIT**2, LIMIT, 1])
-CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
-# share of the longest side, at most 1e-3 cells, within which a coordinate lies in a plane of the grid: of meshes in
-# single precision, or of six digits
-SAME, MOST_SAME = 1e-6, 1e-3
+# triangles or cells in a batch [-]; bounds the memory of a pass
+CHUNK = 1 << 17
+# distance at which a coordinate is moved onto a grid plane, relative to the longest
+# side [-]; above the rounding of meshes in single precision
+SAME = 1e-6
+# upper limit of this distance [cells]; far below a cell
+MOST_SAME = 1e-3
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubes of side ``cell_size`` [m] from ``origin`` (3,) [m]; ``shape`` (3,) of them cover the body."""
+    """A grid of cubes from ``origin`` (3,) [m] that covers a body.
+
+    cell_size : side of a cell [m]
+    shape     : (3,) number of cells along each axis
+    """
 
     origin: Floats
     cell_size: float
@@ -33,24 +41,24 @@ class Grid:
     def covering(cls, bounds: Rows, cell_size: float) -> "Grid":
         """Return the grid that starts at the low corner of ``bounds`` (2, 3) [m].
 
-        Raises InputError for a cell size too small to number the cells along an axis.
+        Raises InputError if the cell size is too small to number the cells along an axis.
         """
         length = (bounds[1] - bounds[0]) / cell_size
         cells = np.ceil(length - min(SAME * length.max(), MOST_SAME))
         if not cells.max() < LIMIT - 1:
             raise InputError(
-                f"cages.cell_size: {cell_size:g} m would cut the body into {cells.max():.3g} cells along one side, "
-                f"more than {LIMIT - 2}"
+                f"cages.cell_size: {cell_size:g} m would cut the body into {cells.max():.3g} cells "
+                f"along one side, more than {LIMIT - 2}"
             )
         return cls(bounds[0].copy(), float(cell_size), np.maximum(cells, 1).astype(np.int64))
 
     def to_cells(self, points: Positions) -> Rows:
-        """Return points (..., 3) [m] in units of cells, kept within the grid: its last cells own its far faces."""
+        """Return points (..., 3) [m] in cell units; the grid's last cells own its far faces."""
         inside = np.nextafter(self.shape.astype(float), 0)
         at = (points - self.origin) / self.cell_size
         plane = np.rint(at)
-        same = np.abs(at - plane) <= min(SAME * self.shape.max(), MOST_SAME)
-        return np.clip(np.where(same, plane, at), 0, inside)
+        is_on_plane = np.abs(at - plane) <= min(SAME * self.shape.max(), MOST_SAME)
+        return np.clip(np.where(is_on_plane, plane, at), 0, inside)
 
     def node_positions(self, ijk: Array) -> Positions:
         """Return the positions [m] of grid nodes (..., 3)."""
@@ -59,26 +67,27 @@ class Grid:
 
 @dataclass(frozen=True)
 class BodyGrids:
-    """Grids of bodies, of one cell size, numbered as one grid: each is moved along the first axis.
+    """Grids of several bodies with a common cell size, numbered as a single grid.
 
-    So no two bodies have a cell or a node in common, wherever they are. A body has ``room`` cells, a power of two and
-    more than twice what any body takes along any axis: along the Morton curve one body follows the other, each in the
-    order that it has alone, and a coarser grid's cell is one body's until it is as large as a body.
+    Body b's grid is shifted by b ``room`` cells along the first axis, so no two bodies share a cell
+    or a node. ``room`` is a power of two and more than twice the longest side of any body. Hence
+    along the Morton curve body follows body, each in its own order. A cell of a coarser grid
+    belongs to a single body until it is as large as a body.
     """
 
     grids: tuple[Grid, ...]
 
     @classmethod
     def covering(cls, bounds: Sequence[Rows], cell_size: float) -> "BodyGrids":
-        """Return the grids of bodies in these bounding boxes (2, 3) [m].
+        """Return the grids of bodies with the bounding boxes ``bounds``, (2, 3) [m] each.
 
-        Raises InputError for a cell size too small to number the cells.
+        Raises InputError if the cell size is too small to number the cells.
         """
         grids = cls(tuple(Grid.covering(box, cell_size) for box in bounds))
         if grids.room * len(bounds) > LIMIT:
             raise InputError(
-                f"cages.cell_size: {cell_size:g} m is too small to number the cells of {len(bounds)} bodies: "
-                f"at most {LIMIT // len(bounds) // 4} along a side are sure to do"
+                f"cages.cell_size: {cell_size:g} m is too small to number the cells of "
+                f"{len(bounds)} bodies: use at most {LIMIT // len(bounds) // 4} cells along a side"
             )
         return grids
 
@@ -89,7 +98,7 @@ class BodyGrids:
 
     @cached_property
     def room(self) -> int:
-        """Cells along the first axis that are each body's own; 0 for a single body, which needs no bounds."""
+        """Cells reserved for each body along the first axis; 0, no limit, for a single body."""
         longest = max(int(grid.shape.max()) for grid in self.grids)
         return 2 << longest.bit_length() if len(self.grids) > 1 else 0
 
@@ -103,29 +112,27 @@ class BodyGrids:
         return first
 
     def body_of(self, ijk: Indices) -> Indices:
-        """Return the number (...,) of the body that grid indices (..., 3) are of."""
-        return (
-            (ijk[..., 0] // self.room).astype(np.int64)
-            if self.room
-            else np.zeros(ijk.shape[:-1], np.int64)
-        )
+        """Return the body number (...,) of grid indices (..., 3)."""
+        if not self.room:
+            return np.zeros(ijk.shape[:-1], np.int64)
+        body: Indices = (ijk[..., 0] // self.room).astype(np.int64)
+        return body
 
     def node_positions(self, ijk: Array) -> Positions:
-        """Return the positions [m] of grid nodes (..., 3), or of what lies between nodes."""
+        """Return the positions [m] of grid nodes (..., 3), or of points between nodes."""
         body = self.body_of(ijk)
         return self._origins[body] + (ijk - self.first(body)) * self.cell_size
 
     def nearest_nodes(self, points: Positions, body: Indices) -> Indices:
-        """Return the grid index (..., 3) of the nodes of bodies (...,) nearest to points (..., 3) [m]."""
-        nodes: Indices = np.rint((points - self._origins[body]) / self.cell_size).astype(
-            np.int64
-        ) + self.first(body)
+        """Return the grid indices (..., 3) of the bodies' nodes nearest to points (..., 3) [m]."""
+        cells = np.rint((points - self._origins[body]) / self.cell_size)
+        nodes: Indices = cells.astype(np.int64) + self.first(body)
         return nodes
 
 
 @njit()
 def _spread(x: int) -> int:
-    """Return the bits of x with two zeros between each two."""
+    """Return the bits of x with two zero bits between neighbours."""
     x &= 0x1FFFFF
     x = (x | x << 32) & 0x1F00000000FFFF
     x = (x | x << 16) & 0x1F0000FF0000FF
@@ -147,6 +154,7 @@ def _gather(x: int) -> int:
 
 @njit()
 def _encode(ijk: Indices, keys: Indices) -> None:
+    """Set the Morton keys (n,) of grid indices (n, 3); -1 for an index outside 0..LIMIT - 1."""
     for n in range(len(ijk)):
         keys[n] = -1
         if 0 <= ijk[n, 0] < LIMIT and 0 <= ijk[n, 1] < LIMIT and 0 <= ijk[n, 2] < LIMIT:
@@ -155,16 +163,15 @@ def _encode(ijk: Indices, keys: Indices) -> None:
 
 @njit()
 def _decode(keys: Indices, ijk: Indices) -> None:
+    """Set the grid indices (n, 3) of Morton keys (n,)."""
     for n in range(len(keys)):
-        ijk[n, 0], ijk[n, 1], ijk[n, 2] = (
-            _gather(keys[n]),
-            _gather(keys[n] >> 1),
-            _gather(keys[n] >> 2),
-        )
+        ijk[n, 0] = _gather(keys[n])
+        ijk[n, 1] = _gather(keys[n] >> 1)
+        ijk[n, 2] = _gather(keys[n] >> 2)
 
 
 def packed(ijk: Indices) -> Indices:
-    """Return one key (n,) for each grid index (n, 3), which sorts as (i, j, k) does."""
+    """Return a key (n,) for each grid index (n, 3); keys sort as (i, j, k) does."""
     keys: Indices = ijk @ PACK
     return keys
 
@@ -175,7 +182,7 @@ def unpacked(keys: Indices) -> Indices:
 
 
 def encode_morton(ijk: Indices) -> Indices:
-    """Return the Morton key of each grid index, (..., 3) int -> (...,) int64; -1 outside 0..LIMIT - 1."""
+    """Return the Morton key (...,) of each grid index (..., 3); -1 outside 0..LIMIT - 1."""
     rows = np.ascontiguousarray(ijk, np.int64).reshape(-1, 3)
     keys = np.empty(len(rows), np.int64)
     _encode(rows, keys)
@@ -183,7 +190,7 @@ def encode_morton(ijk: Indices) -> Indices:
 
 
 def decode_morton(keys: Indices) -> Indices:
-    """Return the grid index of each Morton key, (...,) int64 -> (..., 3) int64."""
+    """Return the grid index (..., 3) of each Morton key (...,)."""
     flat = np.ascontiguousarray(keys, np.int64).reshape(-1)
     ijk = np.empty((len(flat), 3), np.int64)
     _decode(flat, ijk)

@@ -1,6 +1,6 @@
-"""Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands.
+"""Prepare a surface: run named steps that repair, reduce, join or turn it, then scale and place it.
 
-The same step of the same mesh makes the same mesh: of a large one, that takes seconds to repair, it is kept on disk.
+A step is deterministic, so the results for large meshes are cached on disk.
 """
 
 import hashlib
@@ -36,16 +36,19 @@ from msmpetsc.geometry.surface import (
 if TYPE_CHECKING:
     import manifold3d
 
-# A repair that keeps less than this of the area did not mend the body but lost it: of
-# overlapping parts or double-walled tubes MeshFix keeps a few per cent.
+# share of the area below which a repair has failed [-]; MeshFix keeps a few per cent of
+# overlapping parts or double-walled tubes
 LEAST_AREA_KEPT = 0.5
-# share of the area that a repair may change without a word
-RETOUCHED = 0.01
-# share of the mean thickness 2 V / A within which a surface counts as unchanged
-NEAR = 0.01
-FARTHEST = 1e12  # in the file's own unit
-LARGE = 20_000  # triangles
-MOST_FILES = 32  # of some megabytes each; the oldest go first
+# share of the area that a repair may change without a warning [-]; too little to see
+MOST_CHANGED = 0.01
+# distance within which a surface is unchanged, in mean thicknesses 2 V / A [-]
+UNCHANGED_DISTANCE = 0.01
+# largest coordinate that is repaired [file's unit]; MeshFix crashes on larger values
+LARGEST_COORDINATE = 1e12
+# least number of triangles for caching a step [-]; steps on smaller meshes are fast
+LEAST_CACHED = 20_000
+# files in the cache [-]; some megabytes each
+MOST_FILES = 32
 Step = Callable[..., Surface]
 LIBRARIES = ("fast-simplification", "manifold3d", "pymeshfix")
 
@@ -56,11 +59,11 @@ def prepare(
     size: float | None = None,
     base: Sequence[float] | None = None,
 ) -> Surface:
-    """Return the surface after the steps, then scaled, then moved, with its groups where they lie.
+    """Return the surface after the steps, scaled and then moved, its groups with it.
 
-    steps : each the name of a step, or {name: value} for one that takes a value (see STEPS)
-    size  : longest side of the bounding box [m]; scaled about the origin
-    base  : (3,) where the middle of the bounding box's bottom face stands [m]
+    steps : each the name of a step, or {name: value} for a step that takes a value (see STEPS)
+    size  : longest side of the bounding box [m]; the surface is scaled about the origin
+    base  : (3,) target of the middle of the bounding box's bottom face [m]
 
     Raises InputError naming the step that failed.
     """
@@ -76,18 +79,18 @@ def prepare(
     if base is not None:
         low, high = bounds_of(compact(surface.points, surface.triangles))
         foot = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
-        way = np.asarray(base, float) - foot
-        surface = surface.moved(lambda points: points + way)
+        shift = np.asarray(base, float) - foot
+        surface = surface.moved(lambda points: points + shift)
     return surface
 
 
 def merge(surface: Surface) -> Surface:
-    """Merge points of equal position; drop degenerate triangles and unused points."""
+    """Merge points of equal position, and drop degenerate triangles and unused points."""
     return compact(surface.points, merged_triangles(surface))
 
 
 def largest_part(surface: Surface) -> Surface:
-    """Keep the connected part of the largest area."""
+    """Return the connected part of the largest area."""
     import igl
 
     labels = part_labels(surface)
@@ -96,7 +99,7 @@ def largest_part(surface: Surface) -> Surface:
 
 
 def about_middle(step: Step) -> Step:
-    """Return a step that sees the surface about the middle of its box, where numbers round least."""
+    """Return a step with the bounding box's middle as its origin, where coordinates round least."""
 
     @wraps(step)
     def centred(surface: Surface, *values: Any) -> Surface:
@@ -109,10 +112,17 @@ def about_middle(step: Step) -> Step:
 
 @about_middle
 def union(surface: Surface) -> Surface:
-    """Join the closed parts into one solid. Each counts as solid, so a cavity is filled."""
-    import manifold3d  # of the extra "mesh"
+    """Join the closed parts into a single solid.
 
-    surface, solids = merge(surface), []
+    Each part counts as solid, so a cavity is filled.
+
+    Raises InputError if a part is not closed, or not wound consistently.
+    """
+    # from the extra "mesh"
+    import manifold3d
+
+    surface = merge(surface)
+    solids = []
     labels = part_labels(surface)
     for number in range(labels.max() + 1):
         part = compact(surface.points, surface.triangles[labels == number])
@@ -122,18 +132,15 @@ def union(surface: Surface) -> Surface:
         if solid is None:
             raise InputError(
                 f"part {number} is no closed, consistently wound surface "
-                f"({report.boundary_edges} boundary edges, {report.nonmanifold_edges} with more than "
-                f"two triangles, {report.inconsistent_edges} inconsistent)"
+                f"({report.boundary_edges} boundary edges, {report.nonmanifold_edges} with more "
+                f"than two triangles, {report.inconsistent_edges} inconsistent)"
             )
         solids.append(solid)
     return surface_of(manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add))
 
 
 def solid_of(surface: Surface) -> "manifold3d.Manifold | None":
-    """Return what a surface encloses as a solid of manifold3d, of the extra "mesh".
-
-    None stands for a surface that is not closed, or not wound consistently.
-    """
+    """Return a surface as a solid of manifold3d; None if it is open or wound inconsistently."""
     import manifold3d
 
     triangles = np.ascontiguousarray(surface.triangles, np.uint64)
@@ -149,12 +156,16 @@ def surface_of(solid: "manifold3d.Manifold") -> Surface:
 
 @about_middle
 def repair(surface: Surface) -> Surface:
-    """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
-    import pymeshfix  # of the extra "repair"
+    """Close holes and remove self-intersections (pymeshfix, GPL-3, optional).
+
+    Raises InputError if most of the surface is lost or a hole stays open.
+    """
+    # from the extra "repair"
+    import pymeshfix
 
     surface = merge(surface)
-    if np.abs(surface.points).max() > FARTHEST:  # numbers much larger crash it
-        raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
+    if np.abs(surface.points).max() > LARGEST_COORDINATE:
+        raise InputError(f"coordinates beyond {LARGEST_COORDINATE:g} cannot be repaired")
     fix = pymeshfix.MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
@@ -173,52 +184,59 @@ def repair(surface: Surface) -> Surface:
 
 
 def _warn_of_change(before: Surface, after: Surface) -> None:
-    """Warn if a repair has taken away, or has added, more of the surface than RETOUCHED."""
+    """Warn if a repair has removed, or has added, more than MOST_CHANGED of the surface's area."""
     report = examine(after)
-    near = NEAR * 2 * abs(report.volume) / report.area
-    gone, new = _share_beyond(before, after, near), _share_beyond(after, before, near)
-    if max(gone, new) > RETOUCHED:
+    near = UNCHANGED_DISTANCE * 2 * abs(report.volume) / report.area
+    removed = _share_farther_than(before, after, near)
+    added = _share_farther_than(after, before, near)
+    if max(removed, added) > MOST_CHANGED:
         log.warning(
-            "prepare: 'repair' took %.0f%% of the surface's area away, and %.0f%% of the area is new: "
-            "msmpetsc render draws the scene",
-            100 * gone, 100 * new,
-        )  # fmt: skip
+            "prepare: 'repair' took %.0f%% of the surface's area away, and %.0f%% of the area is "
+            "new: msmpetsc render draws the scene",
+            100 * removed,
+            100 * added,
+        )
 
 
-def _share_beyond(surface: Surface, other: Surface, distance: float) -> float:
-    """Return the share of a surface's area that lies farther than a distance from another surface."""
+def _share_farther_than(surface: Surface, reference: Surface, distance: float) -> float:
+    """Return the share of a surface's area farther than ``distance`` from a reference surface."""
     import igl
 
     middles = surface.points[surface.triangles].mean(axis=1)
     areas = igl.doublearea(surface.points, surface.triangles)
-    squares = igl.point_mesh_squared_distance(middles, other.points, other.triangles)[0]
+    squares = igl.point_mesh_squared_distance(middles, reference.points, reference.triangles)[0]
     return float(areas[squares > distance**2].sum() / areas.sum())
 
 
 @about_middle
-def simplify(surface: Surface, faces: int, haste: int = 7) -> Surface:
-    """Reduce to about this many triangles (quadric decimation); a closed surface stays closed.
+def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
+    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed.
 
-    haste : of fast_simplification, which with less goes on to larger errors more slowly, and ends nearer to the surface
+    aggressiveness : of fast_simplification; less is slower and stays closer to the surface
     """
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
-    import fast_simplification  # of the extra "mesh"
+    # from the extra "mesh"
+    import fast_simplification
 
     points, triangles = fast_simplification.simplify(
-        surface.points, surface.triangles, target_count=int(faces), agg=haste
+        surface.points, surface.triangles, target_count=int(faces), agg=aggressiveness
     )
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     used, _ = edge_use(merged_triangles(reduced))
     if len(triangles) and examine(surface).closed and (used != 2).any():
-        return repair(reduced)  # collapsing edges can pinch thin places
+        # an edge collapse can pinch thin places
+        return repair(reduced)
     return reduced
 
 
 @about_middle
 def refine(surface: Surface, share: float) -> Surface:
-    """Split the edges of a closed surface that are longer than this share of its longest side."""
+    """Split the edges of a closed surface that are longer than ``share`` of its longest side.
+
+    Raises InputError if the surface is not closed, or not wound consistently.
+    """
     surface = merge(surface)
     low, high = bounds_of(surface)
     solid = solid_of(surface)
@@ -228,10 +246,12 @@ def refine(surface: Surface, share: float) -> Surface:
 
 
 def orient(surface: Surface) -> Surface:
-    """Wind the triangles consistently, and each patch outwards, or inwards if it bounds a cavity.
+    """Wind triangles consistently and patches outwards, or inwards if a patch bounds a cavity.
 
-    A patch hangs together by edges of exactly two triangles. It bounds a cavity if it lies in an
-    odd number of other patches. An open patch looks away from its own middle with most of its area.
+    A patch is connected by edges of exactly two triangles. It bounds a cavity if it lies in an odd
+    number of other patches. An open patch is turned so that most of its area faces outwards.
+
+    Raises InputError if the surface has a single side.
     """
     import igl
 
@@ -249,7 +269,7 @@ def orient(surface: Surface) -> Surface:
 
 
 def _depths(surface: Surface, patch: Indices) -> Indices:
-    """Return in how many other patches (p,) each patch of triangles (f,) lies."""
+    """Return the number (p,) of patches around each patch of triangles (f,)."""
     order = np.argsort(patch, kind="stable")
     ends = np.flatnonzero(np.diff(patch[order])) + 1
     parts = [
@@ -260,16 +280,18 @@ def _depths(surface: Surface, patch: Indices) -> Indices:
     depths = np.zeros(len(parts), np.int64)
     for number, part in enumerate(parts):
         within = (low[number] < low).all(axis=1) & (high < high[number]).all(axis=1)
-        asked = within[patch]
-        if asked.any():
-            outside = np.bincount(patch[asked], ~is_inside(part, middles[asked]), len(parts))
+        candidates = within[patch]
+        if candidates.any():
+            is_outside = ~is_inside(part, middles[candidates])
+            outside = np.bincount(patch[candidates], is_outside, len(parts))
             depths += within & (outside == 0)
     return depths
 
 
 def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
-    """Turn about an axis through the origin: {"axis": [x, y, z], "degrees": d}."""
-    from scipy.spatial.transform import Rotation  # a slow import for what few scenes do
+    """Turn the surface about an axis through the origin: {"axis": [x, y, z], "degrees": d}."""
+    # imported here because it is slow and few scenes need it
+    from scipy.spatial.transform import Rotation
 
     axis = np.asarray(turn["axis"], float)
     rotation = Rotation.from_rotvec(np.deg2rad(turn["degrees"]) * axis / np.linalg.norm(axis))
@@ -283,32 +305,30 @@ STEPS: dict[str, Step] = {
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """Run a step, which leaves groups where they lie.
-
-    Raises InputError with the name of the step if it fails.
-    """
+    """Run a step and keep the groups. Raises InputError with the name of the step if it fails."""
     try:
         result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:
         raise InputError(f"prepare: '{name}': {error}") from error
-    except Exception as error:  # what the libraries below raise on odd meshes is not documented
+    # the libraries do not document their exceptions on bad meshes
+    except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (expected := as_expected(error)):
-            raise InputError(
-                f"prepare: '{name}': {expected}"
-            ) from error  # one line says which extra it needs
+            # a single line names the missing extra
+            raise InputError(f"prepare: '{name}': {expected}") from error
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():
         raise InputError(f"prepare: '{name}' left no usable mesh")
-    # here, as a result from the cache is told, too
+    # warn here, so that a result from the cache is reported too
     if name == repair.__name__:
         _warn_of_change(surface, result)
     return result if result.groups else replace(result, groups=surface.groups)
 
 
 def cached(step: Step, surface: Surface, *values: object) -> Surface:
-    """Return the result of a step; of a large mesh it is kept in a cache on disk."""
-    if len(surface.triangles) < LARGE or step is rotate:  # which moves groups, too
+    """Return the result of a step; cache it on disk if the mesh is large."""
+    # rotate moves groups, which the cache does not store
+    if len(surface.triangles) < LEAST_CACHED or step is rotate:
         return step(surface, *values)
     versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
     digest = hashlib.sha256(
@@ -316,24 +336,23 @@ def cached(step: Step, surface: Surface, *values: object) -> Surface:
     )
     digest.update(surface.points.tobytes() + surface.triangles.tobytes())
     path = Path(pooch.os_cache("msmpetsc"), "prepared", f"{digest.hexdigest()}.npz")
-    with (
-        suppress(OSError, ValueError, KeyError, EOFError, BadZipFile),
-        np.load(path) as arrays,
-    ):  # there, and whole
+    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile), np.load(path) as arrays:
         return Surface(arrays["points"], arrays["triangles"])
     result = step(surface, *values)
-    with suppress(OSError):  # a full disk, a home that cannot be written
+    # the disk may be full or the home read-only
+    with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f"{path.name}.{os.getpid()}.part.npz")
         np.savez(part, points=result.points, triangles=result.triangles)
-        part.replace(path)  # a process that reads meanwhile finds all or nothing
+        # renaming is atomic: a process reading meanwhile never sees half a file
+        part.replace(path)
         for old in sorted(path.parent.glob("*.npz"), key=os.path.getmtime)[:-MOST_FILES]:
             old.unlink(missing_ok=True)
     return result
 
 
 def part_labels(surface: Surface) -> Indices:
-    """Return the number (f,) of the connected part of each triangle; points of equal position connect."""
+    """Return the number (f,) of the connected part of each triangle; equal positions connect."""
     triangles = first_of_equal(surface.points)[surface.triangles]
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
     n = len(surface.points)

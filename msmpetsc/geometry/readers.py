@@ -1,4 +1,4 @@
-"""Reading of surface meshes from files, which may be damaged or hostile."""
+"""Read surface meshes from files, which may be damaged or hostile."""
 
 import resource
 import struct
@@ -24,35 +24,43 @@ from msmpetsc.geometry.cell_meshes import labels_of, read_cells
 from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.scene.reading import lies_below
 
-# points (v, 3), faces (f, 3 or 4) or a list of polygons, and by name these of groups
+# points (v, 3), faces (f, 3 or 4) or a list of polygons, and the faces of named groups
 Arrays = tuple[Array, Any, Mapping[str, Any]]
 
-COLOURS = ("red", "green", "blue", "alpha")  # of a PLY's faces
+# properties of a PLY's faces that are colours, not labels
+COLOURS = ("red", "green", "blue", "alpha")
 
-LEAST, MOST = 2**28, 50  # memory that reading a file may take: so many bytes, or times its own
+# memory that reading any file may take [byte]; the libraries' own memory is less
+LEAST_MEMORY = 2**28
+# memory that reading a file may take, in sizes of the file [-]; intact files need less
+MEMORY_FACTOR = 50
 
 
 def read_surface(path: str | Path) -> Surface:
     """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU, VTK, MSH, INP or BDF in the file's own unit.
 
-    Polygons are cut into triangles, the parts of a GLB are joined, and cells that have a volume
-    give their boundary. The surface has the groups that the file names.
+    Polygons are cut into triangles, the parts of a GLB are joined, and volume cells give their
+    boundary. The surface has the groups that the file names.
 
-    Raises InputError, one line naming the file, if it holds no usable mesh.
+    Raises InputError, a single line naming the file, if it holds no usable mesh.
     """
     path = Path(path)
-    kind, data = _kind(path), _content(path)
+    kind = _kind(path)
+    data = _content(path)
     try:
-        with _silence(), _bounded_memory(max(LEAST, MOST * len(data))):
+        with _silence(), _bounded_memory(max(LEAST_MEMORY, MEMORY_FACTOR * len(data))):
             points, polygons, named = _READERS[kind](path, data)
-            faces, groups = _cut(polygons), {name: _cut(own) for name, own in named.items()}
-    except ModuleNotFoundError:  # a reader's package: says which extra brings it
+            faces = _cut(polygons)
+            groups = {name: _cut(own) for name, own in named.items()}
+    # the message of a missing package names the extra that brings it
+    except ModuleNotFoundError:
         raise
     except MemoryError:
         raise InputError(
             f"{path}: reading it takes more memory than {kind.upper()} of its size can need"
         ) from None
-    except Exception as error:  # on garbage the readers raise whatever comes
+    # on damaged files the readers raise any exception
+    except Exception as error:
         reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
     _check_arrays(path, points, faces)
@@ -69,7 +77,7 @@ def _cut(polygons: Any) -> Indices:
 
 
 def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
-    """Raise InputError unless the arrays make a mesh."""
+    """Raise InputError unless points and triangles make a mesh."""
     if len(triangles) == 0:
         raise InputError(f"{path}: holds no triangles")
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
@@ -84,7 +92,7 @@ def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
 
 
 def _kind(path: Path) -> str:
-    """Return the format by the file's name; raise InputError if it is not one we read."""
+    """Return the format by a file's ending. Raises InputError if it is not read, or no file."""
     kind = path.suffix.lower().removeprefix(".")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is a folder, a pipe or a device, not a mesh file")
@@ -94,6 +102,7 @@ def _kind(path: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
+    """Return the bytes of a file. Raises InputError if it cannot be read or is empty."""
     try:
         data = path.read_bytes()
     except (OSError, MemoryError) as error:
@@ -106,7 +115,7 @@ def _content(path: Path) -> bytes:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Suppress what readers print or warn; half-read numbers are errors."""
+    """Suppress the output and the warnings of readers, but raise on half-read numbers."""
     with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", message="string or file could not be read")
@@ -115,12 +124,13 @@ def _silence() -> Iterator[None]:
 
 @contextmanager
 def _bounded_memory(most: int) -> Iterator[None]:
-    """Raise MemoryError where this process takes ``most`` [byte] more: files may claim or pack more than they hold."""
+    """Raise MemoryError if the process takes ``most`` [byte] more within the block.
+
+    A hostile file may claim, or pack, more than it holds.
+    """
     limits = resource.getrlimit(resource.RLIMIT_DATA)
-    bounds = [
-        psutil.Process().memory_info().data + most,
-        *(x for x in limits if x != resource.RLIM_INFINITY),
-    ]
+    bounds = [limit for limit in limits if limit != resource.RLIM_INFINITY]
+    bounds.append(psutil.Process().memory_info().data + most)
     resource.setrlimit(resource.RLIMIT_DATA, (min(bounds), limits[1]))
     try:
         yield
@@ -129,6 +139,7 @@ def _bounded_memory(most: int) -> Iterator[None]:
 
 
 def _read_ply(path: Path, data: bytes) -> Arrays:
+    """Read points, faces and labelled faces of a PLY."""
     try:
         mesh = trimesh.exchange.ply.load_ply(BytesIO(data), fix_texture=False, skip_materials=True)
     except ValueError as error:
@@ -136,7 +147,8 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
             raise
         return _read_mixed_ply(data)
     stored = mesh["metadata"]["_ply_raw"]
-    for name in ("vertex", "face"):  # a truncated ASCII file just has fewer rows
+    # trimesh accepts a truncated ASCII file with fewer rows
+    for name in ("vertex", "face"):
         rows = stored.get(name, {}).get("data", ())
         rows = next(iter(rows.values())) if isinstance(rows, dict) else rows
         if len(rows) != stored.get(name, {}).get("length", 0):
@@ -148,17 +160,18 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 
 def _labelled(faces: Array, data: Any) -> dict[str, Array]:
-    """Return the faces (f, k) of each label of a PLY: a whole number of faces that is no colour."""
+    """Return the faces (f, k) of each label in a PLY; integers that are no colours are labels."""
     names = data if isinstance(data, dict) else data.dtype.names
-    # of ASCII a column of one number a face is (f, 1)
+    # in an ASCII file such a column is (f, 1)
     columns = {name: np.ravel(data[name]) for name in names if name not in COLOURS}
-    whole = {name: each for name, each in columns.items() if each.shape == faces.shape[:1]}
-    return {name: faces[whole[key] == label] for key, label, name in labels_of(whole)}
+    of_faces = {name: each for name, each in columns.items() if each.shape == faces.shape[:1]}
+    return {name: faces[of_faces[key] == label] for key, label, name in labels_of(of_faces)}
 
 
 def _read_mixed_ply(data: bytes) -> Arrays:
-    """Read a binary PLY whose faces differ in number of corners, which trimesh does not read."""
-    import meshio  # a slow import for what few scenes name
+    """Read a binary PLY whose faces differ in number of corners, which trimesh cannot read."""
+    # imported here because it is slow and few scenes need it
+    import meshio
 
     mesh = meshio.ply.read(BytesIO(data))
     polygons = [face for block in mesh.cells for face in block.data]
@@ -168,8 +181,8 @@ def _read_mixed_ply(data: bytes) -> Arrays:
 def _read_obj(path: Path, data: bytes) -> Arrays:
     """Read points, polygons and groups of an OBJ.
 
-    A negative number counts back from the newest point.
-    trimesh and meshio take relative numbers as absolute and refuse tabs or comments at line ends.
+    A negative number counts back from the newest point. trimesh and meshio take it as an absolute
+    number, and refuse tabs or comments at line ends.
     """
     points: list[list[float]] = []
     polygons: list[list[int]] = []
@@ -182,7 +195,7 @@ def _read_obj(path: Path, data: bytes) -> Arrays:
             points.append([float(word) for word in words[:3]])
         elif key == "f":
             corners = [int(word.partition("/")[0]) for word in words]
-            # 0 is no point's number: it becomes -1, which is refused
+            # 0 is no valid number: it becomes -1, which ``_check_arrays`` refuses
             polygons.append([n - 1 if n >= 0 else len(points) + n for n in corners])
             for name in {*chain.from_iterable(current.values())}:
                 groups.setdefault(name, []).append(polygons[-1])
@@ -194,10 +207,10 @@ def _read_obj(path: Path, data: bytes) -> Arrays:
 
 
 class _FolderResolver(FilePathResolver):
-    """Reads the files that a glTF names: those in its folder or below it, links followed, and no others."""
+    """Read the files that a glTF names, but only in its folder or below, links followed."""
 
     def get(self, name: str) -> bytes:
-        """Return the content of a named file; ValueError if it is none that may be read."""
+        """Return the content of a named file. Raises ValueError if it may not be read."""
         path = Path(self.parent, name)
         if not lies_below(Path(self.parent), name) or not path.is_file():
             raise ValueError(f"it names {name}, which is no file in its folder")
@@ -205,6 +218,7 @@ class _FolderResolver(FilePathResolver):
 
 
 def _read_trimesh(path: Path, data: bytes) -> Arrays:
+    """Read points, triangles and named nodes by trimesh."""
     kind = _kind(path)
     scene = trimesh.load_scene(
         BytesIO(data),
@@ -216,18 +230,21 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
     )
     parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     first = starts(np.array([len(part.vertices) for part in parts], np.int64))
-    parents, groups = scene.graph.transforms.parents, defaultdict(list)
+    parents = scene.graph.transforms.parents
+    groups = defaultdict(list)
     for part, start in zip(parts, first, strict=True):
+        # a part belongs to its node and to all parent nodes, which may form a cycle
         node, left = part.metadata["node"], len(parents)
-        while node not in (None, scene.graph.base_frame) and left >= 0:  # its parents have it, too
-            if not node.startswith("geometry_"):  # trimesh's name of a part without a name
+        while node not in (None, scene.graph.base_frame) and left >= 0:
+            # trimesh names a part without a name "geometry_..."
+            if not node.startswith("geometry_"):
                 groups[node].append(part.faces + start)
             node, left = parents.get(node), left - 1
     points, faces = (
         [np.zeros((0, 3)), *(getattr(part, name) for part in parts)]
         for name in ("vertices", "faces")
     )
-    triangles = [own + start for own, start in zip(faces[1:], first, strict=True)]
+    triangles = [of_part + start for of_part, start in zip(faces[1:], first, strict=True)]
     return (
         np.concatenate(points),
         np.concatenate([faces[0], *triangles]),
@@ -236,9 +253,10 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
 
 
 def _read_mz3(path: Path, data: bytes) -> Arrays:
-    """Read the mz3 of Surf Ice: 16 bytes of header, int32 triangles, float32 points."""
+    """Read an mz3 of Surf Ice: 16 bytes of header, int32 triangles, float32 points."""
     magic, content, faces, points, skip = struct.unpack_from("<HHIII", data)
-    if magic != 0x5A4D or content & 3 != 3:  # bits 0 and 1: has triangles, has points
+    # bits 0 and 1: the file has triangles, has points
+    if magic != 0x5A4D or content & 3 != 3:
         raise ValueError("no mz3 header with triangles and points")
     start = 16 + skip
     triangles = np.frombuffer(data, "<i4", 3 * faces, start)

@@ -1,10 +1,11 @@
-"""Named meshes: their sources and licences (registry.toml), and their files on this machine.
+"""Find named meshes: their sources and licences (registry.toml), and their files on this machine.
 
-A name gives the same body wherever it is found: a converted copy in $MSMPETSC_MESH_DIR is taken
-as it is, or the same file inside an installed package; an original that was fetched goes through the model's own
-steps first. All are checked by SHA-256 and give single precision. The numbering of points
-is the same too, but for lung, whose copy another tool put in order. Only dragon's
-copy was reduced by another decimator: there the same shape has as many, but other triangles.
+A name gives the same body from each source. A converted copy, in $MSMPETSC_MESH_DIR or in an
+installed package, is taken as it is. A fetched original goes through the model's own steps first.
+All files are checked by SHA-256, and all give single precision.
+
+The points have the same numbers too, except in lung, whose copy was reordered. The fetched dragon
+has the same shape and number of triangles as its copy, but another decimator made the copy.
 """
 
 import os
@@ -30,10 +31,10 @@ MESH_DIR = "MSMPETSC_MESH_DIR"
 class NamedMesh:
     """A mesh that has a name.
 
-    copy, copy_sha256 : file in $MSMPETSC_MESH_DIR that holds it, converted
-    downloads         : the original's files, by their addresses the SHA-256; the mesh is read from the first
-    packaged          : the copy itself inside a Python package, whose name the path starts with
-    steps             : prepare steps that make of the original what the copy holds
+    copy, copy_sha256 : file name and SHA-256 of the converted copy in $MSMPETSC_MESH_DIR
+    downloads         : SHA-256 of the original's files by address; the first holds the mesh
+    packaged          : path of the copy inside a Python package, the package's name first
+    steps             : prepare steps that turn the original into the copy
     """
 
     copy: str
@@ -46,7 +47,7 @@ class NamedMesh:
 
 
 class MeshFile(NamedTuple):
-    """A file that holds a model, and the steps it still needs."""
+    """A file that holds a named mesh, the steps it still needs, and where it was found."""
 
     path: Path
     steps: tuple[str | dict[str, Any], ...]
@@ -56,13 +57,15 @@ class MeshFile(NamedTuple):
 def locate(source: str, folder: str | Path) -> Path:
     """Return the mesh file of a registry name, or of a path relative to ``folder``.
 
-    A name is looked for in $MSMPETSC_MESH_DIR, then among the fetched files, then in installed
-    packages. Raises InputError if the mesh is not here or is not what the registry knows.
+    A name is looked up in $MSMPETSC_MESH_DIR, in the fetched files, then in installed packages.
+
+    Raises InputError if the mesh is not on this machine, or differs from the registry's.
     """
     if source in MODELS:
         return _require(source).path
     path = Path(folder) / source
-    if not os.path.exists(path):  # which a name too long does not raise in
+    # os.path.exists does not raise for a name that is too long
+    if not os.path.exists(path):
         raise InputError(
             f"mesh '{source}' is no model and no file: {path}{did_you_mean(source, MODELS)}"
         )
@@ -70,25 +73,28 @@ def locate(source: str, folder: str | Path) -> Path:
 
 
 def load(source: str, folder: str | Path) -> Surface:
-    """Return the surface of a name or a path; of a name the original after the model's steps."""
-    from msmpetsc.geometry.readers import (
-        read_surface,
-    )  # and trimesh: a third of a second for the one rank that reads
+    """Return the surface of a registry name or a path, after the model's own steps."""
+    # imports trimesh: a third of a second, which only the reading rank shall pay
+    from msmpetsc.geometry.readers import read_surface
 
     if source not in MODELS:
         return read_surface(locate(source, folder))
     file = _require(source)
     surface = prepare(read_surface(file.path), file.steps)
-    # the copies hold single precision, some originals more
+    # copies hold single precision, some originals double
     return Surface(surface.points.astype(np.float32).astype(np.float64), surface.triangles)
 
 
 def find(name: str) -> MeshFile | None:
-    """Return where a named mesh lies on this machine, or None."""
+    """Return the file of a named mesh on this machine, or None.
+
+    Raises InputError if a file differs from the registry's.
+    """
     model = MODELS[name]
     if os.environ.get(MESH_DIR):
         copy = Path(os.environ[MESH_DIR]) / model.copy
-        if os.path.isfile(copy):  # which a name too long does not raise in
+        # os.path.isfile does not raise for a name that is too long
+        if os.path.isfile(copy):
             return MeshFile(_checked(name, copy, model.copy_sha256), (), f"${MESH_DIR}")
     originals = _originals(name)
     fetched = {Path(originals.path, file): sha256 for file, sha256 in originals.registry.items()}
@@ -96,21 +102,23 @@ def find(name: str) -> MeshFile | None:
         first, *_ = (_checked(name, path, sha256) for path, sha256 in fetched.items())
         return MeshFile(first, model.steps, "fetched")
     package, _, path = model.packaged.partition("/")
-    spec = find_spec(package) if package else None  # without importing any of its code
+    # this does not import the package's code
+    spec = find_spec(package) if package else None
     for folder in (spec and spec.submodule_search_locations) or ():
         file = os.path.join(folder, path)
-        if (
-            os.path.isfile(file) and pooch.file_hash(file) == model.copy_sha256
-        ):  # other versions ship others
+        # another version of the package may ship another file
+        if os.path.isfile(file) and pooch.file_hash(file) == model.copy_sha256:
             return MeshFile(Path(file), (), f"package {package}")
     return None
 
 
 def fetch(name: str, progress: bool = False) -> Path:
-    """Download a model's original into the cache, or find it where it is; return its path.
+    """Download a model's original into the cache and return its path.
 
-    Raises InputError for an unknown name, a model that has no download, a failed connection,
-    or a file that is not the one the registry knows.
+    A model that comes with a package is not downloaded.
+
+    Raises InputError for an unknown name, a model without a download, a failed connection, or a
+    file that differs from the registry's.
     """
     if name not in MODELS:
         raise InputError(
@@ -123,10 +131,12 @@ def fetch(name: str, progress: bool = False) -> Path:
     for file, url in originals.urls.items():
         try:
             originals.fetch(file, progressbar=progress)
-        except ValueError as error:  # what pooch raises if the hash differs
+        # pooch raises ValueError if the hash differs
+        except ValueError as error:
             differs = "is not the file the registry knows (its SHA-256 differs)"
             raise InputError(f"mesh '{name}': {url} {differs}") from error
-        except OSError as error:  # no connection (requests' errors are OSErrors), disk full
+        # requests' errors are OSErrors, as is a full disk
+        except OSError as error:
             status = getattr(getattr(error, "response", None), "status_code", None)
             reason = f"HTTP status {status}" if status else type(error).__name__
             raise InputError(f"mesh '{name}': cannot fetch {url} ({reason})") from error
@@ -134,7 +144,7 @@ def fetch(name: str, progress: bool = False) -> Path:
 
 
 def _require(name: str) -> MeshFile:
-    """Return where a named mesh lies; raise InputError saying how to get it if it is not on this machine."""
+    """Return the file of a named mesh. Raises InputError, with the remedy, if it is missing."""
     if file := find(name):
         return file
     package, _, _ = MODELS[name].packaged.partition("/")
@@ -146,15 +156,17 @@ def _require(name: str) -> MeshFile:
 
 
 def _checked(name: str, path: Path, sha256: str) -> Path:
+    """Return the path of a file. Raises InputError if its SHA-256 differs from the registry's."""
     if pooch.file_hash(str(path)) != sha256:
         raise InputError(
-            f"{path}: not the '{name}' that the registry knows (its SHA-256 differs); remove it, or name it by its path"
+            f"{path}: not the '{name}' that the registry knows (its SHA-256 differs); "
+            "remove it, or name it by its path"
         )
     return path
 
 
 def _originals(name: str) -> pooch.Pooch:
-    """Return the cache of a mesh's original files. (The copies' folder has other files: it is no such cache.)"""
+    """Return the cache of a mesh's original files."""
     files = {
         url.rsplit("/", 1)[-1]: (url, sha256) for url, sha256 in MODELS[name].downloads.items()
     }

@@ -1,4 +1,4 @@
-"""Surface meshes: measured, and checked to enclose a volume."""
+"""Measure surface meshes, and check that they enclose a volume."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,8 +9,8 @@ from msmpetsc.backend.arrays import Array, Indices, Mask, Positions, Rows
 from msmpetsc.comm import starts
 from msmpetsc.errors import InputError
 
-# Coordinates are often stored in single precision (1.2e-7): thinner than this, relative to its
-# longest side, a body cannot be told from a flat sheet. A plate of 1:1000 lies far above.
+# thickness below which a body is flat, relative to its longest side [-]; ten times the
+# rounding of coordinates in single precision
 FLAT = 1e-6
 
 
@@ -20,7 +20,7 @@ class Surface:
 
     points    : (v, 3) float64 [m]
     triangles : (f, 3) int64, corners of each triangle as rows of ``points``
-    groups    : by the names that a file gives them, surfaces that mark parts of the body
+    groups    : surfaces that mark parts of the body, by the names that the file gives them
     """
 
     points: Positions
@@ -34,7 +34,7 @@ class Surface:
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface | None:
-    """Return surfaces as one, one after the other; None for none."""
+    """Return several surfaces as a single surface, in order; None for an empty list."""
     if len(surfaces) < 2:
         return next(iter(surfaces), None)
     first = starts(np.array([len(surface.points) for surface in surfaces]))
@@ -47,13 +47,13 @@ def joined(surfaces: Sequence[Surface]) -> Surface | None:
 
 
 def compact(points: Positions, triangles: Indices) -> Surface:
-    """Return the surface of these triangles and only their points, in the order they had."""
+    """Return the surface of these triangles and only their points, in the given order."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return Surface(points[used], numbers.reshape(-1, 3))
 
 
 def outward(surface: Surface) -> Rows:
-    """Return the unit normals (v, 3) at the points of a closed surface, outward whichever way it is wound."""
+    """Return the outward unit normals (v, 3) at the points of a closed surface of any winding."""
     a, b, c = surface.points[surface.triangles].transpose(1, 0, 2) - surface.points.mean(axis=0)
     areas = np.cross(b - a, c - a)
     normals = np.zeros_like(surface.points)
@@ -74,29 +74,33 @@ def bounds_of(surface: Surface) -> Rows:
 class SurfaceReport:
     """Measures of a surface, and counts of its faults.
 
-    Edges are counted after merging points of equal position (so the loose triangles of an STL
-    may be closed) and dropping the triangles that this leaves with two equal corners.
+    Edges are counted after merging points of equal position, so the loose triangles of an STL may
+    be closed. Triangles that this leaves with two equal corners are dropped.
 
-    nonmanifold_edges    : edges of more than two triangles
-    inconsistent_edges   : edges whose two triangles run along them in the same direction
+    volume : [m^3], negative if wound inwards; not meaningful if the surface is open
+    area   : [m^2]
+    nonmanifold_edges  : edges of more than two triangles
+    inconsistent_edges : edges along which two triangles run in the same direction
     """
 
-    volume: float  # [m^3], signed: negative if wound inwards; of little meaning if open
-    area: float  # [m^2]
+    volume: float
+    area: float
     boundary_edges: int
     nonmanifold_edges: int
     inconsistent_edges: int
 
     @property
     def closed(self) -> bool:
-        """Whether no edge belongs to one triangle only."""
+        """Whether no edge belongs to a single triangle only."""
         return self.boundary_edges == 0
 
 
 def examine(surface: Surface) -> SurfaceReport:
-    """Measure volume, area and edges of a surface."""
-    corners = surface.points[surface.triangles]  # (f, 3 corners, 3)
-    corners = corners - surface.points[surface.triangles[0, 0]]  # small numbers round less
+    """Return volume, area and edge counts of a surface."""
+    # (f, 3 corners, 3)
+    corners = surface.points[surface.triangles]
+    # relative to a point of the surface, because small numbers round less
+    corners = corners - surface.points[surface.triangles[0, 0]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     used, forward = edge_use(merged_triangles(surface))
     return SurfaceReport(
@@ -109,10 +113,10 @@ def examine(surface: Surface) -> SurfaceReport:
 
 
 def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
-    """Return a line for each doubt about a surface's inside, with its remedy; none for a clean one.
+    """Return a line for each doubt about a surface's inside, with its remedy.
 
-    Flatness is measured along the principal axes, so that a tilted sheet is seen too. A closed
-    surface is judged by its mean thickness, 2 |volume| / area, relative to its longest side.
+    Flatness is measured along the principal axes, so that a tilted sheet is found too. For a closed
+    surface the criterion is its mean thickness, 2 |volume| / area, relative to its longest side.
 
     Raises InputError if the surface encloses no volume.
     """
@@ -128,25 +132,26 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
             'against each other (for the latter: prepare = ["orient"])'
         )
     doubts = {
-        f"the mesh is open ({report.boundary_edges} boundary edges): the generalized winding number will decide what "
-        'is inside; prepare = ["repair"] closes holes': report.boundary_edges,
+        f"the mesh is open ({report.boundary_edges} boundary edges): the generalized winding "
+        'number will decide what is inside; prepare = ["repair"] closes holes': (
+            report.boundary_edges
+        ),
         f"{report.nonmanifold_edges} edges have more than two triangles": report.nonmanifold_edges,
         f"{report.inconsistent_edges} edges have triangles wound against each other: "
         'prepare = ["orient"] mends that': report.inconsistent_edges,
-        f'the faces are wound inwards (volume {report.volume:.3g} m^3): prepare = ["orient"] turns them': (
-            report.volume < 0
-        ),
+        f"the faces are wound inwards (volume {report.volume:.3g} m^3): "
+        'prepare = ["orient"] turns them': report.volume < 0,
     }
     return [line for line, doubtful in doubts.items() if doubtful]
 
 
 def is_inside(surface: Surface, points: Positions) -> Mask:
-    """Return which points (n, 3) are inside: their winding number is above 1/2 in size (Jacobson et al. 2013)."""
-    # for open surfaces, and scenes with obstacles
+    """Return which points (n, 3) have |winding number| > 1/2 (Jacobson et al. 2013)."""
+    # imported here because only open surfaces and scenes with obstacles need it
     import igl
 
     low, high = bounds_of(surface)
-    # libigl sums in single precision: lengths are measured from the middle, in longest sides
+    # libigl sums in single precision: scale the lengths to about 1, around the middle
     own, asked = (
         (rows - (low + high) / 2) / (high - low).max() for rows in (surface.points, points)
     )
@@ -157,7 +162,7 @@ def is_inside(surface: Surface, points: Positions) -> Mask:
 def merged_triangles(surface: Surface) -> Indices:
     """Return the triangles (g, 3) over merged points.
 
-    Equal positions have the number of the first of them; triangles left with fewer than three corners are dropped.
+    Points of equal position get the lowest of their numbers; degenerate triangles are dropped.
     """
     triangles = first_of_equal(surface.points)[surface.triangles]
     a, b, c = triangles.T
@@ -166,8 +171,9 @@ def merged_triangles(surface: Surface) -> Indices:
 
 
 def first_of_equal(points: Positions) -> Indices:
-    """Return for each point (v,) the lowest number of a point of exactly the same position."""
-    order = np.lexsort(points.T)  # stable: equal points stay in the order of their numbers
+    """Return for each point (v,) the lowest number of a point at exactly the same position."""
+    # a stable sort, so that equal points keep the order of their numbers
+    order = np.lexsort(points.T)
     sorted_points = points[order]
     starts = np.ones(len(points), bool)
     starts[1:] = (sorted_points[1:] != sorted_points[:-1]).any(axis=1)
@@ -177,15 +183,15 @@ def first_of_equal(points: Positions) -> Indices:
 
 
 def edge_use(triangles: Indices) -> tuple[Indices, Indices]:
-    """Return for each undirected edge (e,) how many triangles use it, and how many of those run along it upwards.
+    """Return for each undirected edge (e,) its number of triangles, and of upward triangles.
 
-    Upwards is from its lower to its higher point number.
+    An upward triangle runs along the edge from the lower to the higher point number.
     """
     if len(triangles) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
-    # one sortable number an edge, its direction in the last bit
+    # a sortable number for each edge, its direction in the last bit
     key = np.sort((low * (triangles.max() + 1) + high) * 2 + (start < end))
     first = np.flatnonzero(np.diff(key >> 1, prepend=-1))
     return np.diff(first, append=len(key)), np.add.reduceat(key & 1, first)

@@ -1,12 +1,13 @@
 """Compare two results frame by frame, without MPI and without PETSc.
 
-Of one lattice all fields are. An error is the greatest difference at a frame over the scale of its
-field (msmpetsc/results/README.md), which is that of both runs and all frames compared. What the
-digits of the coarser of the two stored types cannot tell apart is equal, and so are two NaN, or two
-infinities of one sign.
+Results on the same lattice are compared in all fields. The error of a field is its largest
+difference at a frame, divided by the field's scale. The scale (results/README.md) is taken over
+both runs and all compared frames. Differences below the rounding of the coarser stored type are 0.
+Two NaN are equal, and so are two infinities of the same sign.
 
-Of different lattices of one mesh their surfaces are, point by point: both carry the same points of the same mesh, so
-that nothing is projected or interpolated. A point counts by the area around it, a third of its triangles'.
+Results on different lattices of the same mesh are compared in their surfaces, point by point.
+Both have the same points, so nothing is projected or interpolated. The weight of a point is a third
+of the area of its triangles.
 """
 
 from collections.abc import Sequence
@@ -21,24 +22,28 @@ from msmpetsc.results.reader import Result
 
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 COMPARED = ("position", "surface", *ENERGIES, "momentum")
-LEAST_STRAIN = 1e-6  # of the body or of a spring: less is rounding
-SAME_POINT = 1e-6  # of a cell
-SAME_TIME = 1e-6  # of the spacing of frames
-OF_SURFACES = ("frames/surface", "surface/points", "surface/triangles")
-MEAN = "surface, rms"  # name of the field
+# strain of the body or a spring below which a difference is rounding [-]
+LEAST_STRAIN = 1e-6
+# distance within which two points at rest are the same, relative to a cell [-]
+SAME_POINT = 1e-6
+# difference within which two times are the same, relative to the frames' spacing [-]
+SAME_TIME = 1e-6
+SURFACE_FIELDS = ("frames/surface", "surface/points", "surface/triangles")
+# name of the field of root mean square distances
+MEAN = "surface, rms"
 
 
 class DifferentLattices(InputError):
-    """Two results are not of one lattice."""
+    """Two results are not on the same lattice."""
 
 
 @dataclass
 class FieldError:
-    """The difference between two results in one field.
+    """The difference between two results in a field.
 
-    scale  : what errors are relative to
-    errors : (p,) relative, one a frame compared; inf where only one run has a number
-    worst  : (p,) the row, node or point, that is farthest apart; 0 for plain numbers
+    scale  : denominator of the relative errors, in ``unit``
+    errors : (p,) relative error at each compared frame; inf if only a single run has a number
+    worst  : (p,) row, a node or point, of the largest difference; 0 for plain numbers
     """
 
     name: str
@@ -48,7 +53,7 @@ class FieldError:
     worst: Indices
 
     def first_above(self, rtol: float) -> int | None:
-        """Return the first compared frame whose error is above rtol, or None."""
+        """Return the first compared frame with an error above rtol, or None."""
         above = np.flatnonzero(self.errors > rtol)
         return int(above[0]) if len(above) else None
 
@@ -71,11 +76,12 @@ class Comparison:
 Distances = tuple[Floats, Indices, float]
 
 
-@np.errstate(all="ignore")  # what overflows differs, and is reported as that
+# values that overflow are reported as different
+@np.errstate(all="ignore")
 def compare(a: Result, b: Result) -> Comparison:
-    """Compare the fields COMPARED that two results share, at the times that both have.
+    """Compare the fields COMPARED of two results at their common times.
 
-    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time in common.
+    Raises DifferentLattices if the lattices do not match, InputError if no time is common.
     """
     refuse_different_lattices(a, b)
     either = [name for name in COMPARED if name in a.frames or name in b.frames]
@@ -102,14 +108,15 @@ def rest_of(run: Result, name: str) -> Positions | None:
 
 
 def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
-    """Return a field's greatest distance between two rows and that row, (p,) each, and the greatest size.
+    """Return a field's largest difference, the row of it, (p,) each, and the field's largest size.
 
-    The size is that in any frame, from rest where the field is one of positions.
+    Sizes are taken over all compared frames, for positions relative to rest.
     """
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
         raise InputError(
-            f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}"
+            f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, "
+            f"{b_rows.shape[1:]} in {b.path}"
         )
     rest = rest_of(a, name)
     digits = max(
@@ -123,9 +130,9 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
         a_values, b_values = (
             np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame])
         )
-        apart = _row_lengths(difference(a_values, b_values, digits))
-        worst[number] = np.argmax(apart) if apart.size else 0
-        greatest[number] = apart[worst[number]] if apart.size else 0.0
+        distance = _row_lengths(difference(a_values, b_values, digits))
+        worst[number] = np.argmax(distance) if distance.size else 0
+        greatest[number] = distance[worst[number]] if distance.size else 0.0
         for values in (a_values, b_values):
             sizes = _row_lengths(values if rest is None else values - rest)
             size = max(size, sizes[np.isfinite(sizes)].max(initial=0.0))
@@ -133,18 +140,18 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
 
 
 def difference(a: Array, b: Array, digits: float) -> Floats:
-    """Return |a - b|, less what rounding to these relative `digits` may do.
+    """Return |a - b| minus the rounding of values with relative precision ``digits``, at least 0.
 
-    It is 0 of two NaN, inf of a NaN and a number.
+    The difference of two NaN is 0, of a NaN and a number inf.
     """
     with np.errstate(invalid="ignore", over="ignore"):
-        apart = np.abs(a - b) - digits * np.maximum(np.abs(a), np.abs(b))
-    apart = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, apart)
-    return np.maximum(np.where(np.isnan(apart), np.inf, apart), 0.0)
+        distance = np.abs(a - b) - digits * np.maximum(np.abs(a), np.abs(b))
+    distance = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, distance)
+    return np.maximum(np.where(np.isnan(distance), np.inf, distance), 0.0)
 
 
 def _row_lengths(rows: Array) -> Floats:
-    """Return the lengths (r,) of vectors (r, 3), of one vector (3,), or the sizes of plain numbers."""
+    """Return the lengths (r,) of vectors (r, 3) or (3,), or absolute values of plain numbers."""
     if rows.ndim == 0:
         return np.abs(rows)[None]
     return np.ravel(np.linalg.norm(rows, axis=-1))
@@ -153,10 +160,11 @@ def _row_lengths(rows: Array) -> Floats:
 def _scales(
     a: Result, b: Result, distances: dict[str, Distances], pairs: Indices
 ) -> dict[str, float]:
-    """Return the scale of each field, by which its errors are divided."""
+    """Return the scale of each field, the denominator of its errors."""
     scales = {name: size for name, (_, _, size) in distances.items()}
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
-    least = 0.0  # of the stiffest and longest spring, strained by LEAST_STRAIN [J]
+    # energy [J] of the stiffest and longest spring at LEAST_STRAIN
+    least = 0.0
     if all(name in a.lattice and len(a.lattice[name]) for name in ("stiffness", "rest_length")):
         longest = a.lattice.rest_length[:].max()
         least = float(0.5 * a.lattice.stiffness[:].max() * (LEAST_STRAIN * longest) ** 2)
@@ -174,13 +182,16 @@ def _scales(
 
 
 def longest_side(points: Positions, body: Indices) -> float:
-    """Return the longest side [m] of the bounding box of any body's points (n, 3); ``body`` (n,) are their numbers."""
+    """Return the longest side [m] of the bounding boxes of bodies with points (n, 3).
+
+    body : (n,) the body of each point
+    """
     of_bodies = (points[body == number] for number in np.unique(body))
     return float(max((np.ptp(own, axis=0).max() for own in of_bodies), default=0.0))
 
 
 def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> float:
-    """Return the largest size of the named energies at the compared frames of both results."""
+    """Return the largest absolute value [J] of the named energies at the compared frames."""
     runs = (a, pairs[:, 0]), (b, pairs[:, 1])
     energies = [
         (name, run.frames[name][frames])
@@ -188,21 +199,21 @@ def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> floa
         for name in names
         if name in run.frames
     ]
-    # the potential energy's zero means nothing
+    # the zero of the potential energy is arbitrary
     values = [energy - energy[0] if name == "potential" else energy for name, energy in energies]
     sizes = np.abs(np.concatenate([np.empty(0), *values]))
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 
-def rows_agree(a: Array, b: Array, slack: float) -> Mask:
-    """Return which rows (n,) of a and b, (n, 3) or (n,) each, differ by at most `slack`."""
+def rows_agree(a: Array, b: Array, tolerance: float) -> Mask:
+    """Return whether the rows (n,) of a and b, (n, 3) or (n,), differ by at most ``tolerance``."""
     rows: Array = (a - b).reshape(len(a), -1)
-    agree: Mask = np.linalg.norm(rows, axis=1) <= slack
+    agree: Mask = np.linalg.norm(rows, axis=1) <= tolerance
     return agree
 
 
 def refuse_different_lattices(a: Result, b: Result) -> None:
-    """Raise DifferentLattices with the first reason why the two are not of one lattice."""
+    """Raise DifferentLattices, with a reason, if two results are not on the same lattice."""
 
     def refuse(reason: str) -> None:
         raise DifferentLattices(f"{a.path} and {b.path} are runs of different lattices: {reason}")
@@ -215,13 +226,13 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
         )
     if abs(sizes[0] - sizes[1]) > SAME_POINT * sizes[0]:
         refuse(f"cells of {sizes[0]:.6g} m and {sizes[1]:.6g} m")
-    if where := first_apart(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0)):
-        refuse(f"node {where}")
+    if mismatch := first_mismatch(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0)):
+        refuse(f"node {mismatch}")
 
 
-def first_apart(a: Positions, b: Positions, slack: float) -> str:
-    """Return in words the first of points (n, 3) [m] that differs between two results by more than `slack`."""
-    same = rows_agree(a, b, slack)
+def first_mismatch(a: Positions, b: Positions, tolerance: float) -> str:
+    """Return in words the first of points (n, 3) [m] that differ by more than ``tolerance``."""
+    same = rows_agree(a, b, tolerance)
     if same.all():
         return ""
     first = int(np.argmin(same))
@@ -229,7 +240,7 @@ def first_apart(a: Positions, b: Positions, slack: float) -> str:
 
 
 def cell_size(run: Result, nodes: Positions) -> float:
-    """Return the edge length [m] of the first cell; 0 for a file without cells."""
+    """Return the edge length [m] of the first cell; 0 if the file has no cells."""
     if "cells" not in run.lattice or not len(run.lattice.cells):
         return 0.0
     corners = run.indices("lattice/cells")[0]
@@ -242,59 +253,61 @@ def point_text(point: Floats) -> str:
 
 
 def common_times(a: Floats, b: Floats) -> Indices:
-    """Return the indices (p, 2) of equal times in two ascending series [s], equal to rounding."""
+    """Return the indices (p, 2) of times that two ascending series [s] share up to rounding."""
     if not len(b):
         return np.empty((0, 2), int)
-    slack = SAME_TIME * np.diff(b).min(initial=1.0)
-    near = np.searchsorted(b, a - slack).clip(max=len(b) - 1)
-    same = np.abs(b[near] - a) <= slack
+    tolerance = SAME_TIME * np.diff(b).min(initial=1.0)
+    near = np.searchsorted(b, a - tolerance).clip(max=len(b) - 1)
+    same = np.abs(b[near] - a) <= tolerance
     return np.column_stack([np.nonzero(same)[0], near[same]])
 
 
-@np.errstate(
-    over="ignore", invalid="ignore"
-)  # what overflows is far apart, and is reported as that
+# values that overflow are reported as far apart
+@np.errstate(over="ignore", invalid="ignore")
 def compare_surfaces(run: Result, reference: Result) -> Comparison:
-    """Return the distances between the surfaces of a result and its reference, at the times that both have.
+    """Return the distances of a result's surface from its reference, at their common times.
 
-    Its fields are the greatest distance of a point, and the root mean square over the area (MEAN).
-    Both are relative to the largest displacement of a point in the reference, their scale [m]; if
-    that is 0, as none moves, they are in metres.
+    The two fields are the largest distance of a point, and the root mean square over the area
+    (MEAN). Both are relative to their scale [m], the largest displacement in the reference. If no
+    point of the reference moves, the errors are in metres and the scale is 0.
 
-    Raises InputError where a file has no surface, the meshes differ or no time is common.
+    Raises InputError if a file has no surface, the meshes differ or no time is common.
     """
     refuse_different_meshes(run, reference)
-    rest, area = reference["surface/points"][:], point_areas(reference)
+    rest = reference["surface/points"][:]
+    area = point_areas(reference)
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
     if reference.scene.get("time", {}).get("integrator") == "static":
-        pairs = pairs[
-            times[pairs[:, 0]] > 0
-        ]  # when it is in its rest shape, which is no state of equilibrium
+        # a static run starts at rest, which is no equilibrium
+        pairs = pairs[times[pairs[:, 0]] > 0]
     if not len(pairs):
         raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
     worst = np.empty(len(pairs), int)
     greatest, rms = np.empty((2, len(pairs)))
-    moved = 0.0
+    displacement = 0.0
     for number, (of_run, of_reference) in enumerate(pairs):
         true = np.asarray(reference.frames.surface[of_reference], float)
-        apart = np.linalg.norm(run.frames.surface[of_run] - true, axis=1)
-        apart[np.isnan(apart)] = np.inf
-        rms[number] = np.sqrt(area @ apart**2 / area.sum())
-        worst[number] = np.argmax(apart)
-        greatest[number] = apart[worst[number]]
-        moved = max(moved, float(np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0)))
-    if moved <= LEAST_STRAIN * longest_side(rest, reference.body_of("surface")):
-        moved = 0.0  # less is rounding
-    scale = moved or 1.0
-    surface = FieldError("surface", "m", moved, greatest / scale, worst)
-    mean = FieldError(MEAN, "m", moved, rms / scale, worst)
+        distance = np.linalg.norm(run.frames.surface[of_run] - true, axis=1)
+        distance[np.isnan(distance)] = np.inf
+        rms[number] = np.sqrt(area @ distance**2 / area.sum())
+        worst[number] = np.argmax(distance)
+        greatest[number] = distance[worst[number]]
+        largest = np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0)
+        displacement = max(displacement, float(largest))
+    if displacement <= LEAST_STRAIN * longest_side(rest, reference.body_of("surface")):
+        # a smaller displacement is rounding
+        displacement = 0.0
+    scale = displacement or 1.0
+    surface = FieldError("surface", "m", displacement, greatest / scale, worst)
+    mean = FieldError(MEAN, "m", displacement, rms / scale, worst)
     return Comparison(pairs, times[pairs[:, 0]], [surface, mean], [])
 
 
 def point_areas(run: Result) -> Array:
-    """Return the area (v,) [m^2] of each surface point at rest: a third of its triangles'."""
-    points, triangles = run["surface/points"][:], run.indices("surface/triangles")
+    """Return the area (v,) [m^2] of each surface point at rest: a third of its triangles' area."""
+    points = run["surface/points"][:]
+    triangles = run.indices("surface/triangles")
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     around = np.bincount(triangles.ravel(), np.repeat(areas / 3, 3), len(points))
@@ -302,9 +315,9 @@ def point_areas(run: Result) -> Array:
 
 
 def refuse_different_meshes(a: Result, b: Result) -> None:
-    """Raise InputError with the first reason why the two do not carry the same surface."""
+    """Raise InputError, with the first reason, if two results do not have the same surface."""
     for run in (a, b):
-        missing = next((name for name in OF_SURFACES if name not in run), None)
+        missing = next((name for name in SURFACE_FIELDS if name not in run), None)
         if missing is not None:
             raise InputError(f"{run.path} has no {missing}: it was run with output.surface = false")
 
@@ -314,7 +327,7 @@ def refuse_different_meshes(a: Result, b: Result) -> None:
     points, b_points = a["surface/points"][:], b["surface/points"][:]
     if len(points) != len(b_points) or not len(points):
         refuse(f"{len(points)} and {len(b_points)} surface points")
-    if where := first_apart(points, b_points, SAME_POINT * np.ptp(points, axis=0).max()):
-        refuse(f"point {where}")
+    if mismatch := first_mismatch(points, b_points, SAME_POINT * np.ptp(points, axis=0).max()):
+        refuse(f"point {mismatch}")
     if not np.array_equal(a["surface/triangles"][:], b["surface/triangles"][:]):
         refuse("their triangles join other points")

@@ -1,4 +1,4 @@
-"""Files on disk: atomic writes, a lock, checks of free space, and errors in one line."""
+"""Write files to disk: atomically, under a lock, with checks of free space and plain errors."""
 
 import fcntl
 import io
@@ -14,27 +14,26 @@ from typing import Any
 
 from msmpetsc.errors import InputError, one_line
 
-PARTS = (
-    count()
-)  # numbers of parts: several threads write, and USD remembers the name of what failed
-LONGEST_STEM = (
-    50  # letters of a name that its part keeps: with more it could be too long for the file system
-)
+# numbers of temporary files [-]; threads may write the same file, and USD remembers the
+# name of a failed file
+PART_NUMBERS = count()
+# letters of a name kept in its temporary name [-]; file systems limit its length
+LONGEST_STEM = 50
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary name to write to; the file gets its own name only when it is complete.
+    """Yield a temporary path to write to; rename it to ``path`` when the file is complete.
 
-    That name ends alike, for many writers go by the ending. Links are followed; a file that is
-    replaced keeps its rights, and one that may not be written stays. Every file that a command
-    leaves is written so, but for results, which grow (results.writer).
+    The temporary name has the same ending, because many writers choose the format by it. Links are
+    followed. A replaced file keeps its permissions, and a file that may not be written stays. All
+    output files are written this way, except results, which grow (results.writer).
 
-    Raises InputError, with the path and the system's reason in one line.
+    Raises InputError, with the path and the system's reason in a single line.
     """
     real = Path(os.path.realpath(path))
     part = real.with_name(
-        f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PARTS)}.part{real.suffix}"
+        f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PART_NUMBERS)}.part{real.suffix}"
     )
     try:
         with plain_errors(path):
@@ -44,23 +43,25 @@ def whole_file(path: Path) -> Iterator[Path]:
                 open(real, "r+b").close()
             yield part
             with open(part, "r+b") as file:
-                os.fsync(file.fileno())  # some file systems say only now that they are full
+                # some file systems report only here that they are full
+                os.fsync(file.fileno())
             if real.exists():
                 shutil.copymode(real, part)
             part.replace(real)
     finally:
-        with suppress(OSError):  # of a folder that is none
+        # the folder may not exist
+        with suppress(OSError):
             part.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a text or bytes as one complete file. Raises InputError."""
+    """Write a text or bytes as a complete file. Raises InputError."""
     with whole_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def refuse_no_file(path: Path) -> None:
-    """Raise InputError for the name of a folder, a pipe or a device."""
+    """Raise InputError if the path is a folder, a pipe or a device."""
     if path.is_dir():
         raise InputError(f"{path} is a folder, not a file")
     if path.exists() and not path.is_file():
@@ -68,9 +69,11 @@ def refuse_no_file(path: Path) -> None:
 
 
 class Storage(io.FileIO):
-    """A file that HDF5 writes to, which keeps write errors back: HDF5 crashes on them as it ends.
+    """A file for HDF5 to write to, which stores write errors instead of raising them.
 
-    failure : the first, to be raised by who writes
+    HDF5 crashes at exit if its driver raises.
+
+    failure : the first write error, for the writer to raise
     """
 
     failure: OSError | None = None
@@ -94,8 +97,8 @@ class Storage(io.FileIO):
             return size or 0
 
     @contextmanager
-    def telling(self) -> Iterator[None]:
-        """Raise the first write error after the block, whatever HDF5 made of it."""
+    def reporting_errors(self) -> Iterator[None]:
+        """Raise the first write error after the block, in place of HDF5's own error."""
         try:
             yield
         finally:
@@ -104,10 +107,10 @@ class Storage(io.FileIO):
 
 
 class Lock:
-    """A lock on a file beside `path` during writing; the system frees it when a run is killed."""
+    """A lock beside ``path`` while it is written; the system releases it if the run is killed."""
 
     def __init__(self, path: Path):
-        """Take the lock. Raises InputError where another run has it."""
+        """Take the lock. Raises InputError if another run holds it."""
         self.path = path.with_name(f".{path.name}.lock")
         while True:
             self._file = os.open(
@@ -119,22 +122,22 @@ class Lock:
                 if error.errno in (EACCES, EAGAIN):
                     os.close(self._file)
                     raise InputError(f"{path} is being written by another run") from None
-                return  # a file system without locks
+                # the file system has no locks
+                return
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
                     return
-            os.close(
-                self._file
-            )  # who had it took its name away meanwhile: another run may have locked a new one
+            # the last holder has removed the name: another run may lock a new file
+            os.close(self._file)
 
     def free(self) -> None:
-        """Free the lock and remove its file."""
+        """Release the lock and remove its file."""
         unlink_inode(self.path, self.inode)
         os.close(self._file)
 
     @property
     def inode(self) -> int:
-        """Return the number of the lock's file in its file system."""
+        """Inode number of the lock's file."""
         return os.fstat(self._file).st_ino
 
 
@@ -146,7 +149,7 @@ def unlink_inode(path: Path, inode: int) -> None:
 
 
 def refuse_small_disk(path: Path, planned: int) -> None:
-    """Raise InputError where the disk has no room for `planned` bytes, less what the file takes."""
+    """Raise InputError if ``planned`` bytes, less the present size, exceed the free space."""
     free = shutil.disk_usage(path.parent).free
     needed = planned - (path.stat().st_blocks * 512 if path.exists() else 0)
     if needed > free:
@@ -157,7 +160,7 @@ def refuse_small_disk(path: Path, planned: int) -> None:
 
 @contextmanager
 def plain_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the file system, and HDF5's wording of them, into one line's InputError."""
+    """Turn errors of the file system and of HDF5 into an InputError of a single line."""
     try:
         yield
     except (OSError, RuntimeError, ValueError) as error:

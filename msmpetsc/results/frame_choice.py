@@ -1,4 +1,4 @@
-"""Choice of a result's frames by numbers and slices as Python counts: "0,10:250:5,-1"."""
+"""Choose the frames of a result by numbers and slices in Python's notation: "0,10:250:5,-1"."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ Frames = Sequence[int | slice]
 
 
 def frames_in(text: str) -> Frames:
-    """Return the numbers and slices of "0,10:250:5". Raises InputError."""
+    """Return the numbers and slices in a text like "0,10:250:5". Raises InputError."""
     try:
         return [_slice(part) if ":" in part else int(part) for part in text.split(",")]
     except ValueError:
@@ -18,7 +18,7 @@ def frames_in(text: str) -> Frames:
 
 
 def _slice(text: str) -> slice:
-    """Return the slice that "0:250:5" means."""
+    """Return the slice for a text like "0:250:5". Raises ValueError."""
     numbers = [int(word) if word else None for word in text.split(":")]
     if len(numbers) > 3 or numbers[2:] == [0]:
         raise ValueError(text)
@@ -26,7 +26,10 @@ def _slice(text: str) -> slice:
 
 
 def frames_of(path: str, frames: Frames, total: int) -> list[int]:
-    """Return the numbers of the chosen frames. Raises InputError if there are none."""
+    """Return the numbers of the chosen frames among ``total`` frames.
+
+    Raises InputError if a frame does not exist, or none is chosen.
+    """
     numbers = range(total)
     chosen: list[int] = []
     for part in frames:

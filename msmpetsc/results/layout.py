@@ -1,12 +1,13 @@
-"""The layout of a result file, and the transfer of distributed rows between it and the ranks.
+"""Lay out a result file, and transfer distributed rows between the file and the ranks.
 
-All metadata is there before the first frame and then does not change, so that a kill leaves the
-file readable. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the
-start, its chunks allocated, nothing buffered.
+All metadata is written before the first frame and then does not change, so a killed run leaves a
+readable file. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the
+start, its chunks are allocated, and nothing is buffered.
 
-Rank 0, which has the file open, takes or gives rows in pieces. Or each rank writes its own straight
-to their bytes: a frame's chunks stay where HDF5 put them when the file was laid out, uncompressed.
-That needs nothing of h5py, and as nothing is collective no rank waits for one that has failed.
+Rank 0, which has the file open, transfers the rows of other ranks in pieces. Alternatively each
+rank writes its own rows straight to their bytes: uncompressed chunks stay at the offsets that HDF5
+gave them at the start. This needs no parallel h5py. As nothing is collective, no rank waits for
+a rank that has failed.
 """
 
 import math
@@ -25,28 +26,31 @@ from msmpetsc.errors import InputError
 from msmpetsc.fields import DIMENSIONS, FIELDS, FRAME_FIELDS, LABELS, RANKS_SHARE, unit_of
 from msmpetsc.results.disk import Storage
 
+# largest size of a chunk [byte]; bounds the memory of a reader
 CHUNK_BYTES = 64 * 2**20
-PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
-# netCDF-4's name of a scale without coordinates
+# largest size of the rows that rank 0 holds of another rank [byte]
+PIECE_BYTES = 64 * 2**20
+# netCDF-4's name of a dimension scale without coordinates
 LENGTH_ALONE = "This is a netCDF dimension but not a netCDF variable."
 
 
 def open_to_write(storage: Storage, mode: str) -> h5py.File:
-    """Open a new file ("w") or an existing one ("r+") in a way that a kill cannot spoil.
+    """Open a new file ("w") or an existing file ("r+") so that a kill leaves it readable.
 
-    libver earliest: its superblock has no flag "open for writing", which would shut a killed run's
-    file. No chunk cache: nothing waits to be written. No lock: a running result may be looked at.
+    The superblock of libver "earliest" has no flag "open for writing", which would lock the file of
+    a killed run. Without a chunk cache nothing waits to be written. Without a lock other programs
+    can read a running result.
     """
     return h5py.File(storage, mode, libver="earliest", rdcc_nbytes=0, locking=False)
 
 
-def of_ranks(name: str) -> bool:
+def is_distributed(name: str) -> bool:
     """Return whether a field of frames is distributed over the ranks."""
     return bool(RANKS_SHARE.intersection(FRAME_FIELDS[name].shape))
 
 
 class Plan(NamedTuple):
-    """One planned dataset: name, shape, shape of its chunks, and type."""
+    """A planned dataset: its name, shape, chunk shape and type."""
 
     name: str
     shape: tuple[int, ...]
@@ -58,36 +62,37 @@ class Plan(NamedTuple):
 class Layout:
     """The sizes of all datasets that are written frame by frame.
 
-    frames  : planned, frame 0 included
-    nodes   : of all ranks
-    also    : rows, of all ranks, of fields that not all scenes ask for, by their names: {"surface": 1000}
-    rows    : by name, shape of a node's part of the checkpoint's rows
-    numbers : names of the checkpoint's numbers
+    frames   : number of planned frames, frame 0 included
+    nodes    : number of nodes of all ranks
+    optional : number of rows of all ranks in the optional fields, by name: {"surface": 1000}
+    rows     : shape of a node's values in each of the checkpoint's datasets, by name
+    numbers  : names of the checkpoint's numbers
     """
 
     frames: int
     nodes: int
-    also: dict[str, int]
+    optional: dict[str, int]
     rows: dict[str, tuple[int, ...]]
     numbers: tuple[str, ...]
 
     def plans(self) -> Iterator[Plan]:
-        """Yield the datasets in the order in which they are laid out."""
-        counts = {"position": self.nodes, **self.also}
-        for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: of_ranks(item[0])):
+        """Yield the datasets in the order in which they are created."""
+        counts = {"position": self.nodes, **self.optional}
+        for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: is_distributed(item[0])):
             if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
                 continue
             shape = tuple(
                 size if isinstance(size, int) else counts[name] for size in about.shape[1:]
             )
-            if of_ranks(name):
+            if is_distributed(name):
                 yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
             else:
                 yield Plan(
                     f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype
                 )
-        # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
-        # file before noting its new length; killed in between, it could not be opened.)
+        # The checkpoint comes last and is never trimmed, so the end of the file never
+        # moves back. HDF5 would cut the file before it stores the new length, and a
+        # kill in between would leave a file that cannot be opened.
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)
         if self.numbers:
             count = len(self.numbers)
@@ -116,7 +121,7 @@ class Layout:
             file["checkpoint/numbers"].attrs["names"] = " ".join(self.numbers)
 
     def first_misfit(self, file: h5py.File) -> str | None:
-        """Return the name of the first dataset that a file lacks, or has in another shape or with other names."""
+        """Return the first dataset that a file lacks or has in another form; None if all fit."""
         for plan in self.plans():
             dataset = file.get(plan.name)
             if (
@@ -130,23 +135,25 @@ class Layout:
 
 
 def _rows_plan(name: str, times: int, rows: int, shape: tuple[int, ...], dtype: str) -> Plan:
-    """Return the plan of a dataset (times, rows, *shape), whose chunks hold rows of one time."""
+    """Return the plan of a dataset (times, rows, *shape), each chunk with rows of a single time."""
     most = CHUNK_BYTES // (math.prod(shape) * np.dtype(dtype).itemsize)
     return Plan(name, (times, rows, *shape), (1, min(max(1, rows), most), *shape), dtype)
 
 
 def _plan_dataset(file: h5py.File, plan: Plan) -> None:
-    """Create a dataset that can shrink, with all its space in the file allocated now and nothing written.
+    """Create a dataset that can shrink, with all its space allocated and nothing written.
 
-    Through h5py's lower layer: its create_dataset insists on filling datasets that can change their size.
+    This calls h5py's low-level API: its create_dataset always fills a dataset that can be resized.
     """
     dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     dcpl.set_chunk(plan.chunks)
     dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    dcpl.set_obj_track_times(False)  # the same run makes the same bytes
+    # without times the same run writes the same bytes
+    dcpl.set_obj_track_times(False)
     if plan.name == "frames/time":
-        dcpl.set_fill_value(np.array(np.nan))  # what shrinking puts behind the new end
+        # the value behind the new end of a dataset that has shrunk
+        dcpl.set_fill_value(np.array(np.nan))
     space = h5py.h5s.create_simple(plan.shape, plan.shape)
     kind = h5py.h5t.py_create(np.dtype(plan.dtype))
     h5py.h5d.create(file.id, plan.name.encode(), kind, space, dcpl)
@@ -156,7 +163,7 @@ def _plan_dataset(file: h5py.File, plan: Plan) -> None:
 def _name_axes(frames: h5py.Group, name: str) -> None:
     """Attach HDF5 dimension scales to the axes of a dataset of frames.
 
-    By these netCDF's readers name the axes.
+    Readers of netCDF take the names of the axes from them.
     """
     for axis, (symbol, size) in enumerate(
         zip(FRAME_FIELDS[name].shape, frames[name].shape, strict=True)
@@ -169,16 +176,16 @@ def _name_axes(frames: h5py.Group, name: str) -> None:
             frames.create_dataset(dimension, data=LABELS[dimension], dtype=h5py.string_dtype())
             frames[dimension].make_scale(dimension)
         elif dimension not in frames:
-            # never written, so that it takes no room
+            # never written, so that it takes no space
             frames.create_dataset(dimension, (size,), ">f4").make_scale(f"{LENGTH_ALONE}{size:10}")
         frames[name].dims[axis].attach_scale(frames[dimension])
 
 
 def pieces(rows: Array, counts: Sequence[int]) -> Iterator[tuple[int, slice, slice]]:
-    """Yield pieces of the ranks' rows of at most PIECE_BYTES: rank, its own slice, and the slice of all rows.
+    """Yield pieces of at most PIECE_BYTES: the rank, the slice of its rows and of all rows.
 
-    rows   : (counts[rank], ...) this rank's
-    counts : rows of each rank
+    rows   : (counts[rank], ...) this rank's rows
+    counts : number of rows of each rank
     """
     most = max(1, PIECE_BYTES // max(1, rows.dtype.itemsize * math.prod(rows.shape[1:])))
     start = 0
@@ -194,8 +201,10 @@ def gather_rows(
 ) -> None:
     """Call store(part, piece) on rank 0 for the rows of all ranks, in order (collective).
 
-    rows   : (counts[rank], ...) this rank's, contiguous
-    counts : rows of each rank
+    rows   : (counts[rank], ...) this rank's rows, contiguous
+    counts : number of rows of each rank
+
+    Raises the first OSError of ``store`` on rank 0.
     """
     failure = None
     for rank, own, part in pieces(rows, counts):
@@ -211,7 +220,8 @@ def gather_rows(
             if failure is None:
                 store(part, piece)
         except OSError as error:
-            failure = error  # the others still send: hear them out
+            # the other ranks still send, so keep receiving
+            failure = error
     if failure is not None:
         raise failure
 
@@ -219,10 +229,10 @@ def gather_rows(
 def scatter_rows(
     comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Callable[[slice], Any]
 ) -> Exception | None:
-    """Fill each rank's rows with load(part) of rank 0, and return an error of reading there (collective).
+    """Fill each rank's rows with load(part) of rank 0; return rank 0's reading error (collective).
 
-    rows   : (counts[rank], ...) this rank's, to be filled
-    counts : rows of each rank
+    rows   : (counts[rank], ...) this rank's rows, to be filled
+    counts : number of rows of each rank
     """
     failure: Exception | None = None
     for rank, own, part in pieces(rows, counts):
@@ -234,7 +244,8 @@ def scatter_rows(
         try:
             piece[...] = load(part)
         except InputError as error:
-            failure = error  # the others still wait
+            # the other ranks still wait, so keep sending
+            failure = error
         if rank > 0:
             comm.Send(piece, dest=rank)
         else:
@@ -243,7 +254,7 @@ def scatter_rows(
 
 
 def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
-    """Return a descriptor of the file on each rank; None where the ranks see different files (collective)."""
+    """Return a descriptor of the file, or None if the ranks see different files (collective)."""
     descriptor = identity = None
     try:
         descriptor = os.open(path, os.O_WRONLY)
@@ -259,7 +270,7 @@ def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
 
 
 def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
-    """Return the byte offsets in the file of the chunks of dataset[index], in the order of its rows."""
+    """Return the byte offsets in the file of the chunks of dataset[index], in row order."""
     starts = range(0, dataset.shape[1], dataset.chunks[1])
     rest = (0,) * (dataset.ndim - 2)
     return [
@@ -270,9 +281,10 @@ def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
 def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequence[int]) -> None:
     """Write contiguous rows (n, ...) at their byte offsets in a file. Raises OSError.
 
-    start   : number of the first of them in its dataset
-    chunk   : rows of a chunk
-    offsets : where the chunks begin [byte]
+    file    : descriptor of the file
+    start   : number of the first row in its dataset
+    chunk   : rows in a chunk
+    offsets : offsets of the chunks [byte]
     """
     row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
     done = 0

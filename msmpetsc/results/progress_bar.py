@@ -1,4 +1,4 @@
-"""The progress of a run: a bar on a terminal, a line now and then in a batch log."""
+"""Show the progress of a run: a bar on a terminal, or a line now and then in a batch log."""
 
 import sys
 from collections.abc import Iterator, Sequence
@@ -12,23 +12,24 @@ from msmpetsc.comm import log
 from msmpetsc.fields import Frame
 
 Item = TypeVar("Item")
-LINE_EVERY = 10.0  # [s] at the least between two lines of a log
+# least time between two lines of a log [s]; a long run's log stays short
+LINE_EVERY = 10.0
 LINE = "frame {n_fmt}/{total_fmt}  {rate_fmt}  {remaining} left{postfix}"
 
 
 class BatchLog:
-    """Standard error of a batch job, where each state of a bar is a line."""
+    """Standard error of a batch job, which prints each state of a bar as a line."""
 
     def write(self, text: str) -> None:
-        """Write a line, without what a bar does to a terminal's cursor."""
+        """Write a line, without the bar's control characters."""
         if text.strip():
             print(text.strip(), file=sys.stderr)
 
 
 class Progress:
-    """The progress of a run of `total` steps, shown frame by frame; enabled on rank 0 alone.
+    """The progress of a run of ``total`` steps, shown frame by frame; enable it on rank 0 alone.
 
-    Call update(frame) for every frame, frame 0 included, and close() at the end, whatever the end.
+    Call update(frame) for every frame, frame 0 included, and close() at the end, on errors too.
     """
 
     def __init__(self, total: int, enabled: bool = True):
@@ -38,14 +39,16 @@ class Progress:
         if not self._is_terminal:
             style = dict(bar_format=LINE, file=BatchLog(), mininterval=LINE_EVERY)
         self._style = style | dict(total=total, unit="frame", miniters=1)
-        self._shown = ExitStack()  # the bar, with log lines above it
+        # the bar, and the redirection of log lines above it
+        self._shown = ExitStack()
         self._bar: tqdm | None = None
 
     def update(self, frame: Frame) -> None:
-        """Show that a frame is done."""
+        """Show that a frame is finished."""
         if not self._enabled:
             return
-        if self._bar is None:  # whose rate counts from the first frame of a run that goes on
+        # created at the first frame, from which the rate of a resumed run counts
+        if self._bar is None:
             bar = tqdm_logging_redirect(initial=frame.index, loggers=[log], **self._style)
             self._bar = self._shown.enter_context(bar)
         self._bar.set_postfix_str(
@@ -61,12 +64,12 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in words: 3.1 s, 31 s, 12 min, 3.4 h."""
+    """Return a duration [s] in words: 3.1 s, 31 s, 12 min, 3.4 h."""
     if seconds < 120:
         return f"{seconds:.{int(seconds < 10)}f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def counted(items: Sequence[Item], unit: str) -> Iterator[Item]:
-    """Yield the items, with a bar on a terminal that disappears at the end."""
+    """Yield the items and show a bar on a terminal, which disappears at the end."""
     yield from tqdm(items, unit=f" {unit}", disable=None, leave=False, dynamic_ncols=True)

@@ -1,7 +1,7 @@
-"""Reading of result files without MPI and without PETSc: ``msmpetsc.open``.
+"""Read result files without MPI and without PETSc: ``msmpetsc.open``.
 
-What a file claims is checked when it is opened, before anything of that size is read: whoever made the file, it ends in
-an InputError of one line, or its arrays have the shapes and types of `msmpetsc.fields`.
+A file's claims are checked when it is opened, before any array is read. A hostile or damaged file
+raises an InputError of a single line. In other files all arrays are as `msmpetsc.fields` says.
 """
 
 import math
@@ -23,34 +23,39 @@ from msmpetsc.fields import FIELDS
 from msmpetsc.results.disk import refuse_no_file
 from msmpetsc.scene.toml import toml_of
 
-if TYPE_CHECKING:  # who reads frames needs neither
+# frames can be read without scipy
+if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 FORMAT, FORMAT_VERSION = "msmpetsc", 1
 NEEDED = ("lattice/nodes", "frames/time", "frames/position")
-NAMED = {  # by datasets of numbers, what these are numbers of
+# datasets of indices, with the dataset whose rows they number
+NUMBERED = {
     "lattice/cells": "lattice/nodes",
     "lattice/springs": "lattice/nodes",
     "lattice/pinned": "lattice/nodes",
     "surface/triangles": "surface/points",
     "obstacle/triangles": "obstacle/points",
 }
-PATIENCE = 10  # [s] to read a file's tables
+# time limit for reading a file's metadata [s]; an intact file takes far less
+TIME_LIMIT = 10
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
-DEFLATE_MOST = 1032  # zlib packs no better than this
+# largest compression ratio of zlib [-]
+DEFLATE_MOST = 1032
 
 
 class LazyArray:
-    """A dataset that is read by indexing, as h5py's are: ``array[-1]``, ``array[:, 17]``, ``np.diff(array)``.
+    """A dataset that is read when it is indexed: ``array[-1]``, ``array[:, 17]``.
 
-    Frames end with the finished ones. One index may be a list that goes up, or a mask.
+    The rows of frames end with the last finished frame. The index along an axis may be an ascending
+    list or a mask.
 
-    name    : of the dataset in the file, "frames/position"
+    name    : name of the dataset in the file, "frames/position"
     planned : shape of the dataset in the file, frames to come included
     """
 
     def __init__(self, dataset: h5py.Dataset, count: int | None = None):
-        """Wrap a dataset; count: its rows that can be read, all if None."""
+        """Wrap a dataset of which the first ``count`` rows can be read, all if None."""
         self._dataset = dataset
         self._file, self.name = dataset.file.filename, dataset.name.lstrip("/")
         self.planned: tuple[int, ...] = dataset.shape
@@ -78,6 +83,10 @@ class LazyArray:
         return f"<{self.name} {self.shape} {self.dtype} [{self.unit}]>"
 
     def __getitem__(self, key: Any) -> Array:
+        """Read the values at an index.
+
+        Raises IndexError for an invalid index, InputError if the file is closed or cannot be read.
+        """
         if not self._dataset:
             raise InputError(f"{self._file} is closed")
         keys = key if isinstance(key, tuple) else (key,)
@@ -102,7 +111,7 @@ class LazyArray:
 
 
 class Arrays(dict[str, LazyArray]):
-    """The arrays of one group by their names: ``frames["time"]`` or ``frames.time``."""
+    """The arrays of a group by their names: ``frames["time"]`` or ``frames.time``."""
 
     def __init__(self, group: str, arrays: dict[str, LazyArray]):
         super().__init__(arrays)
@@ -123,23 +132,43 @@ class Arrays(dict[str, LazyArray]):
 
 
 class Frames(Arrays):
-    """The arrays of frames by their names; its length is the number of finished frames."""
+    """The arrays of frames by their names; the length is the number of finished frames."""
 
     def __len__(self) -> int:
         return len(self["time"])
 
 
 class Result:
-    """A result file opened for reading, also while it is written: then up to the frames finished by now.
+    """A result file opened for reading, also while a run writes it.
 
-    attributes : who made it and how: msmpetsc_version, petsc_options, ranks, command, ...
-    lattice, surface, frames : their arrays as in the file, each read where it is indexed; one that the file does not
-        have, because an older version wrote it or the scene did not ask for it, is not among them
-    file : the same as h5py has it, unchecked where the table of fields ends; what else is there is not read
+    A file that is being written has the frames finished when it was opened. The lattice, the
+    surface and the frames hold the arrays that the file has. A file of an older version, or of a
+    scene that did not ask for an array, lacks it.
+
+    Parameters
+    ----------
+    path : str or Path
+        The result file.
+
+    Attributes
+    ----------
+    attributes : dict
+        Origin of the file: msmpetsc_version, petsc_options, ranks, command, ...
+    lattice, surface : Arrays
+        The arrays of the lattice and of the surface, each read when it is indexed.
+    frames : Frames
+        The arrays of the finished frames, each read when it is indexed.
+    file : h5py.File
+        The same file by h5py. Datasets that the table of fields does not list are unchecked.
+
+    Raises
+    ------
+    InputError
+        If the file is no result, or is damaged.
     """
 
     def __init__(self, path: str | Path):
-        """Open the file. Raises InputError if it is no result, or damaged."""
+        """Open the file. Raises InputError if it is no result, or is damaged."""
         self.path = Path(path)
         self.file = open_result(path)
         try:
@@ -162,6 +191,7 @@ class Result:
         self.frames = Frames("frames", self._group("frames"))
 
     def _group(self, group: str) -> Arrays:
+        """Return the arrays of a group of datasets."""
         start = f"{group}/"
         arrays = {
             name.removeprefix(start): array
@@ -177,7 +207,7 @@ class Result:
         self.close()
 
     def close(self) -> None:
-        """Close the file; a second call does nothing. Afterwards only what was read already can be used."""
+        """Close the file; a second call does nothing. Arrays that were read stay valid."""
         self.file.close()
 
     def __repr__(self) -> str:
@@ -190,23 +220,24 @@ class Result:
         return name in self._datasets
 
     def __getitem__(self, name: str) -> LazyArray:
-        """Return the array of a dataset, "lattice/nodes". Raises InputError where there is none."""
+        """Return the array of a dataset, "lattice/nodes". Raises InputError if it is missing."""
         if name not in self._datasets:
             raise InputError(f"{self.path} is damaged: it has no {name}")
         return self._datasets[name]
 
     def indices(self, name: str) -> Indices:
-        """Return a dataset of node or point numbers. Raises InputError for one out of range."""
-        rows, count = self[name][:].astype(np.int64), len(self[NAMED[name]])
-        plural = NAMED[name].partition("/")[2]
+        """Return a dataset of node or point numbers. Raises InputError if one is out of range."""
+        rows = self[name][:].astype(np.int64)
+        count = len(self[NUMBERED[name]])
+        plural = NUMBERED[name].partition("/")[2]
         if rows.size and not 0 <= rows.min() <= rows.max() < count:
             raise InputError(
-                f"{self.path} is damaged: {name} names what is not among its {count} {plural}"
+                f"{self.path} is damaged: {name} has numbers outside its {count} {plural}"
             )
         return rows
 
     def surface_at(self, frame: int) -> Positions:
-        """Return the surface points (v, 3) of a frame [m]: as stored, or W @ positions."""
+        """Return the surface points (v, 3) [m] of a frame: as stored, or W @ positions."""
         if "surface" in self.frames:
             return self.frames.surface[frame]
         points: Positions = self.embedding @ self.frames.position[frame]
@@ -214,7 +245,7 @@ class Result:
 
     @cached_property
     def scene(self) -> dict[str, Any]:
-        """The scene as run, overrides included, as TOML has it: ``scene["material"]["density"]``."""
+        """The scene as run, overrides included, as TOML: ``scene["material"]["density"]``."""
         text = self.attributes.get("scene")
         if not isinstance(text, str):
             raise InputError(f"{self.path} does not say its scene")
@@ -225,9 +256,9 @@ class Result:
 
     @cached_property
     def embedding(self) -> "csr_array | None":
-        """W (v, n): surface points = W @ positions; None where a scene has output.surface = false.
+        """W (v, n) with surface points = W @ positions; None if output.surface is false.
 
-        Raises InputError if scipy is not installed, or the file's numbers make no matrix.
+        Raises InputError if scipy is not installed, or the stored numbers make no matrix.
         """
         try:
             from scipy.sparse import csr_array
@@ -243,35 +274,36 @@ class Result:
             raise InputError(f"{self.path}: embedding is no matrix: {one_line(error)}") from error
         if "points" in self.surface and W.shape[0] != len(self.surface.points):
             raise InputError(
-                f"{self.path}: embedding has {W.shape[0]} rows for {len(self.surface.points)} points"
+                f"{self.path}: embedding has {W.shape[0]} rows for "
+                f"{len(self.surface.points)} points"
             )
         return W
 
     def body_of(self, group: str) -> Indices:
-        """Return the number of the body of each node ("lattice", (n,)) or surface point ("surface", (v,))."""
+        """Return the body (n,) of each node ("lattice"), or (v,) of each point ("surface")."""
         if f"{group}/body" in self:
             return self[f"{group}/body"][:].astype(np.int64)
-        return np.zeros(
-            len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64
-        )
+        points = "lattice/nodes" if group == "lattice" else "surface/points"
+        return np.zeros(len(self[points]), np.int64)
 
 
 def open_result(path: str | Path) -> h5py.File:
-    """Open a result file for reading. Raises InputError if it is none."""
+    """Open a result file for reading. Raises InputError if it is no result."""
     path = Path(path)
     refuse_no_file(path)
     if not path.exists():
         raise InputError(f"{path}: no such file")
     with plain_damage(path):
-        path.open("rb").close()  # is_hdf5 does not tell why it cannot read
+        # h5py.is_hdf5 does not say why it cannot read a file
+        path.open("rb").close()
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is not an HDF5 file")
-        # No cache: it may be written just now. What is read is what stands in the file.
+        # no chunk cache: a run may be writing the file
         try:
-            # by default as other readers: HDF5 opens a file but once in a process, with the same locking
+            # the default locking: HDF5 opens a file twice only with the same locking
             file = h5py.File(path, "r", rdcc_nbytes=0)
         except OSError:
-            # a file system without locks, or a lock of another process
+            # the file system has no locks, or another process holds a lock
             file = h5py.File(path, "r", rdcc_nbytes=0, locking=False)
     try:
         with plain_damage(path):
@@ -283,9 +315,9 @@ def open_result(path: str | Path) -> h5py.File:
 
 
 def refuse_deadly(path: Path) -> None:
-    """Raise InputError for a file on which the HDF5 library crashes or hangs: a child process reads it first.
+    """Raise InputError if the HDF5 library crashes or hangs on a file.
 
-    For commands: a process that has threads should not be forked.
+    A child process reads the file first. Only commands may call this: threads forbid a fork.
     """
     child = os.fork()
     if child == 0:
@@ -293,7 +325,7 @@ def refuse_deadly(path: Path) -> None:
             for number in (*CRASHES, signal.SIGALRM):
                 signal.signal(number, signal.SIG_DFL)
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            signal.alarm(PATIENCE)
+            signal.alarm(TIME_LIMIT)
             _read_tables(path)
         except BaseException:
             pass
@@ -306,25 +338,26 @@ def refuse_deadly(path: Path) -> None:
 
 
 def _read_tables(path: Path) -> None:
-    """Read the metadata of every dataset, and one row of each."""
+    """Read the metadata of every dataset and a row of each."""
     with Result(path) as run:
         for array in run._datasets.values():
             _ = array[:, :1] if array.ndim == 3 else array[:1]
 
 
 def finished(file: h5py.File) -> int:
-    """Return the number of finished frames: those whose time is finite."""
+    """Return the number of finished frames: frames with a finite time."""
     has_time = np.isfinite(file["frames/time"][:])
     return int(np.argmin(np.append(has_time, False)))
 
 
 def newest_slot(steps: Indices) -> int | None:
-    """Return the slot of the newest checkpoint from the steps (2,) of both slots, or None."""
+    """Return the slot of the newest checkpoint, given the steps (2,) of both slots, or None."""
     slot = int(np.argmax(steps))
     return slot if steps[slot] >= 0 else None
 
 
 def _check_is_result(path: Path, file: h5py.File) -> None:
+    """Raise InputError unless format, version and frames of a file are those of a result."""
     name, version = (as_python(file.attrs.get(key)) for key in ("format", "format_version"))
     if not (isinstance(name, str) and name == FORMAT):
         raise InputError(
@@ -342,7 +375,7 @@ def _check_is_result(path: Path, file: h5py.File) -> None:
 
 @contextmanager
 def plain_damage(path: Path) -> Iterator[None]:
-    """Turn errors of HDF5 and h5py on damaged files into an InputError of one line."""
+    """Turn errors of HDF5 and h5py on damaged files into an InputError of a single line."""
     try:
         yield
     except PermissionError as error:
@@ -364,14 +397,14 @@ def plain_damage(path: Path) -> Iterator[None]:
 
 
 def as_python(value: Any) -> Any:
-    """Return an attribute as Python's own type, if there is one."""
+    """Return an attribute's value as Python's own type, if there is one."""
     if isinstance(value, bytes):
         return value.decode(errors="replace")
     return value.item() if isinstance(value, np.generic) else value
 
 
 def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Return all known datasets of a result by name. Raises InputError for a wrong one."""
+    """Return all known datasets of a result by name. Raises InputError for an invalid dataset."""
     path = Path(file.filename)
     for name in NEEDED:
         if object_at(path, file, name) is None:
@@ -383,7 +416,7 @@ def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> None:
-    """Raise InputError where a size of the table of fields is not the same everywhere, or frames are too few."""
+    """Raise InputError if datasets differ in a common size, or have too few frames."""
     sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
         for axis, (size, symbol) in enumerate(zip(dataset.shape, FIELDS[name].shape, strict=True)):
@@ -402,7 +435,7 @@ def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
     """Return the HDF5 object of a name, or None. Raises InputError for links."""
     node = file
     for part in name.split("/"):
-        # the lower layer: h5py's own `in` and `get` follow a link to say whether it leads anywhere
+        # h5py's own `in` and `get` would follow a link, so its low-level API is used
         if not isinstance(node, h5py.Group) or not node.id.links.exists(part.encode()):
             return None
         if node.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
@@ -412,13 +445,15 @@ def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
 
 
 def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """Return a dataset of the expected type and axes, no larger than the file can hold."""
+    """Return a dataset, checked for type, axes and size.
+
+    Raises InputError if it is missing, invalid, too large for the file, or kept in another file.
+    """
     dataset = object_at(path, file, name)
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{path} is damaged: it has no dataset {name}")
-    if (
-        dataset.is_virtual or dataset.external
-    ):  # to be asked before its shape, which HDF5 may look up there
+    # checked before the shape, which HDF5 may look up in the other file
+    if dataset.is_virtual or dataset.external:
         raise InputError(f"{path}: {name} is kept in another file, which is not opened")
     field = FIELDS.get(name)
     kinds = "f" if field is None or field.dtype.startswith("f") else "iu"
@@ -427,7 +462,8 @@ def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
         kind = printable(str(dataset.dtype), 40)
         raise InputError(f"{path} is damaged: {name} has type {kind} and shape {dataset.shape}")
     rows = " x ".join(map(str, dataset.shape))
-    most = max(dataset.size, math.prod(dataset.chunks or ()))  # a packed chunk is read whole
+    # HDF5 reads a compressed chunk as a whole
+    most = max(dataset.size, math.prod(dataset.chunks or ()))
     claimed = most * dataset.dtype.itemsize
     if claimed > file.id.get_filesize() * (DEFLATE_MOST if dataset.compression else 1):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Restart from a result file: its run, its last checkpoint, its lattice."""
+"""Restart from a result file: read its run and last checkpoint, and check its lattice."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -18,19 +18,24 @@ from msmpetsc.results.comparison import rows_agree
 from msmpetsc.results.layout import scatter_rows
 from msmpetsc.results.reader import Result, as_python, newest_slot, plain_damage
 
-NEAR, FARTHEST = 0.01, 1e6  # of the body's longest side
-SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
+# median distance of a checkpoint from its frame, in longest sides [-]; most stay near
+NEAR = 0.01
+# largest distance from any other frame, in longest sides [-]; excludes damaged numbers
+FARTHEST = 1e6
+# difference of equal lattices relative to the largest value [-]; the order of sums over
+# cells depends on the number of ranks
+SAME = 1e-9
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """What a resumed run must know of the run that wrote the result file.
+    """The facts about the run that wrote a result file which a resumed run needs.
 
     texts      : the file's attributes that are text
-    true_error : every so many steps the true error was measured, 0 for never
-    step       : of the last checkpoint, 0 if it has none
-    finished   : frames that it has
-    planned    : frames that it has room for
+    true_error : number of steps between measurements of the true error, 0 for never
+    step       : step of the last checkpoint, 0 if there is none
+    finished   : number of finished frames
+    planned    : number of frames that are laid out
     """
 
     path: Path
@@ -42,23 +47,24 @@ class Earlier:
 
     @classmethod
     def read(cls, path: Path) -> "Earlier":
-        """Read the earlier run on one rank. Raises InputError for no result, or a damaged one."""
-        with Result(path) as result:  # which checks it
+        """Read the earlier run on a single rank. Raises InputError if the file is no result."""
+        with Result(path) as result:
             texts = {
                 name: value for name, value in result.attributes.items() if isinstance(value, str)
             }
             true_error = result.attributes.get("true_error")
-            count, planned = len(result.frames.time), result.frames.time.planned[0]
-            newest = _newest(result)
+            count = len(result.frames.time)
+            planned = result.frames.time.planned[0]
+            newest = _newest_checkpoint(result)
         step = newest[1].step if newest is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
         return cls(path, texts, true_error, step, count, planned)
 
 
-def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
-    """Return the slot, the step with its numbers, and the names of rows of the newest checkpoint, or None.
+def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
+    """Return slot, step with its numbers, and row names of the newest checkpoint, or None.
 
-    Raises InputError for a checkpoint that no run wrote so.
+    Raises InputError if the checkpoint is incomplete.
     """
     stored = [name for name in CHECKPOINT if f"checkpoint/{name}" in run]
     if not stored:
@@ -78,7 +84,8 @@ def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
             names = str(as_python(run.file["checkpoint/numbers"].attrs.get("names", ""))).split()
     if len(names) != len(values):
         raise InputError(
-            f"{run.path} is damaged: checkpoint/numbers has {len(values)} numbers of {len(names)} names"
+            f"{run.path} is damaged: checkpoint/numbers has {len(values)} numbers of "
+            f"{len(names)} names"
         )
     numbers = dict(zip(names, values.tolist(), strict=True))
     rows = [name for name in stored if name not in ("step", "numbers")]
@@ -88,11 +95,13 @@ def _newest(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
 def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None:
     """Return the last checkpoint with this rank's rows, or None if there is none (collective).
 
-    owned : nodes of this rank; the ranks' follow each other
+    owned : number of this rank's nodes, a range in the order of the ranks
+
+    Raises InputError if the checkpoint is incomplete or cannot be read.
     """
     with opened_on_root(comm, path) as run:
         newest: tuple[int, Checkpoint, list[str]] | None = comm.bcast(
-            on_root(comm, lambda: _newest(run))
+            on_root(comm, lambda: _newest_checkpoint(run))
         )
         if newest is None:
             return None
@@ -106,34 +115,36 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
 
 
 def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
-    """Raise InputError where the newest checkpoint's positions cannot follow from those of a frame.
+    """Raise InputError if the newest checkpoint's positions cannot follow from a frame.
 
-    number   : of the last frame up to its step
-    is_frame : whether it is of that very step
+    number   : number of the last frame up to the checkpoint's step
+    is_frame : whether the frame shows that very step
 
-    They need not be equal: contact may have reflected nodes since, and after a stop other ranks may have gone on. But a
-    body goes no farther than its own length in a step, and most of it stays nearly where the frame has it.
+    The positions may differ: contact may have reflected nodes, or the run was resumed on another
+    number of ranks. But in a step a body moves less than its own length, and most nodes stay near
+    their positions in the frame.
     """
     with Result(path) as run:
         slot = newest_slot(run["checkpoint/step"][:])
         q, q_previous = (run[f"checkpoint/{name}"][slot] for name in ("q", "q_previous"))
         frame = run.frames.position[number]
-        moved = np.abs(frame - run.frames.position[number - 1]).max() if number else 0.0
+        motion = np.abs(frame - run.frames.position[number - 1]).max() if number else 0.0
         size = np.ptp(run.lattice.nodes[:], axis=0).max()
-    far, step = (np.abs(a - b).max(axis=1) for a, b in ((q, frame), (q, q_previous)))
-    most, usual = (
-        (size + moved, NEAR * size + moved) if is_frame else (FARTHEST * size, FARTHEST * size)
-    )
-    in_step = most if number else FARTHEST * size  # a body may start fast
-    if not (far.max() <= most and np.median(far) <= usual and step.max() <= in_step):
+    distance, step = (np.abs(a - b).max(axis=1) for a, b in ((q, frame), (q, q_previous)))
+    largest = size + motion if is_frame else FARTHEST * size
+    median = NEAR * size + motion if is_frame else FARTHEST * size
+    # without an earlier frame the body's speed is unknown
+    in_step = largest if number else FARTHEST * size
+    is_near = distance.max() <= largest and np.median(distance) <= median
+    if not (is_near and step.max() <= in_step):
         raise InputError(
-            f"{path} is damaged: its checkpoint's positions are {far.max():.3g} m from those of frame {number}, "
-            f"and moved by {step.max():.3g} m in a step"
+            f"{path} is damaged: its checkpoint's positions are {distance.max():.3g} m from those "
+            f"of frame {number}, and moved by {step.max():.3g} m in a step"
         )
 
 
 def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]) -> None:
-    """Raise InputError where a lattice differs from the one in the file (collective).
+    """Raise InputError if a lattice differs from the lattice in the file (collective).
 
     lattice : this rank's rows by dataset, "lattice/nodes"
     """
@@ -151,19 +162,24 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
                 same = all(comm.allgather(bool(agree)))
             if not same:
                 raise InputError(
-                    f"{path}: the mesh has changed: {name} is not what this run makes of it"
+                    f"{path}: the mesh has changed: {name} differs from this run's lattice"
                 )
 
 
 @contextmanager
 def opened_on_root(comm: MPI.Comm, path: Path) -> Iterator[Any]:
-    """Open a result file on rank 0 alone; yield None on other ranks (collective). Raises InputError."""
+    """Open a result file on rank 0; yield None on other ranks (collective). Raises InputError."""
     with on_root(comm, lambda: Result(path)) or nullcontext() as run:
         yield run
 
 
 def _own_rows(comm: MPI.Comm, run: Any, place: tuple[str] | tuple[str, int], count: int) -> Array:
-    """Return this rank's `count` rows of a dataset, or of one of its slots (collective)."""
+    """Return this rank's `count` rows of a dataset, or of a slot of it (collective).
+
+    place : name of the dataset, and the slot if there are slots
+
+    Raises InputError if the rows cannot be read.
+    """
     name, *index = place
     counts = comm.allgather(count)
     dtype, shape = comm.bcast(

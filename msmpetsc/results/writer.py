@@ -1,12 +1,13 @@
-"""Writing of the result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
+"""Write the result file (HDF5, format_version 1): a single file of all ranks, safe against a kill.
 
-All metadata is on disk before the first frame and does not change while frames are written (results.layout). A frame is
-its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
-(`finished`). Of the checkpoint's two slots the older is written, with its step at -1 meanwhile, so a whole checkpoint
-is always left: the slot of the greatest step.
+All metadata is on disk before the first frame and does not change while frames are written
+(results.layout). The data of a frame is written before its time. ``/frames/time`` starts as NaN, so
+a frame is finished if its time is finite (`finished`). The checkpoint has two slots. The older slot
+is overwritten, with step -1 meanwhile, so a whole checkpoint remains: the slot of the last step.
 
-A run that goes on writes into the file as it lies there, if all that it needs is laid out in it: so no metadata change
-then either. Else it writes a new one, takes the frames over, and renames it when it holds them (`Begin`).
+A resumed run writes into the existing file if everything it needs is laid out there; so the
+metadata does not change either. Otherwise the run writes a new file, copies the frames to it, and
+renames it when they are complete (`Begin`).
 """
 
 import os
@@ -39,7 +40,7 @@ from msmpetsc.results.layout import (
     Layout,
     chunk_offsets,
     gather_rows,
-    of_ranks,
+    is_distributed,
     open_on_all_ranks,
     open_to_write,
     write_bytes,
@@ -53,28 +54,30 @@ from msmpetsc.results.reader import (
     open_result,
 )
 
-NOTHING = Surface(
-    np.empty((0, 3)), np.empty((0, 3), np.int64)
-)  # what ranks but the first have of surfaces
+# surfaces of ranks other than rank 0
+EMPTY_SURFACE = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
 
 
 class Begin(Enum):
     """How the writing of a result file begins."""
 
-    NEW = "a new file, of a name that is free"
-    OVERWRITE = "a new file, which may replace another"
-    IN_PLACE = "an earlier file as it lies there, laid out for all frames: only numbers in their places are written"
-    COPY = "a new file with the frames of an earlier one, which it replaces when it has them and a checkpoint"
+    NEW = "write a new file, whose name must be free"
+    OVERWRITE = "write a new file, which may replace an existing file"
+    IN_PLACE = "write into an existing file, in which everything is laid out already"
+    COPY = (
+        "copy an existing file's frames and a checkpoint to a new file, then replace the old file"
+    )
 
 
 class ResultFile:
-    """The result file of one run. Every rank of `comm` calls every method; errors are raised on all together.
+    """The result file of a run. All ranks call every method together and raise errors together.
 
-    The file has a temporary name until `start_frames`; closed before that, it is dropped, and an old file of its
-    name stays. What cannot be written (full disk, no permission) raises InputError. A lock beside the file, where the
-    file system has locks, keeps a second run from writing it at the same time.
+    Until `start_frames` the file has a temporary name. If it is closed before that, it is deleted,
+    and an existing file of its name stays. A lock beside the file prevents a second run from
+    writing it at the same time, if the file system has locks. Write errors (full disk, no
+    permission) raise InputError.
 
-    finished : number of frames that it holds
+    finished : number of finished frames in the file
     """
 
     def __init__(
@@ -85,36 +88,41 @@ class ResultFile:
         begin: Begin = Begin.NEW,
         gathers: bool = False,
     ):
-        """Open the file.
+        """Open the file (collective).
 
-        attributes : who makes it and how; format and format_version are added
-        gathers    : rank 0 writes frames for all ranks, even where each can reach the file
+        attributes : origin of the file; format and format_version are added
+        begin      : whether the file is new, a copy, or written in place
+        gathers    : rank 0 writes the frames of all ranks, even if each rank can reach the file
+
+        Raises InputError if the file cannot be written, exists, or is locked.
         """
         self.path = Path(path)
         self._planned = self.finished = 0
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
-        self._comm, self._begin, self._gathers = comm, begin, gathers
-        self._file: h5py.File | None = None  # open on rank 0 only
-        self._storage: Storage | None = None  # that it is written to
-        self._numbers: dict[
-            str, h5py.Dataset
-        ] = {}  # datasets of one number a frame, once it has frames
-        self._direct: int | None = (
-            None  # descriptor of the same file on each rank, once it has its name
-        )
-        self._opened = (
-            ExitStack()
-        )  # on rank 0 the lock, the temporary name and the storage, until they are given up
-        self._copied: int | None = None  # most frames to take over, all if None
-        self._rows: dict[str, list[int]] = {}  # fields that ranks have rows of: how many each has
-        self._failed = False  # to write
-        self._passing: dict[
-            Path, int
-        ] = {}  # inodes of files that last no longer than the run, by name
+        self._comm = comm
+        self._begin = begin
+        self._gathers = gathers
+        # on rank 0 only, as is its storage
+        self._file: h5py.File | None = None
+        self._storage: Storage | None = None
+        # datasets of a number for each frame, set by start_frames
+        self._numbers: dict[str, h5py.Dataset] = {}
+        # descriptor of the file on each rank, set by start_frames if all ranks reach it
+        self._descriptor: int | None = None
+        # lock, temporary name and storage on rank 0, to be released
+        self._resources = ExitStack()
+        # largest number of frames to copy, all if None
+        self._most_copied: int | None = None
+        # number of rows of each rank, by the name of a distributed field
+        self._rows: dict[str, list[int]] = {}
+        # whether a write has failed
+        self._failed = False
+        # inodes of the files that do not outlast the run, by path
+        self._temporary: dict[Path, int] = {}
         with self._together():
             if comm.rank == 0:
                 self._open(attributes)
-        self._passing = comm.bcast(self._passing)
+        self._temporary = comm.bcast(self._temporary)
 
     def __enter__(self) -> "ResultFile":
         return self
@@ -124,25 +132,30 @@ class ResultFile:
     ) -> None:
         if kind is None:
             self.close()
-        else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
+        else:
+            # Nothing collective is called, as other ranks may be elsewhere. After a
+            # failed write the disk may be full, and then metadata must not change.
             with suppress(InputError), plain_errors(self.path):
-                self._finish(trim=not self._failed)  # a full disk is no place to change metadata
+                self._finish(trim=not self._failed)
             if not getattr(error, "on_all_ranks", False):
                 self.abandon()
 
     def abandon(self) -> None:
-        """Remove the lock and the temporary file, as MPI_Abort is about to end rank 0. Any rank may call it."""
-        for path, inode in self._passing.items():
+        """Remove the lock and the temporary file before MPI_Abort ends rank 0; not collective."""
+        for path, inode in self._temporary.items():
             unlink_inode(path, inode)
 
     def write(self, name: str, rows: Array) -> None:
-        """Store the rows of all ranks, (n_local, ...) on each, in order as dataset `name`: "lattice/nodes".
+        """Store the rows of all ranks, (n_local, ...) each, in order in a dataset (collective).
 
-        A file that begins in place has it; raises InputError where its shape is another.
+        name : of the dataset, "lattice/nodes"; a file written in place has it already
+
+        Raises InputError if the existing dataset has another shape.
         """
         rows = np.asarray(rows)
         counts, dtypes = zip(*self._comm.allgather((len(rows), rows.dtype)), strict=True)
-        dtype, shape = np.result_type(*dtypes), (sum(counts), *rows.shape[1:])
+        dtype = np.result_type(*dtypes)
+        shape = (sum(counts), *rows.shape[1:])
         with self._together():
             if self._file is not None and self._begin is Begin.IN_PLACE:
                 stored = checked_dataset(self.path, self._file, name).shape
@@ -155,25 +168,25 @@ class ResultFile:
 
     def keep(self, frames: int) -> None:
         """Limit the number of frames that are copied from the earlier file."""
-        self._copied = frames
+        self._most_copied = frames
 
     def start_frames(
         self,
         count: int,
         nodes: int,
-        also: Mapping[str, int] | None = None,
+        optional: Mapping[str, int] | None = None,
         saved: Checkpoint | None = None,
     ) -> None:
-        """Plan the frames and checkpoints, and give the file its name.
+        """Lay out frames and checkpoints, and give the file its name (collective).
 
-        count : of frames, frame 0 included
-        nodes : of this rank
-        also  : this rank's rows of fields that not all scenes ask for, by their names: {"surface": 1000}
-        saved : a checkpoint like those to come; None: of q and q_previous alone
+        count    : number of frames, frame 0 included
+        nodes    : number of this rank's nodes
+        optional : number of this rank's rows in the optional fields, by name: {"surface": 1000}
+        saved    : a checkpoint with the rows and numbers to lay out; None for q and q_previous
         """
-        given = self._comm.allgather({"position": nodes, **(also or {})})
-        counts = {name: [rank[name] for rank in given] for name in given[0]}
-        self._rows = {name: counts[name] for name in counts if of_ranks(name)}
+        rows_of_ranks = self._comm.allgather({"position": nodes, **(optional or {})})
+        counts = {name: [rank[name] for rank in rows_of_ranks] for name in rows_of_ranks[0]}
+        self._rows = {name: counts[name] for name in counts if is_distributed(name)}
         sizes = {
             name: sum(rows) if name in self._rows else rows[0] for name, rows in counts.items()
         }
@@ -185,7 +198,8 @@ class ResultFile:
         with self._together():
             if self._file is not None:
                 self._lay_out(self._file, layout)
-        self.finished, self._planned = self._comm.bcast(self.finished), count
+        self.finished = self._comm.bcast(self.finished)
+        self._planned = count
         if self._begin is Begin.COPY and saved is not None:
             self.write_checkpoint(saved)
         with self._together():
@@ -197,13 +211,13 @@ class ResultFile:
                 self._numbers = {
                     name: dataset
                     for name, dataset in self._file["frames"].items()
-                    if name in FRAME_FIELDS and name != "time" and not of_ranks(name)
+                    if name in FRAME_FIELDS and name != "time" and not is_distributed(name)
                 }
         if self._comm.size > 1 and not self._gathers:
-            self._direct = open_on_all_ranks(self._comm, self.path)
+            self._descriptor = open_on_all_ranks(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:
-        """Store the next frame, so that no kill can lose it once this returns."""
+        """Store the next frame (collective). After the return a kill cannot lose it."""
         index = self.finished
         for name, counts in self._rows.items():
             self._collect(
@@ -218,12 +232,13 @@ class ResultFile:
                 for name, numbers in self._numbers.items():
                     numbers[index] = getattr(frame, name)
                 self._flush(self._file)
-                self._file["frames/time"][index] = frame.time  # from here on the frame is there
+                # the frame is finished from here on
+                self._file["frames/time"][index] = frame.time
                 self._flush(self._file)
         self.finished += 1
 
     def write_checkpoint(self, saved: Checkpoint) -> None:
-        """Store a checkpoint, with the rows and numbers that were planned."""
+        """Store a checkpoint, with the rows and numbers laid out by `start_frames` (collective)."""
         slot = 0
         with self._together():
             if self._file is not None:
@@ -246,18 +261,19 @@ class ResultFile:
                 self._flush(self._file)
 
     def close(self, trim: bool = True) -> None:
-        """Close the file; a second call does nothing.
+        """Close the file (collective); a second call does nothing.
 
-        Before, trim the frames to the finished ones, but where the run is to go on: as it lies
-        there the file has room for the rest.
+        trim : cut the datasets to the finished frames; a run that is to be resumed in place needs
+               them at their planned length
         """
         with self._together():
             self._finish(trim)
-        self._passing = {}
+        self._temporary = {}
 
     # On rank 0 alone
 
     def _open(self, attributes: dict[str, Any]) -> None:
+        """Take the lock and open the file: the existing file in place, or a new temporary file."""
         if self._begin is not Begin.IN_PLACE:
             self._refuse_to_replace()
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -275,10 +291,10 @@ class ResultFile:
                 self._file.attrs.update(
                     attributes | {"format": FORMAT, "format_version": FORMAT_VERSION}
                 )
-                self._passing[self._part] = self._part.stat().st_ino
+                self._temporary[self._part] = self._part.stat().st_ino
             opened.callback(self._storage.close)
-            self._passing[lock.path] = lock.inode
-            self._opened = opened.pop_all()
+            self._temporary[lock.path] = lock.inode
+            self._resources = opened.pop_all()
 
     def _flush(self, file: h5py.File) -> None:
         """Flush the file. Raises OSError for an earlier write error."""
@@ -287,11 +303,16 @@ class ResultFile:
             raise self._storage.failure
 
     def _refuse_to_replace(self) -> None:
+        """Raise InputError if the path is no file, or a file that may not be replaced."""
         refuse_no_file(self.path)
         if self.path.exists() and self._begin is Begin.NEW:
             raise InputError(f"{self.path} exists: --overwrite replaces it")
 
     def _lay_out(self, file: h5py.File, layout: Layout) -> None:
+        """Create the datasets, or check the existing datasets of a file written in place.
+
+        Raises InputError if the disk is too small, or an existing dataset does not fit.
+        """
         if self._begin is Begin.IN_PLACE:
             if name := layout.first_misfit(file):
                 raise InputError(
@@ -306,7 +327,7 @@ class ResultFile:
             self._copy_frames(file)
 
     def _copy_frames(self, file: h5py.File) -> None:
-        """Copy the frames of the earlier file, as many as it has and `keep` allows."""
+        """Copy the finished frames of the earlier file, up to the limit of `keep`."""
         with Result(self.path) as earlier:
             datasets = {
                 name: file["frames"][name] for name in earlier.frames if name in file["frames"]
@@ -314,36 +335,40 @@ class ResultFile:
             for name, dataset in datasets.items():
                 if dataset.shape[1:] != earlier.frames[name].shape[1:]:
                     raise InputError(
-                        f"{self.path} is damaged: frames/{name} has shape {earlier.frames[name].shape}"
+                        f"{self.path} is damaged: frames/{name} has shape "
+                        f"{earlier.frames[name].shape}"
                     )
             count = len(earlier.frames.time)
-            if self._copied is not None:
-                count = min(self._copied, count)
+            if self._most_copied is not None:
+                count = min(self._most_copied, count)
             for index in range(count):
                 for name, dataset in datasets.items():
                     dataset[index] = earlier.frames[name][index]
         self.finished = count
 
     def _finish(self, trim: bool) -> None:
-        if self._direct is not None:
-            os.close(self._direct)
-        self._direct = None
-        file, self._file, self._numbers = self._file, None, {}
+        """Trim the frames if asked to, then close the file and release its lock."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+        self._descriptor = None
+        file = self._file
+        self._file = None
+        self._numbers = {}
         if file is None:
             return
-        with self._opened, file:
+        with self._resources, file:
             if trim and self.finished < self._planned:
                 for name in FRAME_FIELDS.keys() & file["frames"].keys():
                     file["frames"][name].resize(self.finished, axis=0)
 
-    # What the ranks do together
+    # On all ranks together
 
     @contextmanager
     def _together(self) -> Iterator[None]:
-        """Raise an error of any rank on all ranks after the block."""
+        """Raise an error of any rank on all ranks after the block (collective)."""
         try:
-            telling = self._storage.telling() if self._storage else nullcontext()
-            with together(self._comm), plain_errors(self.path), telling:
+            reporting = self._storage.reporting_errors() if self._storage else nullcontext()
+            with together(self._comm), plain_errors(self.path), reporting:
                 yield
         except InputError:
             self._failed = True
@@ -357,12 +382,13 @@ class ResultFile:
         name: str,
         index: int | None = None,
     ) -> None:
-        """Write the ranks' rows, `counts` of each, into dataset `name`, or into its row `index`."""
+        """Write the ranks' rows, `counts` each, to a dataset or its row `index` (collective)."""
         rows = np.ascontiguousarray(rows, dtype)
-        if self._direct is not None and index is not None:
-            self._write_directly(self._direct, rows, counts, name, index)
+        if self._descriptor is not None and index is not None:
+            self._write_directly(self._descriptor, rows, counts, name, index)
             return
-        file: Any = self._file  # on rank 0, which alone stores
+        # on rank 0, the only rank that stores
+        file: Any = self._file
 
         def store(part: slice, piece: Array) -> None:
             file[name][part if index is None else (index, part)] = piece
@@ -373,6 +399,7 @@ class ResultFile:
     def _write_directly(
         self, descriptor: int, rows: Array, counts: Sequence[int], name: str, index: int
     ) -> None:
+        """Write each rank's rows to their bytes in row `index` of dataset `name` (collective)."""
         chunk, offsets = 0, []
         with self._together():
             if self._file is not None:
@@ -400,13 +427,14 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     several = len(model.bodies) > 1
     if several:
         file.write("lattice/body", lattice.body[:owned].astype("i4"))
-    if comm.bcast(bool(model.solids)):  # all of them on rank 0
-        solids = joined([*model.solids.values()]) or NOTHING
+    # rank 0 has all solids
+    if comm.bcast(bool(model.solids)):
+        solids = joined([*model.solids.values()]) or EMPTY_SURFACE
         counts = [len(solid.triangles) for solid in model.solids.values()]
         file.write("obstacle/points", solids.points)
         file.write("obstacle/triangles", solids.triangles)
         file.write("obstacle/number", np.repeat(np.array([*model.solids], "i4"), counts))
-    surface, embedding = model.surface or NOTHING, model.embedding
+    surface, embedding = model.surface or EMPTY_SURFACE, model.embedding
     if embedding is None:
         return
     if several:

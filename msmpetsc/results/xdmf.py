@@ -1,4 +1,4 @@
-"""The XDMF 3 file of a result, which lets ParaView open the frames and holds no data itself."""
+"""Write the XDMF 3 file of a result, by which ParaView opens the frames; it holds no data."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,8 +13,9 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
-SHARE = 0.05  # of a run's time that its XDMF file may take before the end
-# Length of the difference of two vectors, whose x, y and z are the arguments in pairs. VTK's
+# share of a run's time for updates of the XDMF file [-]; hardly slows the run
+SHARE = 0.05
+# Length of the difference of two vectors, given as pairs of components x, y, z. VTK's
 # functions know no other name of the root, and no exponents in numbers.
 LENGTH = "sqrt(($0 - $1) * ($0 - $1) + ($2 - $3) * ($2 - $3) + ($4 - $5) * ($4 - $5))"
 HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0"><Domain>'
@@ -38,8 +39,8 @@ class GrowingXdmf:
 def write_xdmf(h5_path: str | Path) -> Path:
     """Write x.xdmf beside x.h5 for its finished frames, and return its path. Raises InputError.
 
-    Two temporal collections: the surface triangles, if the surface was stored, and the lattice
-    cells with their stress, if that was. Both have displacement, velocity and speed.
+    The file has two temporal collections: the surface triangles, if the surface was stored, and the
+    lattice cells, with any stored stress. Both have displacement, velocity and speed.
     """
     h5_path = Path(h5_path)
     with Result(h5_path) as run:
@@ -54,7 +55,11 @@ def write_xdmf(h5_path: str | Path) -> Path:
 
 
 def _collection(run: Result, name: str, kind: str, elements: str, points: str) -> Iterator[str]:
-    """Yield the lines of a grid for each finished frame, of topology ``kind`` on a field of points."""
+    """Yield the lines of a collection of grids, one for each finished frame.
+
+    kind   : XDMF's topology type
+    points : name of the field of point positions
+    """
     yield f'<Grid Name="{name}" GridType="Collection" CollectionType="Temporal">'
     topology = f'<Topology TopologyType="{kind}" NumberOfElements="{len(run[elements])}">'
     topology += f"{_data(run, elements)}</Topology>"
@@ -79,11 +84,12 @@ def _collection(run: Result, name: str, kind: str, elements: str, points: str) -
 
 
 def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str]:
-    """Yield the attributes of a frame that are differences of positions, which readers compute.
+    """Yield the attributes of a frame that readers compute as differences of positions.
 
-    Velocity is that from the frame before to the frame after, as far as these are there.
+    The velocity is a central difference between frames, or one-sided at either end.
     """
-    rows, at_rest = run.frames[points].shape[1], _data(run, FRAME_FIELDS[points].at_rest)
+    rows = run.frames[points].shape[1]
+    at_rest = _data(run, FRAME_FIELDS[points].at_rest)
     moved = _function("$0 - $1", f"{rows} 3", [_slab(run, points, index), at_rest])
     before, after = max(index - 1, 0), min(index + 1, len(times) - 1)
     passed = float(times[after] - times[before])
@@ -100,7 +106,7 @@ def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str
 def _stress(run: Result, index: int) -> Iterator[str]:
     """Yield the attributes of a frame's stress.
 
-    A tensor is two vectors, since XDMF's readers differ in the order of its components.
+    A tensor is stored as two vectors, as readers of XDMF differ in the order of tensor components.
     """
     for name in filter(run.frames.__contains__, STRESS):
         centre = "Cell" if "c" in FRAME_FIELDS[name].shape else "Node"
@@ -112,22 +118,25 @@ def _stress(run: Result, index: int) -> Iterator[str]:
 
 
 def _attribute(name: str, sort: str, centre: str, item: str) -> str:
+    """Return an attribute of a grid, with the reference ``item`` to its values."""
     return f'<Attribute Name="{name}" AttributeType="{sort}" Center="{centre}">{item}</Attribute>'
 
 
 def _function(formula: str, size: str, arguments: list[str]) -> str:
+    """Return a reference to the values of a formula, which the reader computes."""
     head = f'<DataItem ItemType="Function" Function="{formula}" Dimensions="{size}">'
     return "".join([head, *arguments, "</DataItem>"])
 
 
 def _slab(run: Result, name: str, index: int, first: int = 0, columns: int = 3) -> str:
-    """Return a reference to so many columns, from ``first`` on, of frame ``index`` of a field.
+    """Return a reference to columns of a frame of a field: start, stride, count and dataset.
 
-    columns : 0 for a field (T, r) that has none
+    first, columns : first column and number of columns; 0 columns for a field (T, r)
 
-    It is start, stride, count, and the dataset. VTK takes the comment for its name, and caches by it.
+    VTK uses the comment as the name of the slab, by which it caches.
     """
-    size, more = f"{run.frames[name].shape[1]}" + f" {columns}" * bool(columns), columns > 0
+    more = columns > 0
+    size = f"{run.frames[name].shape[1]}" + f" {columns}" * more
     select = f"{index} 0{f' {first}' * more} 1 1{' 1' * more} 1 {size}"
     return (
         f'<DataItem ItemType="HyperSlab" Dimensions="{size}" Type="HyperSlab">'
@@ -138,7 +147,7 @@ def _slab(run: Result, name: str, index: int, first: int = 0, columns: int = 3) 
 
 
 def _data(run: Result, name: str) -> str:
-    """Return a reference to a whole dataset by the file's name alone: both files can move together."""
+    """Return a reference to a whole dataset, by the file's name so that both files can be moved."""
     array, place = run[name], escape(f"{run.path.name}:/{name}")
     kind, shape = NUMBER_TYPES[array.dtype.kind], " ".join(map(str, array.planned))
     head = f'<DataItem Format="HDF" NumberType="{kind}" Precision="{array.dtype.itemsize}"'

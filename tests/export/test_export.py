@@ -141,7 +141,8 @@ def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tm
 
 
 WRONG = {
-    "what is exported is named *.glb, *.usd": ("x.vtkhdf", {}),  # on a full disk HDF5 crashed in it
+    # on a full disk HDF5 crashed in it
+    "unknown format: name the file *.glb, *.usd": ("x.vtkhdf", {}),
     "has frames 0 to 4, not 5": ("x.glb", {"frames": [0, 5]}),
     "a *.obj holds one frame, not 2": ("x.obj", {"frames": [0, 1]}),
     "must follow each other in time": ("x.glb", {"frames": [3, 1]}),

@@ -165,7 +165,7 @@ def test_fields_that_one_alone_has_are_told(a: Path, tmp_path: Path, capsys):
         (dict(nodes=np.vstack([NODES, [[9, 9, 9]]]), mass=np.ones(13)), "12 and 13 nodes"),
         (dict(nodes=2 * NODES), "cells of 0.5 m and 1 m"),
         (dict(nodes=NODES + np.array([1e-3, 0, 0])), r"node 0 rests at \(0, 0, 0\) m in one"),
-        (dict(cells=np.full((2, 8), 99)), "lattice/cells names what is not among its 12 nodes"),
+        (dict(cells=np.full((2, 8), 99)), "lattice/cells has numbers outside its 12 nodes"),
     ],
 )
 def test_other_lattices_are_refused_with_the_reason(

@@ -181,7 +181,7 @@ def test_where_hdf5_itself_fails_a_child_fails(bar_result, monkeypatch, ending):
     from msmpetsc.results import reader
 
     code = {"crashes": "os.abort()", "hangs": "while True: pass"}[ending]
-    monkeypatch.setattr(reader, "PATIENCE", 1)
+    monkeypatch.setattr(reader, "TIME_LIMIT", 1)
     monkeypatch.setattr(reader, "_read_tables", lambda path: exec(code, {"os": __import__("os")}))
     with pytest.raises(InputError, match=f"bar.h5 is damaged: the HDF5 library {ending} on it"):
         refuse_deadly(bar_result)

@@ -269,7 +269,7 @@ def springs_out_of_range(file: h5py.File) -> None:
         (
             damage(springs_out_of_range),
             "springs",
-            "lattice/springs names what is not among its 12 nodes",
+            "lattice/springs has numbers outside its 12 nodes",
         ),
     ],
 )

@@ -57,8 +57,8 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
         "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
         cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
     )  # fmt: skip
-    if model.taken:
-        log.info("%s", ", ".join(model.taken))
+    if model.node_counts:
+        log.info("%s", ", ".join(model.node_counts))
 
 
 def warn_of_long_steps(scene: Scene, model: Model) -> None:

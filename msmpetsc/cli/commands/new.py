@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
 from msmpetsc.backend.arrays import Floats
-from msmpetsc.build import USUAL
+from msmpetsc.build import USUAL_SIDES
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.prepare import part_labels
@@ -203,7 +203,7 @@ def measured(surface: Surface, report: SurfaceReport, up: str) -> MeshMeasures:
 
 def unit_of(side: float) -> float | None:
     """Return the unit [m] in which a body of this longest side has a usual size, metres before millimetres."""
-    return next((unit for unit in (1.0, MILLIMETRE) if USUAL[0] <= side * unit <= USUAL[1]), None)
+    return next((unit for unit in (1.0, MILLIMETRE) if USUAL_SIDES[0] <= side * unit <= USUAL_SIDES[1]), None)
 
 
 def uprightness(surface: Surface, axis: int) -> float:

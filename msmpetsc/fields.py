@@ -167,8 +167,8 @@ STRESS = tuple(
     for name in FRAME_FIELDS
     if name.endswith(("stress", "von_mises", "pressure", "strain_energy"))
 )
-# HDF5 dimension scale of each letter or length in a frame's shape. No scale is named like
-# a field with several axes: netCDF readers would take such a field for coordinates.
+# HDF5 dimension scale of each letter or length in a frame's shape. No scale is named
+# like a field with several axes, which netCDF readers would take for coordinates.
 DIMENSIONS: dict[int | str, str] = {
     "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle",
     "b": "body", "w": "probe_number", 3: "axis", 6: "component",

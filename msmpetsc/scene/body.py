@@ -129,7 +129,7 @@ class Material(Table):
     )
     damping: NotNegative = Field(
         0.0,
-        description="mass-proportional damping rate: free velocities decay as exp(-damping t) [1/s]",
+        description="mass-proportional damping: free velocities decay as exp(-damping t) [1/s]",
     )
     retardation_time: NotNegative = Field(
         0.0,

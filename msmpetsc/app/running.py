@@ -81,7 +81,7 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     refuse_early(comm)
     choose(comm, request.device)
     began = perf_counter()
-    logged = {}
+    logged: dict[str, float] = {}
     if request.measure:
         PETSc.Log.begin()
         logged = event_times()

@@ -369,7 +369,8 @@ def _loads(
             share = shares_by_mass(comm, where, lattice.mass)
             loads.append(Load(share, total_of(force.total), **acts))
         else:
-            rows, function = np.flatnonzero(where), FORCES.find(force.function)
+            rows = np.flatnonzero(where)
+            function = FORCES.find(force.function)
             own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], **acts))
     return loads, tuple(own_forces)
 

@@ -73,7 +73,8 @@ class Checkpoint:
     def restore_counts(self, part: Counting) -> None:
         """Set the counters of a part to their stored values; raise InputError out of range."""
         for attribute, bounds in part.state.items():
-            value, name = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
+            value = getattr(part, attribute)
+            name = f"{type(part).__name__}.{attribute}"
             if is_dataclass(value) and not isinstance(value, type):
                 inner = {
                     item: self._like(f"{name}.{item}", number, bounds)

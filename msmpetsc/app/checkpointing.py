@@ -34,7 +34,10 @@ class Checkpoints:
     """
 
     def __init__(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop", every: int | None):
-        self.comm, self.file, self.simulation, self.every = comm, file, simulation, every
+        self.comm = comm
+        self.file = file
+        self.simulation = simulation
+        self.every = every
         self.signal = 0
         # of the last checkpoint: its step, the frames since then, the time of its end,
         # and the interval to the next checkpoint [s]

@@ -117,7 +117,9 @@ class Cost:
     """
 
     def __init__(self, comm: MPI.Comm, simulation: TimeLoop, setup: float):
-        self.comm, self.simulation, self.setup = comm, simulation, setup
+        self.comm = comm
+        self.simulation = simulation
+        self.setup = setup
         self.output = self.stepping = 0.0
         self.products: dict[int, int] = {}
         model = simulation.model

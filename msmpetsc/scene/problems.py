@@ -124,8 +124,9 @@ def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]
         if kind == "extra_forbidden" and len(loc) == 1:
             context["valid"] = known
         elif kind == "missing" and isinstance(loc[-1], int):
-            kind, identity, context = "too_few", loc[:-1], {"length": loc[-1] + 1}
-            loc = loc[:-1]
+            kind = "too_few"
+            context = {"length": loc[-1] + 1}
+            identity = loc = loc[:-1]
         elif kind == "missing" and len(loc) == 1 and loc[0] in meant:
             continue
         custom = PydanticCustomError(kind, "{kind}", context)

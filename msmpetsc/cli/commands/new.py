@@ -241,10 +241,10 @@ def unit_of(side: float) -> float | None:
 
 
 def uprightness(surface: Surface, axis: int) -> float:
-    """Return the stability of a body with an axis upwards less that with it downwards, in [-1, 1].
+    """Return the excess in [-1, 1] of a body's stability with an axis upwards over downwards.
 
-    A chair is stable on its feet and unstable on its head. A body on its back is about equally
-    stable both ways.
+    A chair is stable on its feet and unstable on its head, but on its side about equally stable
+    both ways.
     """
     return stability(surface, axis, 1) - stability(surface, axis, -1)
 
@@ -253,8 +253,8 @@ def stability(surface: Surface, axis: int, sign: int) -> float:
     """Return the stability in [0, 1] of a body with an axis upwards (sign 1) or downwards (-1).
 
     The base is the convex hull of the lowest points in the ground plan. The stability is the area
-    of the base over the area of the hull of all points. It is smaller if the base is a flat face
-    instead of feet, and zero if the centre of the surface is not above the base.
+    of the base over the area of the hull of all points. A base that is a flat face instead of
+    feet lowers it. If the centre of the surface is not above the base, it is zero.
     """
     used = np.unique(surface.triangles)
     plan = np.delete(surface.points, axis, axis=1)

@@ -63,7 +63,7 @@ class Model:
     exchanges   : obstacles with response = "exchange"
     penalties   : obstacles with response = "reflect" or "penalty"
     start       : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
-    collision   : the surface that may touch itself or obstacles; None if nothing keeps it apart
+    collision   : the surface in contact with itself or barriers; None without such contact
     bodies      : each body's surface and report
     node_counts : lines of the log: how many nodes each anchor leads and each force pulls
     damping     : mass-proportional damping rate [1/s]
@@ -259,7 +259,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 
 
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
-    """Return the prepared bodies: surfaces on rank 0, reports and bounds on all (collective)."""
+    """Return the prepared bodies, with their surfaces on rank 0 only (collective)."""
     prepared = on_root(comm, lambda: [*_prepared(scene)]) or []
     facts = comm.bcast([(report, bounds_of(surface)) for surface, report in prepared])
     surfaces: list[Surface | None] = [surface for surface, _ in prepared] or [None] * len(facts)

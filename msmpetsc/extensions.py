@@ -13,7 +13,7 @@ from msmpetsc.errors import InputError, did_you_mean
 # positions (k, 3) [m] and velocities (k, 3) [m/s] of this rank's nodes in the region,
 # time [s] -> force per mass (k, 3) [N/kg]
 ForceFunction = Callable[[Positions, Rows, float], Rows]
-# positions (k, 3) [m], relative to the obstacle's position at time 0
+# positions (k, 3) [m] in the obstacle's frame of time 0
 # -> signed distances (k,) [m] and their gradients (k, 3)
 DistanceFunction = Callable[[Positions], tuple[Floats, Rows]]
 T = TypeVar("T")

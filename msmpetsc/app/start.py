@@ -86,18 +86,18 @@ def run(*values: Any, **keywords: Any) -> Path:
 def carry_out(comm: MPI.Intracomm, request: RunRequest) -> int:
     """Run a request; return the exit status (collective)."""
     started = perf_counter()
-    with options_given(comm, request) as (asked, earlier):
+    with options_given(comm, request) as (request, earlier):
         from msmpetsc.app.running import run_steps
 
-        return run_steps(comm, asked, earlier, started)
+        return run_steps(comm, request, earlier, started)
 
 
 def options_shown(comm: MPI.Intracomm, request: RunRequest) -> list[str]:
     """Return the PETSc options of a run as lines of an options file (collective)."""
-    with options_given(comm, request) as (asked, earlier):
+    with options_given(comm, request) as (request, earlier):
         from msmpetsc.app.running import lines_of_options
 
-        return lines_of_options(comm, asked, earlier)
+        return lines_of_options(comm, request, earlier)
 
 
 @contextmanager

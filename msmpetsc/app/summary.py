@@ -51,9 +51,9 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
         name = f"body.{number}" if len(model.bodies) > 1 else "body"
         size = " x ".join(f"{length:.4g}" for length in body.bounds[1] - body.bounds[0])
         log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
-    held = int(lattice.pinned[: lattice.owned].sum())
+    own_pinned = int(lattice.pinned[: lattice.owned].sum())
     cells, springs, pinned = (
-        comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, held)
+        comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, own_pinned)
     )
     log.info(
         "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
@@ -91,9 +91,9 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
 def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:
     """Log the duration of the run [s] and its files; the first file has the frames."""
     sizes = {path: tqdm.format_sizeof(path.stat().st_size, "B") for path in files if path.is_file()}
-    result, *others = (f"{path} ({size})" for path, size in sizes.items())
+    result, *companions = (f"{path} ({size})" for path, size in sizes.items())
     log.info("took %s, %s of it before the first step", duration(seconds), duration(setup))
-    log.info("left %d frame%s in %s", frames, "s" * (frames != 1), ", ".join([result, *others]))
+    log.info("left %d frame%s in %s", frames, "s" * (frames != 1), ", ".join([result, *companions]))
 
 
 def tell_stop(number: int, path: Path, simulation: TimeLoop) -> int:

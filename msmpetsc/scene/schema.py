@@ -105,7 +105,7 @@ def unlike_the_material(scene: Any) -> Iterator[Broken]:
 
 
 def regions_of_no_body(scene: Any) -> Iterator[Broken]:
-    """Yield the broken rules of the scene's own regions that only make sense for a single body."""
+    """Yield a broken rule for each region of all bodies that is relative or painted."""
     for kind in OF_REGIONS:
         for number, table in enumerate(getattr(scene, kind) if scene.body else ()):
             if table.region.relative or table.region.painted is not None:

@@ -82,12 +82,12 @@ class Environment:
         end  : positions (l, 3) [m] at which an earlier solve of this step ended; the normal forces
             there then limit friction
         """
-        before = self._before(q)
+        previous = self._previous_contact(q)
         surface = None
-        states = self.obstacles.during(q, last, end, (time, time_step), sides, before)
+        states = self.obstacles.during(q, last, end, (time, time_step), sides, previous)
         if self.contacts and not self.contacts.apart:
             surface = SurfaceContact(
-                self.contacts, q, time_step, last, end, before.surface if before else None
+                self.contacts, q, time_step, last, end, previous.surface if previous else None
             )
         return Contact(states, self.lattice.owned, surface) if states or surface else None
 
@@ -101,7 +101,7 @@ class Environment:
             self.contacts = Contacts(self.self_contact, begin, time, self.contacts)
             self.contacts.narrow(q, begin)
 
-    def _before(self, q: Positions) -> Contact | None:
+    def _previous_contact(self, q: Positions) -> Contact | None:
         """Return the contact of the last step if it ended at q, otherwise None (collective)."""
         if self._ended is None:
             return None

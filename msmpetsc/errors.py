@@ -1,4 +1,4 @@
-"""Expected errors of the package: one line for the user, and an exit status for each class."""
+"""Expected errors of the package: a line for the user, and an exit status for each class."""
 
 import difflib
 from collections.abc import Iterable

@@ -30,7 +30,7 @@ class Field(NamedTuple):
 
 
 def _number(dtype: str, unit: str, long_name: str) -> Field:
-    """Return a field with one number in each frame."""
+    """Return a field with a number in each frame."""
     return Field(dtype, ("T",), unit, long_name)
 
 
@@ -40,7 +40,7 @@ def _of_nodes(unit: str, long_name: str) -> Field:
 
 
 def _of_cells(unit: str, long_name: str) -> Field:
-    """Return a field with one number for each cell."""
+    """Return a field with a number for each cell."""
     return Field("f4", ("T", "c"), unit, long_name)
 
 
@@ -150,7 +150,7 @@ class Frame:
     ] = None
 
     def __repr__(self) -> str:
-        """Return step, time and solver figures in one line, without the arrays."""
+        """Return step, time and solver figures in a line, without the arrays."""
         solved = f"its {self.ksp_its}, error {self.step_error:.1e}"
         return (
             f"Frame({self.index}: t = {self.time:.6g} s, {solved}, position {self.position.shape})"

@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # what FROM says, for type checkers
+# FROM again, as imports that a type checker can follow
+if TYPE_CHECKING:
     from msmpetsc.app.start import Simulation as Simulation
     from msmpetsc.app.start import frames as frames
     from msmpetsc.app.start import run as run
@@ -16,7 +17,8 @@ if TYPE_CHECKING:  # what FROM says, for type checkers
     open = Result
 
 __version__ = "0.2.0"
-FROM = {  # what is imported when it is first used: reading a result needs numpy and h5py alone
+# import path of each public name; imported on first use, as `open` needs few packages
+FROM = {
     "Frame": "msmpetsc.fields.Frame",
     "Result": "msmpetsc.results.reader.Result",
     "Scene": "msmpetsc.scene.reading.Scene",
@@ -31,7 +33,7 @@ FROM = {  # what is imported when it is first used: reading a result needs numpy
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on its first use. Raises InputError for a package that is missing."""
+    """Import a public name on its first use; raise InputError for a missing package."""
     if name not in FROM:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
@@ -46,5 +48,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names, those not imported yet included, and Python's own."""
+    """Return Python's own names and all public names, whether imported yet or not."""
     return sorted({*FROM, *(name for name in globals() if name.startswith("__"))})

@@ -1,4 +1,4 @@
-"""``python -m msmpetsc``."""
+"""Run the command line as ``python -m msmpetsc``."""
 
 from msmpetsc.cli.main import entry_point
 

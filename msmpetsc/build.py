@@ -1,4 +1,4 @@
-"""From a scene to what is simulated: surfaces, cages, lattice, embedding, loads, obstacles."""
+"""Build the model of a scene: surfaces, cages, lattice, embedding, loads and obstacles."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -43,28 +43,34 @@ from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import OfBody, held_by
 
-SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
-PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
-FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
-USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
+# range of a body's longest side [m]; its fourth power stays within a double
+SIDE_LIMITS = 1e-60, 1e60
+# default stiffness of an obstacle [stiffest spring]; so that nodes sink in by little
+PENALTY = 10.0
+# largest coordinate of a body [its longest side]; seven digits of the shape remain
+MAX_OFFSET = 1e9
+# usual range of a body's longest side [m]; a mesh beyond it is probably not in metres
+USUAL_SIDES = 1e-3, 20.0
 
 
 @dataclass(frozen=True)
 class Model:
-    """A scene made ready to step. Arrays hold this rank's share; the surfaces are on rank 0 only.
+    """A scene made ready to step. Arrays hold this rank's rows; the surfaces are on rank 0 only.
 
-    embedding : this rank's rows of W (geometry.embedding); None where the scene stores no surface
-    loads     : gravity first, where there is any
-    own_forces : forces that are functions of the state that starts a step
-    start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
-    surface   : of all bodies, one after the other
-    damping   : of velocities, by the mass [1/s]
+    surface     : surfaces of all bodies, joined in the scene's order
+    embedding   : this rank's rows of W (geometry.embedding); None if the scene stores no surface
+    loads       : gravity, if there is any, then the forces of given total
+    exchanges   : obstacles with response = "exchange"
+    penalties   : obstacles with response = "reflect" or "penalty"
+    start       : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
+    collision   : the surface in contact with itself or barriers; None without such contact
+    bodies      : each body's surface and report
+    node_counts : lines of the log: how many nodes each anchor leads and each force pulls
+    damping     : mass-proportional damping rate [1/s]
     retardation : viscosity over stiffness [s]
-    collision : the surface that meets itself, where it does
-    obstacles : in the scene's order
-    holders   : pins and anchors, and which nodes each has
-    bodies    : surfaces, and what all ranks know of them
-    taken     : what anchors and forces take, in words
+    own_forces  : forces that are functions of the state at the start of a step
+    obstacles   : all obstacles in the scene's order
+    holders     : pins and anchors, and the nodes that each holds
     """
 
     surface: Surface | None
@@ -77,7 +83,7 @@ class Model:
     start: InitialState
     collision: CollisionSurface | None = None
     bodies: tuple[BodySurface, ...] = ()
-    taken: tuple[str, ...] = ()
+    node_counts: tuple[str, ...] = ()
     damping: float = 0.0
     retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
@@ -88,13 +94,16 @@ class Model:
 
     @property
     def body_of_point(self) -> Indices:
-        """Return the number (v,) of the body of each surface point, on rank 0."""
+        """Return the body number (v,) of each surface point, on rank 0."""
         points = [0 if body.surface is None else len(body.surface.points) for body in self.bodies]
         return np.repeat(np.arange(len(points)), points)
 
     @cached_property
     def solids(self) -> dict[int, Surface]:
-        """Return the surfaces of obstacles that are meshes or functions, by number, on rank 0 (collective at first)."""
+        """Return the surfaces of mesh and function obstacles by number, on rank 0.
+
+        The first access is collective.
+        """
         solids = {number: obstacle.solid for number, obstacle in enumerate(self.obstacles)}
         drawn = {
             number: solid for number, solid in solids.items() if isinstance(solid, DistanceSolid)
@@ -113,25 +122,29 @@ class Model:
 
 
 class Geometry:
-    """What meshes and cages alone decide, which runs of other materials, loads and times may share.
+    """Surfaces, cages and topology: the part of a model that depends on meshes and cages alone.
 
-    bodies, cages, topology : surfaces, valid cells, and the nodes and springs that these make
+    Runs with other materials, loads and times may share it.
+
+    bodies   : prepared surfaces
+    cages    : valid cells
+    topology : nodes and springs of the cells
     """
 
     def __init__(self, comm: MPI.Comm, scene: Scene):
-        """Read the meshes and fill them (collective). Raises InputError on all ranks."""
+        """Read the meshes and fill them with cells (collective). Raises InputError on all ranks."""
         self.source = scene.folder, scene.meshes, scene.cages
         self.bodies = read_bodies(comm, scene)
         self.cages = fill_cages(self.bodies, scene)
         self.topology = topology_of(self.cages)
 
     def fits(self, scene: Scene) -> bool:
-        """Return whether a scene has these meshes and these cages."""
+        """Return whether a scene has the meshes and cages of this geometry."""
         return self.source == (scene.folder, scene.meshes, scene.cages)
 
     @cached_property
     def embedding(self) -> csr_array:
-        """Return how the surfaces follow the nodes (collective)."""
+        """Return this rank's rows of W, surface points = W @ node positions (collective)."""
         points = [
             np.empty((0, 3)) if body.surface is None else body.surface.points
             for body in self.bodies
@@ -141,42 +154,47 @@ class Geometry:
 
     @cached_property
     def nearest(self) -> Positions:
-        """Return the points (l, 3) [m] of the bodies that nodes are nearest to (collective)."""
+        """Return the nearest point (l, 3) [m] of its body for each node (collective)."""
         return nearest_of_body(self.bodies, self.cages, self.topology)
 
     def outside(self, nodes: Positions) -> Floats | None:
-        """Return how far nodes (l, 3) stick out of surfaces [m]; None where cells are whole (collective)."""
+        """Return the distance (l,) [m] of nodes (l, 3) outside their body; None with whole cells.
+
+        Collective.
+        """
         return None if self.cages.share is None else np.linalg.norm(nodes - self.nearest, axis=1)
 
 
 def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topology) -> Positions:
-    """Return the point (l, 3) [m] of its body that each node is nearest to at rest (collective).
+    """Return the nearest point (l, 3) [m] of its body for each node at rest (collective).
 
-    It is the node itself but where that sticks out of the surface: corners of boundary cells, by up to a diagonal. An
-    obstacle should be met by the surface, not by the lattice that carries it. A node that sticks out by d meets it when
-    it is d deep: there the surface is. Where the surface is flat as far as a cell that is exact, however the body has
-    turned. Where cells count whole there is nothing to correct: the lattice is the body.
+    The nearest point is the node itself, except for corners of boundary cells, which stick out
+    of the surface by up to a cell diagonal. An obstacle should meet the surface, not the lattice.
+    So a node that sticks out by d meets the obstacle at depth d, where the surface is. This is
+    exact, for any rotation of the body, if the surface is flat over a cell. With whole cells
+    the lattice is the body, and each node is its own nearest point.
     """
     owned, ghosts = np.split(topology.ijk, [len(topology.octants)])
     body = cages.grids.body_of(owned)
-    # a node within eight cells may stick out into a fold only
+    # a node shared by eight valid cells is inside, or in a narrow fold of the surface
     rows = np.flatnonzero(~topology.octants.all(axis=1) & np.array(cages.fills)[body])
     nearest = cages.grids.node_positions(owned)
     nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
     return np.concatenate([nearest, topology.table.rows_of(encode_morton(ghosts), nearest)])
 
 
-def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> Model:
-    """Build everything of a scene but its solver (collective). Raises InputError on all ranks.
+def build_model(comm: MPI.Comm, scene: Scene, geometry: Geometry | None = None) -> Model:
+    """Build the model of a scene (collective). Raises InputError on all ranks.
 
-    shape : of the scene's meshes and cages, where it is known already
+    geometry : of the scene's meshes and cages; built here if None
     """
-    shape = shape or Geometry(comm, scene)
-    bodies, cages = shape.bodies, shape.cages
+    geometry = geometry or Geometry(comm, scene)
+    bodies, cages = geometry.bodies, geometry.cages
     finder = Finder(bodies, cages, scene.folder)
-    lattice = build_lattice(cages, scene.material, cell_materials(scene, finder), shape.topology)
+    materials = cell_materials(scene, finder)
+    lattice = build_lattice(cages, scene.material, materials, geometry.topology)
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
-    points = shape.nearest if tables else lattice.nodes
+    points = geometry.nearest if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
     lattice = lattice.pin(
         reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned)
@@ -184,14 +202,14 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
     anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
-    outside = shape.outside(lattice.nodes) if scene.obstacle else None
+    outside = geometry.outside(lattice.nodes) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     return Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
         lattice=clamped(scene, lattice, masks, finder, points),
-        embedding=shape.embedding if scene.output.surface else None,
+        embedding=geometry.embedding if scene.output.surface else None,
         loads=loads,
         own_forces=own_forces,
         anchors=anchors,
@@ -200,7 +218,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
         collision=collision_surface(scene, bodies, cages, lattice, obstacles),
-        taken=taken(comm, scene, lattice, anchors, masks),
+        node_counts=taken(comm, scene, lattice, anchors, masks),
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),
@@ -209,12 +227,14 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
 
 
 def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
-    """Return the model with the arrays that each step works with sent where ``send`` takes them.
+    """Return the model with ``send`` applied to the arrays that each step uses.
 
-    What only prepares steps stays in the memory of the CPU.
+    Arrays that only set up a step stay in CPU memory.
     """
 
-    lattice, (positions, velocities), solid = model.lattice, model.start, model.lattice.solid
+    lattice = model.lattice
+    solid = lattice.solid
+    positions, velocities = model.start
     return replace(
         model,
         lattice=replace(
@@ -239,51 +259,55 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 
 
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
-    """Return the prepared surfaces, on rank 0, and what all ranks must know (collective)."""
-    found = on_root(comm, lambda: [*_prepared(scene)]) or []
-    facts = comm.bcast([(report, bounds_of(surface)) for surface, report in found])
-    surfaces: list[Surface | None] = [surface for surface, _ in found] or [None] * len(facts)
+    """Return the prepared bodies, with their surfaces on rank 0 only (collective)."""
+    prepared = on_root(comm, lambda: [*_prepared(scene)]) or []
+    facts = comm.bcast([(report, bounds_of(surface)) for surface, report in prepared])
+    surfaces: list[Surface | None] = [surface for surface, _ in prepared] or [None] * len(facts)
     return tuple(
-        BodySurface(comm, surface, *known) for surface, known in zip(surfaces, facts, strict=True)
+        BodySurface(comm, surface, report, bounds)
+        for surface, (report, bounds) in zip(surfaces, facts, strict=True)
     )
 
 
 def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
-    """Yield each body's surface and report, checked; bodies of one shape are prepared once."""
+    """Yield each body's checked surface and its report; prepare each distinct mesh once."""
     shapes: dict[str, Surface] = {}
     for path, mesh in scene.meshes.items():
-        whose = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
+        prefix = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
         shape = repr(mesh.model_copy(update={"base": None}))
         try:
             if shape not in shapes:
                 shapes[shape] = prepare(load(mesh.source, scene.folder), mesh.prepare, mesh.size)
             surface = prepare(shapes[shape], (), base=mesh.base)
-            of_size = _doubtful_unit(surface, mesh.size)
+            unit_warnings = _check_size(surface, mesh.size)
             report = examine(surface)
-            warnings = *check_encloses(surface, report), *of_size
+            warnings = *check_encloses(surface, report), *unit_warnings
         except InputError as error:
-            raise InputError(f"{whose}{error}") from error
+            raise InputError(f"{prefix}{error}") from error
         for warning in warnings:
-            log.warning("%s%s: %s", whose, mesh.source, warning)
-        # an unused point may lie in no cell
+            log.warning("%s%s: %s", prefix, mesh.source, warning)
+        # a point of no triangle may lie in no cell: compact() drops it
         yield replace(compact(surface.points, surface.triangles), groups=surface.groups), report
 
 
-def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
-    """Return a warning of a body whose longest side is unusual, unless the scene says what it is.
+def _check_size(surface: Surface, size: float | None) -> list[str]:
+    """Return a warning if the body's longest side is unusual and the scene sets no mesh.size.
 
     Raises InputError for a body whose volume or shape a double cannot hold.
     """
     points = surface.points[np.unique(surface.triangles)]
-    side, reach = np.ptp(points, axis=0).max(), np.abs(points).max()
-    if side > 0 and not (SIDES[0] <= side <= SIDES[1] and reach <= FARTHEST * side):
+    side = np.ptp(points, axis=0).max()
+    offset = np.abs(points).max()
+    low, high = SIDE_LIMITS
+    if side > 0 and not (low <= side <= high and offset <= MAX_OFFSET * side):
         raise InputError(
-            f"the mesh is {side:.3g} m long and reaches {reach:.3g} m from the origin: "
+            f"the mesh is {side:.3g} m long and reaches {offset:.3g} m from the origin: "
             "too large, too small or too far away to compute with"
         )
-    if size is not None or USUAL[0] <= side <= USUAL[1]:
+    low, high = USUAL_SIDES
+    if size is not None or low <= side <= high:
         return []
-    unit = "millimetres" if side > USUAL[1] else "another unit than metres"
+    unit = "millimetres" if side > high else "another unit than metres"
     return [
         f"the body is {side:.3g} m long, and the scene gives no mesh.size: is the mesh in {unit}?"
     ]
@@ -291,7 +315,7 @@ def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
 
 def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     """Return the scene's valid cells (collective)."""
-    cages = scene.cages  # which have a cell size or a count
+    cages = scene.cages
     cell_size = cages.cell_size or choose_cell_size(
         bodies, cages.count or 0, cages.max_cells, cages.boundary
     )
@@ -302,22 +326,24 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
 def _anchors(
     tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders
 ) -> list[Anchor]:
-    """Return the anchors: a pin prevails over an anchor, and of two anchors on a node the first (collective).
+    """Return the anchors (collective). A node follows its pin, or else the first of its anchors.
 
-    Raises InputError where pins and anchors leave no node to move.
+    Raises InputError if pins and anchors leave no node to move.
     """
     anchors = []
-    taken = lattice.pinned
+    prescribed = lattice.pinned
     for anchor in tables:
-        where = masks[anchor.key] & ~taken
-        middle = holders.centers[holders.keys.index(anchor.key)]
-        center = middle if anchor.table.center is None else np.array(anchor.table.center)
+        where = masks[anchor.key] & ~prescribed
+        center_of_mass = holders.centers[holders.keys.index(anchor.key)]
+        center = center_of_mass if anchor.table.center is None else np.array(anchor.table.center)
         path = Motion.through(anchor.table.path, center)
         anchors.append(Anchor(where, path, stop=anchor.table.stop))
-        taken = taken | where
-    if lattice.table.comm.allreduce(int((~taken[: lattice.owned]).sum())) == 0:
-        what = "pin or anchor" if anchors else "pin"
-        raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
+        prescribed = prescribed | where
+    if lattice.table.comm.allreduce(int((~prescribed[: lattice.owned]).sum())) == 0:
+        tables_named = "pin or anchor" if anchors else "pin"
+        raise InputError(
+            f"{tables_named}: every node of the lattice is held, nothing is left to move"
+        )
     return anchors
 
 
@@ -328,9 +354,9 @@ def _loads(
     lattice: Lattice,
     masks: Regions,
 ) -> tuple[list[Load], tuple[OwnForce, ...]]:
-    """Return the forces, and those that are functions.
+    """Return the forces of given total, gravity first, and the forces that are functions.
 
-    Raises InputError for a function's name that is neither registered nor installed.
+    Raises InputError for a function that is neither registered nor installed.
     """
     loads, own_forces = [], []
     if gravity is not None:
@@ -343,7 +369,8 @@ def _loads(
             share = shares_by_mass(comm, where, lattice.mass)
             loads.append(Load(share, total_of(force.total), **acts))
         else:
-            rows, function = np.flatnonzero(where), FORCES.find(force.function)
+            rows = np.flatnonzero(where)
+            function = FORCES.find(force.function)
             own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], **acts))
     return loads, tuple(own_forces)
 
@@ -355,19 +382,22 @@ def _contacts(
     bounds: Rows,
     obstacles: list[Obstacle],
 ) -> tuple[list[Exchange], list[Penalty]]:
-    """Return how nodes meet the obstacles, by their tables (collective).
+    """Return the obstacles of response "exchange", then of "reflect" and "penalty" (collective).
 
-    bounds : (b, 2, 3) of the bodies at rest [m]
+    bounds : bounding boxes (b, 2, 3) of the bodies at rest [m]
     """
     exchanges, penalties = [], []
-    usual, stick = PENALTY * lattice.stiffest(comm), STICK * smallest(bounds)
+    default_stiffness = PENALTY * lattice.stiffest(comm)
+    default_speed = STICK * smallest(bounds)
     for obstacle, table in zip(obstacles, tables, strict=True):
         if table.response == "exchange":
             exchanges.append(
                 Exchange(obstacle, 1.0 if table.restitution is None else table.restitution)
             )
         elif table.response != BARRIER:
-            given = table.stiffness or usual, table.friction or 0.0, table.friction_speed or stick
-            slows = None if table.restitution == 1 else table.restitution
-            penalties.append(Penalty(obstacle, *given, slows))
+            stiffness = table.stiffness or default_stiffness
+            friction = table.friction or 0.0
+            friction_speed = table.friction_speed or default_speed
+            restitution = None if table.restitution == 1 else table.restitution
+            penalties.append(Penalty(obstacle, stiffness, friction, friction_speed, restitution))
     return exchanges, penalties

@@ -1,7 +1,7 @@
-"""State of a run, which a file holds: positions, velocities, and what the run has counted so far.
+"""Checkpoints: the positions, velocities and counters that the next step of a run depends on.
 
-What solvers know of the steps before is no part of it. A run forgets that wherever a checkpoint
-may be (solve.simulate), so that one that goes on and one that is resumed are the same bit by bit.
+Solver histories are not part of a checkpoint. A run clears them at each step that may be a
+checkpoint (solve.simulate), so that a resumed run equals an uninterrupted run bit by bit.
 """
 
 import math
@@ -17,19 +17,21 @@ from msmpetsc.backend.arrays import Array
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 
-MOST = 1e60  # of any number: its fourth power is still finite
-MOST_COUNT = 2**53  # the whole numbers that a double holds
+# largest absolute value of a stored row; its fourth power stays finite
+MAX_VALUE = 1e60
+# largest counter; a double holds every whole number up to it
+MAX_COUNT = 2**53
 Range = tuple[float, float]
-COUNT: Range = (0, MOST_COUNT)
+COUNT: Range = (0, MAX_COUNT)
 ANY: Range = (-math.inf, math.inf)
 FINITE: Range = (-sys.float_info.max, sys.float_info.max)
 LENGTH: Range = (0.0, sys.float_info.max)
 
 
 class Counting(Protocol):
-    """A part of a run that counts.
+    """A part of a run with counters that a checkpoint stores.
 
-    state : names of its attributes, numbers or dataclasses of numbers, that a checkpoint holds, and the range of each
+    state : name and range of each stored attribute, a number or a dataclass of numbers
     """
 
     @property
@@ -37,7 +39,7 @@ class Counting(Protocol):
 
 
 def _numbers(part: Counting) -> Iterator[tuple[str, Any]]:
-    """Yield the numbers of a part by the names that they are stored under."""
+    """Yield the stored name and the value of each counter of a part."""
     for attribute in part.state:
         value = getattr(part, attribute)
         inner = vars(value) if is_dataclass(value) else {"": value}
@@ -47,11 +49,10 @@ def _numbers(part: Counting) -> Iterator[tuple[str, Any]]:
 
 @dataclass
 class Checkpoint:
-    """The state of a run after ``step`` steps; empty, it is what a run begins with.
+    """The state of a run after ``step`` steps; an empty checkpoint is the start of a run.
 
-    rows    : by name, what there is of each node, this rank's owned ones: (owned, 3) or (owned,); q and q_previous
-        [m] among them
-    numbers : by name, of the whole run
+    rows    : arrays (owned, 3) or (owned,) of this rank's nodes by name, with q and q_previous [m]
+    numbers : counters and scalars of the whole run by name
     """
 
     step: int = 0
@@ -61,38 +62,41 @@ class Checkpoint:
     def keep(
         self, rows: dict[str, Array] | None = None, numbers: dict[str, float] | None = None
     ) -> None:
-        """Store a part's rows and numbers."""
+        """Add rows and numbers to the checkpoint."""
         self.rows |= rows or {}
         self.numbers |= numbers or {}
 
     def keep_counts(self, part: Counting) -> None:
-        """Store the numbers of a part."""
+        """Add the counters of a part to the checkpoint."""
         self.keep(numbers=dict(_numbers(part)))
 
     def restore_counts(self, part: Counting) -> None:
-        """Give a part its stored numbers. Raises InputError for what no run can have had."""
+        """Set the counters of a part to their stored values; raise InputError out of range."""
         for attribute, bounds in part.state.items():
-            value, name = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
+            value = getattr(part, attribute)
+            name = f"{type(part).__name__}.{attribute}"
             if is_dataclass(value) and not isinstance(value, type):
                 inner = {
-                    each: self._like(f"{name}.{each}", number, bounds)
-                    for each, number in vars(value).items()
+                    item: self._like(f"{name}.{item}", number, bounds)
+                    for item, number in vars(value).items()
                 }
                 setattr(part, attribute, replace(value, **inner))
             else:
                 setattr(part, attribute, self._like(name, value, bounds))
 
     def _like(self, name: str, value: Any, bounds: Range) -> Any:
-        """Return the number of a name, of the kind that ``value`` is."""
-        if isinstance(value, float) and math.isnan(value):  # it may be unknown
+        """Return the stored number of a name, as the type of ``value``, which is its default."""
+        # a quantity that may be unknown is nan, which no range contains
+        if isinstance(value, float) and math.isnan(value):
             return self.numbers.get(name, value)
         least, most = bounds
         if isinstance(value, int):
-            least, most = max(least, -MOST_COUNT), min(most, MOST_COUNT)
+            least = max(least, -MAX_COUNT)
+            most = min(most, MAX_COUNT)
         return type(value)(self.number(name, value, least, most))
 
     def row(self, name: str) -> Array:
-        """Return the rows of a name. Raises InputError where there are none."""
+        """Return the rows of a name; raise InputError if the checkpoint lacks them."""
         if name not in self.rows:
             raise InputError(f"the checkpoint is damaged: it lacks {name}")
         return self.rows[name]
@@ -100,18 +104,19 @@ class Checkpoint:
     def number(
         self, name: str, default: float, least: float = -math.inf, most: float = math.inf
     ) -> float:
-        """Return the number of a name. Raises InputError for one that no run can have had."""
+        """Return the number of a name; raise InputError if it is out of range."""
         value = self.numbers.get(name, default)
         if not least <= value <= most:
             raise InputError(f"the checkpoint is damaged: {name} is {value:g}")
         return value
 
     def refuse_rows_unlike(self, comm: MPI.Comm, like: "Checkpoint") -> None:
-        """Raise InputError for rows of another shape than in ``like``, or absurd (collective)."""
+        """Raise InputError if rows differ in shape from ``like`` or are too large (collective)."""
         with together(comm):
             for name in self.rows.keys() & like.rows.keys():
                 rows = self.rows[name]
-                if rows.shape != like.rows[name].shape or not (np.abs(rows) < MOST).all():
+                shape = like.rows[name].shape
+                if rows.shape != shape or not (np.abs(rows) < MAX_VALUE).all():
                     raise InputError(
-                        f"the checkpoint is damaged: {name} is not of finite numbers, {like.rows[name].shape}"
+                        f"the checkpoint is damaged: {name} is no {shape} array of finite numbers"
                     )

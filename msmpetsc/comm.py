@@ -1,4 +1,4 @@
-"""Ranks together: what rank 0 reads all know, what fails on any fails on all, rows go to owners."""
+"""Communication between ranks: shared errors, work on rank 0, rows sent to the owners of keys."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from msmpetsc.errors import MsmpetscError, as_expected
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-log = logging.getLogger("msmpetsc")  # the command line lets rank 0 alone speak
+log = logging.getLogger("msmpetsc")
 
 T = TypeVar("T")
 
 
 @contextmanager
 def together(comm: MPI.Comm) -> Iterator[None]:
-    """Raise on all ranks the first rank's MsmpetscError, or lack of memory, if any (collective).
+    """Raise on all ranks the first rank's MsmpetscError or MemoryError, if any (collective).
 
-    Nothing collective may stand in the block: a rank that fails leaves it early.
+    The block may contain no collective call, as a rank that fails leaves it early.
     """
     error = None
     try:
@@ -38,7 +38,10 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
-    """Call a function on rank 0 only; its error is everyone's. Returns None elsewhere."""
+    """Return the value of a function called on rank 0 only, None elsewhere (collective).
+
+    If the function raises an expected error, all ranks raise it.
+    """
     value = None
     with together(comm):
         if comm.rank == 0:
@@ -47,20 +50,23 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
 
 
 class Stop:
-    """The signal that asks this process to stop, 0 while none does: signals are a process's own, so there is one."""
+    """The signal that asks this process to stop; 0 if there is none.
+
+    The number is a class attribute, as signals belong to the whole process.
+    """
 
     signal = 0
 
     @classmethod
     def agreed(cls, comm: MPI.Comm) -> int:
-        """Return the greatest that any rank has got (collective)."""
+        """Return the greatest signal number that any rank has received (collective)."""
         return max(comm.allgather(cls.signal)) if comm.size > 1 else cls.signal
 
 
 class Route:
-    """A way of rows to the ranks named for them (Alltoallv), and of answers back in their order.
+    """Rows sent to their destination ranks by Alltoallv, and answers sent back in the same order.
 
-    destination : (n,) rank of each row
+    destination : rank (n,) of each row
     """
 
     def __init__(self, comm: MPI.Comm, destination: Indices):
@@ -71,18 +77,22 @@ class Route:
         comm.Alltoall(self.sent, self.received)
 
     def send(self, rows: Array) -> Array:
-        """Send rows; return those that all ranks sent to this one, by rank and then in its order."""
+        """Send rows; return the rows received from all ranks, ordered by the sender's rank."""
         return self._alltoall(np.asarray(rows)[self.order], self.sent, self.received)
 
     def answer(self, rows: Array) -> Array:
-        """Send answers to the rows that ``send`` returned; return those to this rank's own rows, in their order."""
-        back = self._alltoall(np.asarray(rows), self.received, self.sent)
-        answers = np.empty_like(back)
-        answers[self.order] = back
+        """Send answers to the rows that ``send`` returned; return the answers to this rank's rows.
+
+        The answers are in the order of the rows given to ``send``.
+        """
+        received = self._alltoall(np.asarray(rows), self.received, self.sent)
+        answers = np.empty_like(received)
+        answers[self.order] = received
         return answers
 
     def _alltoall(self, rows: Array, out_counts: Indices, in_counts: Indices) -> Array:
-        from mpi4py import MPI  # late: what draws results has none
+        # imported here, as an installation that only draws results has no mpi4py
+        from mpi4py import MPI
 
         rows = np.ascontiguousarray(rows)
         result = np.empty((int(in_counts.sum()), *rows.shape[1:]), rows.dtype)
@@ -100,20 +110,21 @@ class Route:
 
 
 def starts(counts: Indices) -> Indices:
-    """Return where each part begins when parts of these sizes follow each other."""
+    """Return the exclusive prefix sum of counts: the first index of each part."""
     return (np.cumsum(counts) - counts).astype(np.int64)
 
 
-SAMPLES = 128  # a rank: keeps the ranks' parts within some percent of each other
+# keys sampled on each rank to choose the splitters; parts then differ by some percent
+SAMPLES = 128
 
 
 class SortedKeys:
-    """Distinct int64 keys in ascending order over all ranks; a key's position is its global index.
+    """Distinct int64 keys sorted over all ranks; a key's position is its global index.
 
-    So the numbering does not depend on the number of ranks, and each rank owns one contiguous
-    range of it. Collective to build and to ask.
+    The numbering does not depend on the number of ranks, and each rank owns a contiguous range
+    of it. Construction and ``find`` are collective.
 
-    keys  : (n_local,) those of this rank, ascending
+    keys  : this rank's keys (n_local,), ascending
     first : global index of ``keys[0]``
     total : number of keys on all ranks
     """
@@ -123,7 +134,7 @@ class SortedKeys:
         keys = np.unique(np.asarray(keys, np.int64))
         step = max(1, comm.allreduce(len(keys)) // (comm.size * SAMPLES))
         sample = np.sort(np.concatenate(comm.allgather(keys[step // 2 :: step])))
-        # the keys at which the next rank's part begins: at equal steps of all ranks' samples
+        # first key of each rank but rank 0, at equal steps of the sorted sample
         self.splitters = (
             sample[np.arange(1, comm.size) * len(sample) // comm.size] if len(sample) else sample
         )
@@ -135,23 +146,26 @@ class SortedKeys:
         self.total = int(counts.sum())
 
     def owner(self, keys: Indices) -> Indices:
-        """Return the rank that holds each key, or would hold it."""
+        """Return the rank that owns each key, or would own it."""
         return np.searchsorted(self.splitters, keys, side="right")
 
     def owner_of_index(self, index: Indices) -> Indices:
-        """Return the rank that holds each global index."""
+        """Return the rank that owns each global index."""
         last_start = np.append(self.first_of_rank[1:], self.total)
         return np.searchsorted(last_start, index, side="right")
 
     def find(self, keys: Indices) -> Indices:
-        """Return the global index of each key, -1 where there is none (any shape; collective)."""
-        wanted, inverse = np.unique(np.asarray(keys, np.int64), return_inverse=True)
-        route = Route(self.comm, self.owner(wanted))
-        index = route.answer(self._index(route.send(wanted)))
+        """Return the global index of each key, -1 for an unknown key (any shape; collective)."""
+        distinct, inverse = np.unique(np.asarray(keys, np.int64), return_inverse=True)
+        route = Route(self.comm, self.owner(distinct))
+        index = route.answer(self._index(route.send(distinct)))
         return index[inverse].reshape(np.shape(keys))
 
     def rows_of(self, keys: Indices, rows: Array) -> Array:
-        """Return the row of each key (k,), all of which there are; ``rows`` go with this rank's keys (collective)."""
+        """Return the row of each key (k,); every key must exist (collective).
+
+        rows : of this rank's keys, in their order
+        """
         route = Route(self.comm, self.owner(keys))
         return route.answer(rows[self._index(route.send(keys)) - self.first])
 

@@ -1,4 +1,4 @@
-"""Actions on a body from outside: forces, anchors, obstacles, and contact of the surface."""
+"""The actions on a body at a given time: forces, anchors, obstacles and surface contact."""
 
 from typing import Any
 
@@ -14,20 +14,28 @@ from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
 from msmpetsc.contact.surface.term import SurfaceContact
 
-GROWN = 4.0  # times more or less than the push that friction went by: then the step is solved again
+# ratio of the normal force at a step's end to the force that limited friction; beyond
+# it, in either direction, the step is solved again with the new limit
+LAG_LIMIT = 4.0
 
 
 class Environment:
-    """Forces, anchors and obstacles of a model, and contact of its surface in a step.
+    """Forces, anchors, obstacles and surface contact of a model during a step.
 
-    Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and
-    ``time_step`` [s] its length; ``sides`` (o, l) are those of NodeObstacles.
+    Positions (l, 3) [m] are local and include ghosts. ``time`` [s] is the end of a step and
+    ``time_step`` [s] its length. ``sides`` (o, l) are the sides of thin obstacles that nodes
+    are on (NodeObstacles).
+
+    damping     : mass-proportional damping rate [1/s]
+    retardation : viscosity over stiffness [s]
+    contacts    : surface contacts of the step begun last; None without surface contact
+    touches     : whether the model has penalty obstacles or surface contact
     """
 
     def __init__(self, model: Model):
         self.lattice = model.lattice
-        self.damping = model.damping  # of velocities, by the mass [1/s]
-        self.retardation = model.retardation  # viscosity over stiffness [s]
+        self.damping = model.damping
+        self.retardation = model.retardation
         self.forces = ActingForces(model.lattice, model.loads, model.own_forces)
         self.anchors = Anchors(model.lattice, model.anchors)
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
@@ -35,24 +43,21 @@ class Environment:
         self.self_contact = (
             NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
         )
-        self.contacts = (
-            Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None
-        )  # of the last step begun
+        self.contacts = Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None
         self.has_friction = self.obstacles.has_friction or bool(
             self.self_contact and self.self_contact.law.friction > 0
         )
-        self._ended: tuple[Positions, Contact] | None = (
-            None  # the last step, if it had contact, and what there was
-        )
+        # end positions and contact of the last step, if friction continues from it
+        self._ended: tuple[Positions, Contact] | None = None
         self.touches = bool(model.penalties or self.self_contact)
 
     def events(self) -> list[float]:
-        """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
-        turns = [time for moving in self.moving for time in moving.path.times.tolist()]
-        return turns + [time for timed in (*self.forces.all, *self.moving) for time in timed.events]
+        """Return the times [s] at which a load or path starts, stops or changes its slope."""
+        kinks = [time for moving in self.moving for time in moving.path.times.tolist()]
+        return kinks + [time for timed in (*self.forces.all, *self.moving) for time in timed.events]
 
     def is_same(self, begin: float, end: float) -> bool:
-        """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
+        """Return whether loads, anchors and obstacles are equal at two times [s]."""
 
         def at(time: float) -> list[Any]:
             loads: list[Any] = [load.state_at(time) for load in self.forces.all]
@@ -71,51 +76,59 @@ class Environment:
         sides: Indices | None,
         end: Positions | None = None,
     ) -> Contact | None:
-        """Return what presses in the step from q, with friction; None if nothing does (collective).
+        """Return the contact of the step from q, with friction; None if there is none (collective).
 
-        last : (l, 3) [m] positions one step before q, of a step that looks back to them
-        end  : (l, 3) [m] where an earlier solve of the step has ended: friction then goes by the push there
+        last : positions (l, 3) [m] one step before q, for a two-step method
+        end  : positions (l, 3) [m] at which an earlier solve of this step ended; the normal forces
+            there then limit friction
         """
-        before, surface = self._before(q), None
-        states = self.obstacles.during(q, last, end, (time, time_step), sides, before)
+        previous = self._previous_contact(q)
+        surface = None
+        states = self.obstacles.during(q, last, end, (time, time_step), sides, previous)
         if self.contacts and not self.contacts.apart:
             surface = SurfaceContact(
-                self.contacts, q, time_step, last, end, before.surface if before else None
+                self.contacts, q, time_step, last, end, previous.surface if previous else None
             )
         return Contact(states, self.lattice.owned, surface) if states or surface else None
 
     def begin_contacts(self, q: Positions, time: float, time_step: float) -> None:
-        """Begin a step at q: the surface is asked about around its contacts alone, if these are few (collective)."""
+        """Begin a step at q with candidate pairs of the surface (collective).
+
+        If contacts are few, only pairs near them are candidates.
+        """
         if self.self_contact:
             begin = max(time - time_step, 0.0)
             self.contacts = Contacts(self.self_contact, begin, time, self.contacts)
             self.contacts.narrow(q, begin)
 
-    def _before(self, q: Positions) -> Contact | None:
-        """Return the contact of the step that ended at q; None if the last one known did not."""
+    def _previous_contact(self, q: Positions) -> Contact | None:
+        """Return the contact of the last step if it ended at q, otherwise None (collective)."""
         if self._ended is None:
             return None
         ended, contact = self._ended
         return contact if self.lattice.table.comm.allreduce(q is ended, MPI.LAND) else None
 
     def end_step(self, x: Positions, contact: Contact | None) -> None:
-        """A step has come to x (l, 3) [m]: friction of the next one goes on from there."""
+        """Record that a step ended at x (l, 3) [m], from which friction continues."""
         self._ended = (x, contact) if contact and self.has_friction else None
 
     def friction_lags(self, x: Positions, contact: Contact | None) -> bool:
-        """Return whether friction of a step to x (l, 3) [m] went by a push far from the one there (collective)."""
+        """Return whether friction in a step to x (l, 3) [m] used an outdated limit (collective).
+
+        The limit is outdated if it differs from mu N at x by more than a factor of LAG_LIMIT.
+        """
         if not (contact and self.has_friction):
             return False
-        by, at_end = self.lattice.table.comm.allreduce(contact.friction_limits(x))
-        return bool(max(at_end, by) > GROWN * min(at_end, by))
+        used, at_end = self.lattice.table.comm.allreduce(contact.friction_limits(x))
+        return bool(max(at_end, used) > LAG_LIMIT * min(at_end, used))
 
     def forget(self) -> None:
-        """Forget what earlier steps showed (collective)."""
+        """Clear the contact history, so that the next step depends on q alone (collective)."""
         self._ended = None
         if self.self_contact:
             self.self_contact.forget()
             self.contacts = Contacts(self.self_contact, 0.0, 0.0)
 
     def touch(self, q: Positions, time: float) -> Touch:
-        """Return what contacts the surface has with itself and obstacles at q and a time [s] (collective)."""
+        """Return count and distance of surface contacts at q and a time [s] (collective)."""
         return self.contacts.touch(q, time) if self.contacts else Touch()

@@ -1,4 +1,4 @@
-"""The exceptions a user can meet. Each is one clear line; the class gives the exit status."""
+"""Expected errors of the package: a line for the user, and an exit status for each class."""
 
 import difflib
 from collections.abc import Iterable
@@ -6,24 +6,28 @@ from errno import EDQUOT, EFBIG, ENOSPC
 
 
 class MsmpetscError(Exception):
-    """Base of all expected failures; ``exit_status`` is what the command line returns."""
+    """Base class of all expected errors.
+
+    exit_status  : returned by the command line
+    on_all_ranks : whether every rank is known to raise this error
+    """
 
     exit_status = 1
-    on_all_ranks = False  # whether every rank raises it, as far as is known
+    on_all_ranks = False
 
 
 class InputError(MsmpetscError):
-    """What the user gave cannot be used: scene, mesh, option or file."""
+    """A scene, mesh, option or file that cannot be used."""
 
     exit_status = 2
 
 
 class StepFailed(MsmpetscError):
-    """A time step did not converge, or what came of it is no motion of a body.
+    """A time step that did not converge, or whose result is not physical.
 
-    kind : "iterations" (at their limit), "line search", "linear solve", "not finite", "energy" (grew without
-        work), "unstable" (explicit substeps)
-    frame : number of the step, once it is known
+    kind  : "iterations" (limit reached), "line search", "linear solve", "not finite",
+        "energy" (grew without work) or "unstable" (explicit substeps)
+    frame : number of the step; None until it is known
     """
 
     exit_status = 3
@@ -34,12 +38,14 @@ class StepFailed(MsmpetscError):
 
 
 class StepStopped(MsmpetscError):
-    """A signal ended a time step between two of its iterations; the state before it stands."""
+    """A time step that a signal ended between two iterations; the state before it is kept."""
 
 
-PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
+# PETSc.Error.ierr of a failed allocation (PETSC_ERR_MEM)
+PETSC_OUT_OF_MEMORY = 55
 NO_ROOM = ENOSPC, EDQUOT, EFBIG
-EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by
+# import names of the packages in each extra of pyproject.toml
+EXTRAS = {
     "run": (
         "petsc4py",
         "mpi4py",
@@ -66,20 +72,19 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
 
 
 def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
-    """Return the error as one of ours, if a user can meet it: lack of memory is one.
+    """Return the MsmpetscError for an error that a user may cause; None for a program fault.
 
-    extra : the one that is named for a package which several extras bring
+    extra : named in the message if several extras bring a missing package
     """
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(
-            f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less"
+            f"there is not enough memory ({reason}): use fewer cells, or ranks on more machines"
         )
-    if isinstance(error, OSError) and error.errno in NO_ROOM:  # in a folder of temporary files, say
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
         return InputError(f"{error.filename or 'the output'} cannot be written: {error.strerror}")
-    if (
-        isinstance(error, OSError) and error.filename
-    ):  # an mpiexec that is not there, a folder that cannot be made
+    # for example a missing mpiexec, or a folder that cannot be created
+    if isinstance(error, OSError) and error.filename:
         return InputError(f"{error.filename}: {error.strerror}")
     if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
         return missing_package(error.name or "", extra)
@@ -87,34 +92,34 @@ def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
 
 
 def missing_package(name: str, extra: str = "run") -> InputError:
-    """Return the error that says which extra brings a package that is not installed."""
+    """Return the error for a package that is not installed, with the extra to install."""
     return InputError(
         f"{name} is not installed: pip install 'msmpetsc[{extra_of(name, extra)}]' brings it"
     )
 
 
 def extra_of(module: str, first: str = "run") -> str | None:
-    """Return the extra that brings a module, the first if several do; None for any other."""
+    """Return the extra that brings a module, ``first`` if it does; None for an unknown module."""
     package = module.partition(".")[0]
     return next((extra for extra in (first, *EXTRAS) if package in EXTRAS[extra]), None)
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """Return the valid name nearest to a wrong one; None where none is near."""
+    """Return the valid name most similar to a misspelt name; None if no name is similar."""
     return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """Return ", did you mean 'x'?" with the nearest valid name; nothing where none is near."""
+    """Return ", did you mean 'x'?" with the most similar valid name, or an empty string."""
     near = nearest(name, valid)
     return f", did you mean {near!r}?" if near else ""
 
 
 def one_line(error: Exception, length: int = 160) -> str:
-    """Return the first line of what a library says went wrong, in printable characters."""
+    """Return the first line of an error's message in printable characters."""
     return printable((str(error).strip().splitlines() or [type(error).__name__])[0], length)
 
 
 def printable(text: str, length: int = 160) -> str:
-    """Return the text, cut, without what would act on a terminal."""
+    """Return the text cut to a length, with control characters replaced by question marks."""
     return "".join(c if c.isprintable() else "?" for c in text[:length])

@@ -1,6 +1,6 @@
-"""What users add by name: presets, forces and obstacles, registered in Python or installed under an entry point.
+"""Presets, forces and obstacles that users register in Python or install as entry points.
 
-A scene file can only name what was registered or installed: nothing in a file is run.
+A scene file names an extension but never contains code.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,17 +10,20 @@ from typing import Any, Generic, TypeVar
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.errors import InputError, did_you_mean
 
-# positions (k, 3) [m] and velocities (k, 3) [m/s] of this rank's nodes in the region, time [s] -> (k, 3) [N/kg]
+# positions (k, 3) [m] and velocities (k, 3) [m/s] of this rank's nodes in the region,
+# time [s] -> force per mass (k, 3) [N/kg]
 ForceFunction = Callable[[Positions, Rows, float], Rows]
-# positions (k, 3) [m], at the obstacle's place at time 0 -> signed distances (k,) [m], and their gradients (k, 3)
+# positions (k, 3) [m] in the obstacle's frame of time 0
+# -> signed distances (k,) [m] and their gradients (k, 3)
 DistanceFunction = Callable[[Positions], tuple[Floats, Rows]]
 T = TypeVar("T")
 
 
 class Extensions(Generic[T]):
-    """Everything of one kind by its name; what is registered comes before what is installed.
+    """Registry of the extensions of a kind by name; registered values precede installed ones.
 
-    group : of the entry points, "msmpetsc.forces"
+    kind  : "force", "obstacle" or "preset"
+    group : of the entry points, for example "msmpetsc.forces"
     """
 
     def __init__(self, kind: str):
@@ -28,15 +31,26 @@ class Extensions(Generic[T]):
         self._registered: dict[str, T] = {}
 
     def register(self, name: str, value: T) -> None:
-        """Give a value a name that scenes then mean, in place of the one before; on all ranks."""
+        """Register a value under a name that scenes may then use. Call it on all ranks.
+
+        Parameters
+        ----------
+        name : str
+            Name in scene files. A value registered before under this name is replaced.
+        value
+            For a force, f(x, v, t) -> force per mass (k, 3) [N/kg], with positions x (k, 3) [m]
+            and velocities v (k, 3) [m/s] of this rank's nodes and the time t [s].
+            For an obstacle, f(x) -> signed distances (k,) [m], negative inside, and their
+            gradients (k, 3).
+        """
         self._registered[name] = value
 
     def names(self) -> list[str]:
-        """Return all names, without importing what is installed."""
+        """Return all registered and installed names without importing any extension."""
         return [*self._registered, *(point.name for point in entry_points(group=self.group))]
 
     def find(self, name: str) -> T:
-        """Return the value of a name, imported where it is installed. Raises InputError."""
+        """Return the value of a name, importing it if it is installed. Raises InputError."""
         if name in self._registered:
             return self._registered[name]
         points = entry_points(group=self.group, name=name)
@@ -47,7 +61,8 @@ class Extensions(Generic[T]):
             )
         try:
             value: T = next(iter(points)).load()
-        except Exception as error:  # of whatever was installed
+        # third-party code may raise anything on import
+        except Exception as error:
             raise InputError(
                 f"the {self.kind} {name!r} that is installed cannot be imported: {error}"
             ) from error
@@ -65,10 +80,18 @@ register_obstacle = OBSTACLES.register
 def register_preset(
     name: str, options: Mapping[str, Any], based_on: str = "newton", about: str = ""
 ) -> None:
-    """Give PETSc options a name, which ``solver.preset`` and ``preset=`` then mean; on all ranks.
+    """Register PETSc options as a preset for ``solver.preset``. Call it on all ranks.
 
-    options  : {"ksp_rtol": 1e-4, ...}, without the dash; None or True for one without a value
-    based_on : a preset that the program has, whose method and other options stay
-    about    : when to use it, for ``--list-presets``
+    Parameters
+    ----------
+    name : str
+        Name of the preset.
+    options : mapping
+        PETSc options without the dash, for example {"ksp_rtol": 1e-4}. An option without a value
+        has None or True.
+    based_on : str
+        Built-in preset whose method and other options stay as they are.
+    about : str
+        When to use the preset, for ``--list-presets``.
     """
     PRESETS.register(name, {"options": options, "based_on": based_on, "about": about})

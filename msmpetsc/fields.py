@@ -1,7 +1,6 @@
-"""Every dataset of a result file in one table: its type, shape, unit and meaning.
+"""The table of all datasets of a result file: type, shape, unit and meaning.
 
-`Frame`, the writer's datasets, the reader's checks, xarray's names, a study's columns and the table
-of the documentation come from it.
+The writer, the reader's checks, xarray's names, study columns and the documentation use it.
 """
 
 import math
@@ -14,13 +13,13 @@ from msmpetsc.backend.arrays import Floats, Positions, Rows
 
 
 class Field(NamedTuple):
-    """One dataset of a result file.
+    """A dataset of a result file.
 
-    dtype     : numpy's name of the type written; a reader takes any size of its kind
-    shape     : numbers, and letters (msmpetsc/results/README.md), each of which is the same number throughout a file
-    unit      : "1" for what has none
-    long_name : meaning, in a few words
-    at_rest   : name of the dataset that holds the same of the body at rest, "" for none
+    dtype     : numpy name of the type written; a reader accepts any size of this kind
+    shape     : numbers and letters (msmpetsc/results/README.md); a letter has one value in a file
+    unit      : "1" for a dimensionless quantity
+    long_name : meaning in a few words
+    at_rest   : name of the dataset with the values at rest, "" if there is none
     """
 
     dtype: str
@@ -31,30 +30,42 @@ class Field(NamedTuple):
 
 
 def _number(dtype: str, unit: str, long_name: str) -> Field:
-    """Return the field of one number a frame."""
+    """Return a field with a number in each frame."""
     return Field(dtype, ("T",), unit, long_name)
 
 
 def _of_nodes(unit: str, long_name: str) -> Field:
-    """Return the field of what cells have, its mean over those around a node by their volume."""
+    """Return a node field: the volume-weighted mean of a cell field over a node's cells."""
     return Field("f4", ("T", "n"), unit, long_name)
 
 
 def _of_cells(unit: str, long_name: str) -> Field:
-    """Return the field of one number a cell."""
+    """Return a field with a number for each cell."""
     return Field("f4", ("T", "c"), unit, long_name)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One simulated time of a run: arrays hold this rank's rows, numbers are of the whole body.
+    """The state of a run at a simulated time.
 
-    Errors are the greatest, counts the sum, of the steps since the frame stored before.
+    Arrays hold this rank's rows; numbers are of all bodies. Errors are maxima and counts are sums
+    over the steps since the previous stored frame.
 
-    index      : number of the step that it shows, 0 for the start
-    position   : (n_local, 3) [m]
-    surface    : (v_local, 3) [m]; as ``reaction`` and all behind it None where the scene does not ask for it
-    iterations : of the nonlinear solver (SNES), or explicit substeps
+    Attributes
+    ----------
+    index : int
+        Number of the step, 0 for the start.
+    time : float
+        Simulated time [s].
+    position : array
+        Node positions (n_local, 3) [m].
+    surface : array or None
+        Surface points (v_local, 3) [m]; None if the scene does not store the surface.
+    iterations : int
+        Iterations of the nonlinear solver (SNES), or explicit substeps.
+
+    ``FRAME_FIELDS`` has shape, unit and meaning of all attributes. From ``reaction`` on, an
+    attribute is None if the scene does not store it.
     """
 
     index: int
@@ -71,7 +82,7 @@ class Frame:
     kinetic: Annotated[float, _number("f8", "J", "kinetic energy")]
     elastic: Annotated[float, _number("f8", "J", "elastic energy")]
     potential: Annotated[float, _number("f8", "J", "energy in gravity and forces")]
-    contact: Annotated[float, _number("f8", "J", "energy in the push of obstacles")]
+    contact: Annotated[float, _number("f8", "J", "contact energy of obstacles")]
     momentum: Annotated[Floats, Field("f8", ("T", 3), "kg m/s", "momentum")]
     wall_time: Annotated[float, _number("f8", "s", "computing time")]
     true_error: Annotated[
@@ -80,26 +91,27 @@ class Frame:
     energy_error: Annotated[
         float, _number("f8", "1", "true relative error of a step, in energy")
     ] = math.nan
-    inverted: Annotated[int, _number("i8", "1", "cells turned inside out")] = 0
+    inverted: Annotated[int, _number("i8", "1", "inverted cells")] = 0
     products: Annotated[
-        int, _number("i8", "1", "products with the Hessian, and at multigrid's finest level")
+        int,
+        _number("i8", "1", "Hessian-vector products, those of multigrid's finest level included"),
     ] = 0
     proof_products: Annotated[
-        int, _number("i8", "1", "of these, to estimate errors and to search for saddles")
+        int, _number("i8", "1", "products that estimate errors or search for saddles")
     ] = 0
-    substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0
+    substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole steps")] = 0
     fallbacks: Annotated[int, _number("i8", "1", "steps solved by the robust method")] = 0
-    energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0
+    energy_gained: Annotated[float, _number("f8", "J", "energy gained without work")] = 0.0
     steps: Annotated[int, _number("i8", "1", "time steps taken")] = 0
     time_error: Annotated[
         float, _number("f8", "1", "estimated relative error of the motion so far")
     ] = math.nan
     self_contacts: Annotated[int, _number("i8", "1", "contacts of the surface with itself")] = 0
     self_distance: Annotated[
-        float, _number("f8", "m", "least distance of a contact with itself")
+        float, _number("f8", "m", "least distance in a contact of the surface with itself")
     ] = math.nan
     self_contact: Annotated[
-        float, _number("f8", "J", "energy in the push of the surface on itself")
+        float, _number("f8", "J", "contact energy of the surface with itself")
     ] = 0.0
     load: Annotated[Floats, Field("f8", ("T", 3), "N", "gravity and forces on all bodies")] = field(
         default_factory=lambda: np.zeros(3)
@@ -111,33 +123,34 @@ class Frame:
         Rows | None, Field("f8", ("T", "a", 3), "N m", "torque of a pin or anchor")
     ] = None
     push: Annotated[
-        Rows | None, Field("f8", ("T", "o", 3), "N", "force of an obstacle, blows left out")
+        Rows | None,
+        Field("f8", ("T", "o", 3), "N", "contact force of an obstacle, without impulses"),
     ] = None
     contact_push: Annotated[
-        Rows | None, Field("f8", ("T", "b", 3), "N", "force on a body where surfaces meet")
+        Rows | None, Field("f8", ("T", "b", 3), "N", "contact force of surfaces on a body")
     ] = None
     probe: Annotated[Rows | None, Field("f8", ("T", "w", 3), "m", "position of a probe")] = None
     stress: Annotated[
         Rows | None, Field("f4", ("T", "n", 6), "Pa", "Cauchy stress: xx, yy, zz, xy, yz, xz")
     ] = None
-    von_mises: Annotated[Floats | None, _of_nodes("Pa", "von Mises' stress, of /frames/stress")] = (
+    von_mises: Annotated[Floats | None, _of_nodes("Pa", "von Mises stress of /frames/stress")] = (
         None
     )
     pressure: Annotated[Floats | None, _of_nodes("Pa", "pressure")] = None
     strain_energy: Annotated[
-        Floats | None, _of_nodes("J/m^3", "elastic energy in a volume at rest")
+        Floats | None, _of_nodes("J/m^3", "elastic energy per volume at rest")
     ] = None
     cell_stress: Annotated[
         Rows | None, Field("f4", ("T", "c", 6), "Pa", "Cauchy stress of a cell")
     ] = None
-    cell_von_mises: Annotated[Floats | None, _of_cells("Pa", "von Mises' stress of a cell")] = None
+    cell_von_mises: Annotated[Floats | None, _of_cells("Pa", "von Mises stress of a cell")] = None
     cell_pressure: Annotated[Floats | None, _of_cells("Pa", "pressure of a cell")] = None
     cell_strain_energy: Annotated[
-        Floats | None, _of_cells("J/m^3", "elastic energy of a cell in its volume")
+        Floats | None, _of_cells("J/m^3", "elastic energy of a cell per volume at rest")
     ] = None
 
     def __repr__(self) -> str:
-        """Return one line, for the arrays would fill the screen."""
+        """Return step, time and solver figures in a line, without the arrays."""
         solved = f"its {self.ksp_its}, error {self.step_error:.1e}"
         return (
             f"Frame({self.index}: t = {self.time:.6g} s, {solved}, position {self.position.shape})"
@@ -154,24 +167,25 @@ STRESS = tuple(
     for name in FRAME_FIELDS
     if name.endswith(("stress", "von_mises", "pressure", "strain_energy"))
 )
-# HDF5 dimension scales of frames, by letters and lengths of shapes. None has the name of a field
-# with several axes: netCDF's readers would take that for its coordinates.
+# HDF5 dimension scale of each letter or length in a frame's shape. No scale is named
+# like a field with several axes, which netCDF readers would take for coordinates.
 DIMENSIONS: dict[int | str, str] = {
-    "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle", "b": "body",
-    "w": "probe_number", 3: "axis", 6: "component",
+    "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle",
+    "b": "body", "w": "probe_number", 3: "axis", 6: "component",
 }  # fmt: skip
 LABELS = {"axis": ("x", "y", "z"), "component": ("xx", "yy", "zz", "xy", "yz", "xz")}
-RANKS_SHARE = {"n", "v", "c"}  # letters of rows that ranks share out
+# letters of dimensions that are distributed over ranks
+RANKS_SHARE = {"n", "v", "c"}
 LATTICE = {
     "nodes": Field("f8", ("n", 3), "m", "node positions at rest"),
     "cells": Field("i8", ("c", 8), "1", "corner nodes in VTK's order"),
     "cell_kind": Field("u1", ("c",), "1", "1 boundary, 2 interior"),
-    "cell_share": Field("f8", ("c",), "1", "share of a cell that counts"),
+    "cell_share": Field("f8", ("c",), "1", "fraction of a cell that has mass and stiffness"),
     "springs": Field("i8", ("s", 2), "1", "nodes that a spring joins"),
     "rest_length": Field("f8", ("s",), "m", "rest length of a spring"),
     "stiffness": Field("f8", ("s",), "N/m", "stiffness of a spring"),
     "mass": Field("f8", ("n",), "kg", "mass of a node"),
-    "pinned": Field("i8", ("p",), "1", "pinned nodes, not those of anchors"),
+    "pinned": Field("i8", ("p",), "1", "pinned nodes, without nodes of anchors"),
     "body": Field("i4", ("n",), "1", "number of a node's body, where there are several"),
 }
 SURFACE = {
@@ -179,25 +193,30 @@ SURFACE = {
     "triangles": Field("i8", ("f", 3), "1", "corner points of a triangle"),
     "body": Field("i4", ("v",), "1", "number of a point's body, where there are several"),
 }
-OBSTACLE = {  # those that are meshes or functions: a scene gives of them but a file or a name
+# surfaces of mesh and function obstacles, which a scene gives by a file or a name only
+OBSTACLE = {
     "points": Field("f8", ("m", 3), "m", "points of obstacles' surfaces at time 0"),
     "triangles": Field("i8", ("h", 3), "1", "corner points of a triangle of an obstacle"),
     "number": Field("i4", ("h",), "1", "number of a triangle's obstacle in the scene"),
 }
-EMBEDDING = {  # W (v, n) in CSR form: surface points = W @ node positions
+# W (v, n) in CSR form: surface points = W @ node positions
+EMBEDDING = {
     "indptr": Field("i8", ("r",), "1", "where a point's weights begin"),
     "indices": Field("i8", ("e",), "1", "node of a weight"),
     "weights": Field("f8", ("e",), "1", "weight of a node for a surface point"),
 }
-CHECKPOINT = {  # two slots, of which the one with the greater step holds
+# two slots; the slot with the greater step is valid
+CHECKPOINT = {
     "step": Field("i8", (2,), "1", "number of the step, -1 for none"),
-    "numbers": Field("f8", (2, "k"), "1", "what else a step depends on; names as an attribute"),
+    "numbers": Field("f8", (2, "k"), "1", "scalars that a step depends on; names in an attribute"),
     "q": Field("f8", (2, "n", 3), "m", "node positions"),
     "q_previous": Field("f8", (2, "n", 3), "m", "node positions one step before"),
-    "history_q": Field("f8", (2, "n", 3), "m", "positions that BDF2 looks back to"),
-    "history_v": Field("f8", (2, "n", 3), "m/s", "velocities that BDF2 looks back to"),
-    "lowest_mode": Field("f8", (2, "n", 3), "kg^-1/2", "mode of the least curvature"),
-    "loads": Field("f8", (2, "n"), "-", "compression of nodes that the load factor was found at"),
+    "history_q": Field("f8", (2, "n", 3), "m", "node positions in the history of BDF2"),
+    "history_v": Field("f8", (2, "n", 3), "m/s", "node velocities in the history of BDF2"),
+    "lowest_mode": Field("f8", (2, "n", 3), "kg^-1/2", "mode of least curvature"),
+    "loads": Field(
+        "f8", (2, "n"), "-", "compression of nodes at which the load factor was computed"
+    ),
     "sides": Field("f8", (2, "n", "o"), "1", "side of a thin obstacle on which a node is"),
 }
 GROUPS = {
@@ -214,5 +233,5 @@ FIELDS = {
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a dataset, "frames/time"; "1" where the table does not have it."""
+    """Return the unit of a dataset such as "frames/time"; "1" for an unknown dataset."""
     return FIELDS[name].unit if name in FIELDS else "1"

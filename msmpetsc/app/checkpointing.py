@@ -1,4 +1,4 @@
-"""When a run writes a checkpoint, and when a signal stops it."""
+"""Checkpoints of a run, and the signals that stop it."""
 
 import os
 import signal
@@ -16,43 +16,51 @@ from msmpetsc.errors import StepStopped
 from msmpetsc.fields import Frame
 from msmpetsc.results.writer import ResultFile
 
-if TYPE_CHECKING:  # PETSc must first be given its options
+# for type checkers only: PETSc must get its options before it is imported
+if TYPE_CHECKING:
     from msmpetsc.solve.simulate import TimeLoop
 
+# exit status of a run that a signal stopped
 STATUS: dict[int, int] = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
-CHECKPOINT_TIME = 0.01  # part of the time that checkpoints may take
+# fraction of the run time that checkpoints may take [-]; hardly noticed
+CHECKPOINT_TIME = 0.01
 
 
 class Checkpoints:
-    """Write a checkpoint when it is due, at the first and the last step, and when a signal asks the run to stop.
+    """Writer of a run's checkpoints: at the first and last step, when due, and at a signal.
 
-    every  : number of frames after which one is due; None: as takes 1% of the time
-    signal : the one that ended the run before its last step; 0 for none
+    every  : frames between checkpoints; None for an interval that takes CHECKPOINT_TIME of the run
+    signal : number of the signal that ended the run before its last step; 0 if there was none
     """
 
     def __init__(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop", every: int | None):
-        self.comm, self.file, self.simulation, self.every = comm, file, simulation, every
+        self.comm = comm
+        self.file = file
+        self.simulation = simulation
+        self.every = every
         self.signal = 0
-        self._written = -1  # step of the last checkpoint
+        # of the last checkpoint: its step, the frames since then, the time of its end,
+        # and the interval to the next checkpoint [s]
+        self._written = -1
         self._frames = 0
-        self._seconds = 0.0  # until the next one
         self._ended = perf_counter()
+        self._interval = 0.0
 
     def steps(self) -> Iterator[Frame | None]:
-        """Yield the frames of the steps, and None after those that give none, until a signal ends one (collective)."""
+        """Yield the frame or None after each step, until a signal ends a step (collective)."""
         try:
             yield from self.simulation.advance()
         except StepStopped:
             self.after_step(is_stored=False)
 
     def after_step(self, is_stored: bool) -> bool:
-        """Write a checkpoint if one is due; return whether the run is to stop (collective).
+        """Write a checkpoint if it is due; return whether the run must stop (collective).
 
         is_stored : whether the step gave a frame
         """
         simulation = self.simulation
         self._frames += is_stored
-        due = perf_counter() - self._ended >= self._seconds
+        due = perf_counter() - self._ended >= self._interval
         if self.every is not None:
             due = self._frames >= self.every
         due = self.comm.bcast(due) or simulation.step in (0, simulation.steps)
@@ -63,42 +71,44 @@ class Checkpoints:
             if saved.step != self._written:
                 self.file.write_checkpoint(saved)
                 self._written = saved.step
-            self._frames, self._ended = 0, perf_counter()
-            self._seconds = (self._ended - began) / CHECKPOINT_TIME
-        if simulation.step < simulation.steps:  # after the last step there is nothing to stop
+            self._frames = 0
+            self._ended = perf_counter()
+            self._interval = (self._ended - began) / CHECKPOINT_TIME
+        # a signal after the last step stops nothing
+        if simulation.step < simulation.steps:
             self.signal = number
         return number != 0
 
 
 class Signals:
-    """Note SIGUSR1, SIGTERM and SIGINT, which ask a run to stop after the iteration or the explicit step under way.
+    """Handlers of SIGUSR1, SIGTERM and SIGINT, which stop a run after its current iteration.
 
-    A second SIGINT ends it at once.
-
-    Used as a context, after PETSc has set its own handlers. Python lets the main thread alone have
-    handlers: a run in another thread hears no signals.
+    A second SIGINT ends the run at once. Enter the context after PETSc has set its own handlers.
+    Only the main thread can have handlers: a run in another thread ignores signals.
     """
 
     def __init__(self, comm: MPI.Comm):
         self.comm = comm
-        self._abandon: Callable[[], None] | None = None  # once steps are taken
-        self._before: dict[int, Any] = {}
+        # called before the run ends at once; None until the first step
+        self._abandon: Callable[[], None] | None = None
+        self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "Signals":
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in STATUS}
+            self._previous = {number: signal.signal(number, self._handle) for number in STATUS}
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
         Stop.signal = 0
 
     def begin(self, abandon: Callable[[], None]) -> None:
-        """Keep the run's result from now on at a SIGINT; a second SIGINT calls ``abandon`` and ends the run."""
+        """Let a SIGINT stop the run orderly from now on, and a second SIGINT call ``abandon``."""
         self._abandon = abandon
 
-    def _note(self, number: int, _: FrameType | None) -> None:
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        """Record the signal; a SIGINT before the first step interrupts, a second SIGINT aborts."""
         if number == signal.SIGINT and self._abandon is None:
             raise KeyboardInterrupt
         if number == Stop.signal == signal.SIGINT and self._abandon:
@@ -107,5 +117,6 @@ class Signals:
             sys.stderr.flush()
             if self.comm.size > 1:
                 self.comm.Abort(STATUS[number])
-            os._exit(STATUS[number])  # the file is left as by a kill, which it is made for
+            # the file stays readable, as after a kill
+            os._exit(STATUS[number])
         Stop.signal = max(Stop.signal, number) if number != signal.SIGINT else number

@@ -1,4 +1,4 @@
-"""What is refused of paths and numbers that a user gives, before anything is done with them."""
+"""Checks of the paths that a user gives, before anything is read or written."""
 
 import os
 import unicodedata
@@ -10,20 +10,16 @@ from msmpetsc.results.disk import refuse_no_file
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
 MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
 SCENE_NAMES = (".toml",)
-NO_PART_OF_A_LINE = (
-    "Cc",
-    "Cs",
-    "Zl",
-    "Zp",
-)  # categories: controls, bytes that are no UTF-8, ends of lines
+# Unicode categories of control characters, surrogates (no UTF-8) and line separators
+UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
 
 
 def checked_path(given: str | os.PathLike[str]) -> Path:
-    """Return a path that prints as one line, and exists or may be created. Raises InputError."""
+    """Return a path that is printable and exists or may be created. Raises InputError."""
     text = os.fspath(given)
     if not text:
-        raise InputError("an empty path leads nowhere")
-    if any(unicodedata.category(letter) in NO_PART_OF_A_LINE for letter in text):
+        raise InputError("the path is empty")
+    if any(unicodedata.category(letter) in UNPRINTABLE for letter in text):
         raise InputError(f"{printable(text, 60)!r} has control characters, or is not UTF-8 text")
     try:
         os.stat(text)
@@ -35,7 +31,7 @@ def checked_path(given: str | os.PathLike[str]) -> Path:
 
 
 def checked_file(given: str | os.PathLike[str]) -> Path:
-    """Return the path of a file: no folder, pipe or device. Raises InputError."""
+    """Return the path of a file. Raises InputError for a folder, a pipe or a device."""
     path = checked_path(given)
     if path.name in ("", "..") or os.fspath(given).endswith("/"):
         raise InputError(f"{given} is a folder, not a file")
@@ -46,8 +42,7 @@ def checked_file(given: str | os.PathLike[str]) -> Path:
 def refuse_other_format(
     option: str, path: str | os.PathLike[str] | None, endings: tuple[str, ...]
 ) -> None:
-    """Raise InputError for the name of a file of another format than is written."""
+    """Raise InputError for a file name with another ending than ``endings``."""
     if path is not None and Path(path).suffix.lower() not in endings:
-        raise InputError(
-            f"{option} {path}: what is written there is named {' or '.join(f'*{end}' for end in endings)}"
-        )
+        names = " or ".join(f"*{ending}" for ending in endings)
+        raise InputError(f"{option} {path}: the file must be named {names}")

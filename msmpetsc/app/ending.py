@@ -1,4 +1,4 @@
-"""What all ranks say together: the log, which rank 0 alone writes; and one line and one exit status when some fail."""
+"""Log and failures of all ranks: rank 0 writes the log, and a failure on some ranks ends all."""
 
 import logging
 import sys
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 STATUS_BUG, STATUS_INTERRUPTED = 1, 130
-PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the other
+# longest wait for a failure of the other ranks [s]; far above any load imbalance
+PATIENCE = 10.0
 LINE = "msmpetsc: %(levelname)s: %(message)s"
 TIMED = "msmpetsc: %(levelname)s [%(relativeCreated).0f ms]: %(message)s"
 
@@ -23,9 +24,9 @@ TIMED = "msmpetsc: %(levelname)s [%(relativeCreated).0f ms]: %(message)s"
 def logged_on_root(
     comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False
 ) -> Iterator[None]:
-    """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with milliseconds."""
+    """Write the log of rank 0 only to stderr, from a level on, if ``timed`` with milliseconds."""
     log = logging.getLogger("msmpetsc")
-    before = log.handlers, log.level
+    handlers, previous_level = log.handlers, log.level
     logging.addLevelName(logging.WARNING, "warning")
     logging.addLevelName(logging.INFO, "note")
     handler = logging.StreamHandler(sys.stderr)
@@ -35,8 +36,8 @@ def logged_on_root(
     try:
         yield
     finally:
-        log.handlers = before[0]
-        log.setLevel(before[1])
+        log.handlers = handlers
+        log.setLevel(previous_level)
 
 
 @contextmanager
@@ -45,14 +46,16 @@ def ending_together(
     extra: str = "run",
     abandon: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
-    """Let a failure of all ranks in the block pass, and end all ranks at a failure of some (collective to enter).
+    """Pass on an error that all ranks raise; abort all ranks at an error of some (collective).
 
-    The other ranks would wait for ever. The block stands within each context whose exit is collective.
+    Without the abort the other ranks would wait for ever. Enter this context inside each context
+    whose exit is collective.
 
-    extra   : the extra that an error names if it brings a package that is missing
-    abandon : called on a failing rank before it ends all ranks, as no context is left then
+    extra   : the extra to name for a missing package that several extras bring
+    abandon : called on a failing rank before the abort, which skips all cleanup
     """
-    meeting = comm.Dup() if comm.size > 1 else None  # its messages meet no others
+    # a communicator of its own, so that its barrier matches no other call
+    meeting = comm.Dup() if comm.size > 1 else None
     try:
         yield
     except KeyboardInterrupt:
@@ -73,9 +76,9 @@ def ending_together(
 
 
 def _all_fail(meeting: "MPI.Comm") -> bool:
-    """Return whether all ranks fail, as soon as they do or when patience ends.
+    """Return whether all ranks fail within PATIENCE.
 
-    That of a low rank ends first: it tells, and ends the others.
+    The limit grows with the rank, so that a low rank reports the error and ends the other ranks.
     """
     barrier = meeting.Ibarrier()
     until = time.monotonic() + PATIENCE * (1 + meeting.rank / meeting.size)
@@ -87,7 +90,7 @@ def _all_fail(meeting: "MPI.Comm") -> bool:
 
 
 def _end_all(comm: "MPI.Comm", line: str, status: int, abandon: Callable[[], None]) -> None:
-    """Print the line and end all ranks by MPI_Abort; a run of one rank ends by itself."""
+    """Print the line and end all ranks by MPI_Abort; do nothing in a serial run."""
     if comm.size > 1:
         print(f"msmpetsc: {line}", file=sys.stderr, flush=True)
         abandon()

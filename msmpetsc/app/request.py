@@ -1,10 +1,10 @@
-"""What a run can be asked for: the one table of it.
+"""The table of the options of a run.
 
-Of its rows are made the keywords of ``msmpetsc.run`` with their types and their help, the options
-of ``msmpetsc run``, and the table of options in README.
+It defines the keywords of ``msmpetsc.run`` with their help, the options of ``msmpetsc run``, and
+the table of options in README.
 """
 
-# ruff: noqa: RUF009  # a call of given() is a field, made once
+# ruff: noqa: RUF009
 
 import os
 import shlex
@@ -25,7 +25,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.toml import overrides_of
 from msmpetsc.solve.petsc.words import words_of
 
-if TYPE_CHECKING:  # --help, which shows the table, needs neither numpy nor a scene
+# not imported at run time, so that --help starts quickly
+if TYPE_CHECKING:
     from msmpetsc.fields import Frame
     from msmpetsc.scene.reading import Scene
 
@@ -34,13 +35,13 @@ File = str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class Option:
-    """What is said of a field of the request, and how the command line takes it.
+    """Help and command line syntax of a field of the request.
 
-    value   : what stands for its value on the command line; "" for a switch
-    kind    : makes the value of a word
-    choices : all the values there are
-    short   : another name, of one dash
-    python  : whether Python alone takes it, or the command line in another way
+    value   : placeholder for the value in the help; "" for a switch
+    kind    : function that converts a word to the value
+    choices : all valid values; None for any value
+    short   : alternative name with a single dash
+    python  : whether only Python has the option, or the command line has another form of it
     """
 
     help: str
@@ -52,22 +53,22 @@ class Option:
 
 
 def given(default: Any, option: Option) -> Any:
-    """Return a field of the request with its default and with what is said of it."""
+    """Return a dataclass field with its default and its option as metadata."""
     return field(default=default, metadata={"option": option})
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A run that is asked for."""
+    """The options of a run."""
 
     scene: "File | Mapping[str, Any] | Scene | None" = given(
         None,
-        Option("scene file (TOML); in Python a Scene, too, or its tables", "SCENE", checked_path),
+        Option("scene file (TOML); in Python also a Scene or its tables", "SCENE", checked_path),
     )
     output: File | None = given(
         None,
         Option(
-            "result file, .h5 or .hdf5; out/SCENE.h5 if not given",
+            "result file, .h5 or .hdf5; default: out/SCENE.h5",
             "OUT.h5",
             checked_file,
             short="-o",
@@ -75,72 +76,69 @@ class RunRequest:
     )
     _: KW_ONLY
     preset: str | None = given(None, Option("solver preset (see --list-presets)", "NAME"))
-    error: float | None = given(None, Option("relative error at which a step is done", "E", float))
+    error: float | None = given(None, Option("target relative error of a step", "E", float))
     device: Literal["cpu", "cuda"] | None = given(
         None,
-        Option(
-            "where to compute: cuda is -mat_type aijcusparse, a CUDA GPU", choices=("cpu", "cuda")
-        ),
+        Option("device: CPU, or CUDA GPU (-mat_type aijcusparse)", choices=("cpu", "cuda")),
     )
     frames: int | None = given(None, Option("stop after N steps", "N", int))
     set: Mapping[str, Any] | Sequence[str] = given(
         (), Option("override scene keys: cages.count=3000, obstacle.0.friction=0.5", "KEY=VALUE")
     )
-    picture: bool = given(False, Option("also draw a few moments: OUT.png"))
+    picture: bool = given(False, Option("draw a few frames into OUT.png"))
     overwrite: bool = given(False, Option("replace OUT.h5 if it exists"))
     resume: File | None = given(
         None,
         Option(
-            "go on where the run that wrote this file was stopped; with SCENE, start it if there is no such file yet",
+            "continue the stopped run that wrote this file; with SCENE, start it if there is no "
+            "file yet",
             "OUT.h5",
             checked_file,
         ),
     )
-    force: bool = given(False, Option("resume with another scene or other options than before"))
+    force: bool = given(False, Option("resume with a changed scene or changed options"))
     checkpoint_every: int | None = given(
         None,
         Option(
-            "frames from one checkpoint to the next; default: as take 1% of the time at most",
+            "frames between checkpoints; default: so that they take at most 1% of the time",
             "N",
             int,
         ),
     )
     gather: bool = given(
         False,
-        Option("let rank 0 write for all: where nodes of a cluster do not see one file alike"),
+        Option("let rank 0 write for all ranks, for cluster nodes without a shared file system"),
     )
     true_error: int | None = given(
-        None, Option("also solve every N-th step to rounding, and store its true error", "N", int)
+        None, Option("solve every N-th step to rounding as well and store its true error", "N", int)
     )
     measure: File | None = given(
         None,
         Option(
-            "write what the run cost: times, products, memory, machine", "OUT.json", checked_file
+            "write the cost of the run: times, products, memory, machine", "OUT.json", checked_file
         ),
     )
     petsc_options: str | Mapping[str, Any] = given(
         "",
         Option(
-            'PETSc\'s options, for this run alone: "-ksp_rtol 1e-3 -ksp_view", {"ksp_rtol": 1e-3}',
+            'PETSc options of this run: "-ksp_rtol 1e-3 -ksp_view", or {"ksp_rtol": 1e-3}',
             python=True,
         ),
     )
-    quiet: bool = given(
-        False, Option("no notes and no progress; warnings and errors stay", python=True)
-    )
+    quiet: bool = given(False, Option("show only warnings and errors", python=True))
     on_frame: "Callable[[Frame], object] | None" = given(
-        None, Option("called on all ranks with each frame, once that is written", python=True)
+        None,
+        Option("function called on all ranks with each frame after it is written", python=True),
     )
 
     def __post_init__(self) -> None:
-        """Raise InputError for what cannot be meant: paths, numbers, and options that contradict each other."""
+        """Raise InputError for invalid paths, numbers and contradictory options."""
         for name, option in OPTIONS.items():
             value = getattr(self, name)
             if isinstance(value, str | os.PathLike) and option.kind in (checked_path, checked_file):
                 option.kind(os.fspath(value))
-            if option.kind is int and not isinstance(
-                value, Integral | None
-            ):  # Python alone can give it
+            # argparse has converted words; Python may pass any type
+            if option.kind is int and not isinstance(value, Integral | None):
                 raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}")
             if option.kind is int and value is not None and value < 1:
                 raise InputError(f"{flag_of(name)} must be at least 1, not {value}")
@@ -148,66 +146,65 @@ class RunRequest:
                 raise InputError(f"{flag_of(name)} is {' or '.join(option.choices)}, not {value!r}")
         refuse_other_format("-o", self.output, RESULT_NAMES)
         refuse_other_format("--measure", self.measure, MEASURE_NAMES)
-        other = (
+        differs = (
             self.output is not None
             and self.resume is not None
             and Path(self.output) != Path(self.resume)
         )
-        if self.resume and (self.overwrite or other):
-            raise InputError(
-                "--resume goes on in its own file: -o and --overwrite have no place beside it"
-            )
+        if self.resume and (self.overwrite or differs):
+            raise InputError("--resume continues its own file: leave out -o and --overwrite")
         if self.scene is not None and not (self.file or self.output or self.resume):
-            raise InputError("a scene that is no file gives its result no name: say output")
+            raise InputError("a scene without a file gives its result no name: say output")
 
     @property
     def file(self) -> Path | None:
-        """Return the path of the scene, if that is a file."""
+        """Return the path of the scene file; None for a scene from Python."""
         return Path(self.scene) if isinstance(self.scene, str | os.PathLike) else None
 
     @property
     def path(self) -> Path:
         """Return the path of the result file."""
-        named = self.resume or self.output
-        return Path(named) if named else Path("out") / f"{self.file.stem if self.file else ''}.h5"
+        given_path = self.resume or self.output
+        if given_path:
+            return Path(given_path)
+        return Path("out") / f"{self.file.stem if self.file else ''}.h5"
 
     @property
     def measured(self) -> Path | None:
-        """Return the path of the file of what the run cost."""
+        """Return the path of the cost file; None if the cost is not measured."""
         return Path(self.measure) if self.measure else None
 
     @property
     def overrides(self) -> list[str]:
-        """Return the changes of the scene, as ``--set`` takes them."""
+        """Return the changes of the scene as values of ``--set``."""
         given = {"solver.preset": self.preset, "solver.error": self.error}
         method = {key: value for key, value in given.items() if value is not None}
         return [*overrides_of(method), *overrides_of(self.set)]
 
     @property
     def command(self) -> str:
-        """Return the command that asks for the same, as result files and ``--measure`` have it."""
+        """Return the equivalent command line, for result and cost files."""
         words = ["msmpetsc", "run", *([str(self.file)] if self.file else [])]
         for name, option in OPTIONS.items():
             value = getattr(self, name)
             if option.python or name == "scene" or not value:
                 continue
             values = overrides_of(value) if isinstance(value, Mapping) else value
-            several = values if isinstance(values, list | tuple) else [values]
-            words += (
-                [flag_of(name)]
-                if value is True
-                else [f"{flag_of(name)}={each}" for each in several]
-            )
+            if value is True:
+                words.append(flag_of(name))
+            else:
+                several = values if isinstance(values, list | tuple) else [values]
+                words += [f"{flag_of(name)}={item}" for item in several]
         return shlex.join([*words, *self.petsc_words])
 
     @property
     def petsc_words(self) -> list[str]:
-        """Return PETSc's options as words. Raises InputError for what is no option."""
+        """Return the PETSc options as words. Raises InputError for an invalid option."""
         return words_of(self.petsc_options)
 
 
 def flag_of(name: str) -> str:
-    """Return the option of the command line for a field: "--true-error"."""
+    """Return the command line option of a field, for example "--true-error"."""
     return f"--{name.replace('_', '-')}"
 
 

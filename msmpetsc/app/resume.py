@@ -1,4 +1,4 @@
-"""``msmpetsc run --resume``: what the earlier run was, whether this one is the same, and where it goes on."""
+"""``msmpetsc run --resume``: compare a run with the earlier run of a file, and continue it."""
 
 import re
 import shlex
@@ -27,14 +27,17 @@ from msmpetsc.scene.problems import as_given
 from msmpetsc.scene.reading import Scene, load_scene, scene_of
 from msmpetsc.solve.petsc.words import options_of, unsafe_word
 
-if TYPE_CHECKING:  # these import PETSc, which must first be given its options
+# for type checkers only: PETSc must get its options before it is imported
+if TYPE_CHECKING:
     from msmpetsc.build import Model
     from msmpetsc.solve.simulate import TimeLoop
 
-OF_NO_EFFECT = re.compile(  # on results
-    r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc|^use_gpu_aware_mpi$|^device_"
+# names of PETSc options without effect on results
+OF_NO_EFFECT = re.compile(
+    r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc"
+    r"|^use_gpu_aware_mpi$|^device_"
 )
-# a file has one of each
+# keys of a scene that cannot change within a result file
 FIXED = (
     "time.step",
     "time.integrator",
@@ -43,36 +46,36 @@ FIXED = (
     "output.stress",
     "output.probe",
 )
-OF_NO_MATTER = {
-    "text",
-    "folder",
-    "title",
-    "picture",
-}  # keys of a scene that may differ without a word
+# fields of a scene that do not affect the run
+IGNORED_FIELDS = {"text", "folder", "title", "picture"}
 
 
 def earlier_run(
     comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool
 ) -> Earlier | None:
-    """Return the run to go on from, None to run from the start (collective). Raises InputError.
+    """Return the run to continue, None to run from the start (collective). Raises InputError.
 
-    may_start : whether there is a scene to start from, where there is no such file yet
+    may_start : whether the run may start from its scene if the file does not exist
     """
     if resume is None:
         return None
     path = Path(resume)
+    # no file yet: the first start of a job that a queue may start again
     if may_start and not comm.bcast(on_root(comm, path.exists)):
         refuse_other_format("--resume", path, RESULT_NAMES)
-        return None  # the first start of a job that may be started again
+        return None
     on_root(comm, lambda: refuse_deadly(path))
     earlier: Earlier = comm.bcast(on_root(comm, lambda: Earlier.read(path)))
     return earlier
 
 
 def kept_options(earlier: Earlier, given: Sequence[str]) -> list[str]:
-    """Return the earlier run's options of PETSc that affect results and are not given again, as words.
+    """Return the earlier run's PETSc options that affect results and are not given again.
 
-    Raises InputError for one that could do more than choose a solver: the file may be from anywhere.
+    given : words of this run's PETSc options
+
+    Raises InputError for an option that could do more than choose a solver, as the file may come
+    from an untrusted source.
     """
     kept: list[str] = []
     for name, value in _stored(earlier).items():
@@ -80,30 +83,31 @@ def kept_options(earlier: Earlier, given: Sequence[str]) -> list[str]:
         if name in options_of(given) or OF_NO_EFFECT.search(name):
             continue
         if unsafe_word(words):
-            text = f"{earlier.path} was run with {' '.join(words)}"
-            raise InputError(f"{text}, which is not taken from a file: give it again")
+            raise InputError(
+                f"{earlier.path} was run with {' '.join(words)}, which is not taken from a file: "
+                "give it again"
+            )
         kept += words
     return kept
 
 
 def _stored(earlier: Earlier) -> dict[str, str]:
-    """Return PETSc's options of the earlier run."""
+    """Return the PETSc options of the earlier run. Raises InputError."""
     try:
         return options_of(shlex.split(earlier.texts.get("petsc_options", "")))
     except ValueError:
-        raise InputError(
-            f"{earlier.path} is damaged: its PETSc options cannot be taken apart"
-        ) from None
+        raise InputError(f"{earlier.path} is damaged: its PETSc options cannot be parsed") from None
 
 
 def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
-    """Return the scene that the earlier run's file has, with changes. Raises InputError."""
+    """Return the scene stored in the earlier run's file, with changes. Raises InputError."""
     text, file = (earlier.texts.get(name) for name in ("scene", "scene_file"))
     if not text or not file or not file.isprintable():
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
     scene = scene_of(Path(file), text, changes)
-    # The result may be from anywhere, and so may be what it says of the folder in which its scene lay: each file that
-    # it names must lie beside it, or be named by that scene's file or by the user.
+    # The result and the scene folder that it names may be untrusted. So each file of
+    # the stored scene must be in the result's folder, or be named by the scene file
+    # or by the user.
     given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
     known = set(MODELS)
     with suppress(InputError):
@@ -111,33 +115,34 @@ def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
     for path, name in scene.named_files():
         keys = tuple(map(str, path))
         lies_beside = (Path(file).parent / name).resolve().parent == earlier.path.resolve().parent
-        if not (name in known or lies_beside or any(keys[: len(own)] == own for own in given)):
+        by_user = any(keys[: len(user_keys)] == user_keys for user_keys in given)
+        if not (name in known or lies_beside or by_user):
             raise InputError(
-                f"{earlier.path} names {as_given(name)}, and {as_given(file)} does not: name the SCENE too, "
-                f"or --set {'.'.join(keys)}=PATH"
+                f"{earlier.path} names {as_given(name)}, and {as_given(file)} does not: "
+                f"name the SCENE too, or --set {'.'.join(keys)}=PATH"
             )
     return scene
 
 
 class Resumed:
-    """A run that goes on from an earlier one, if it is the same or is forced to.
+    """A run that continues an earlier run with the same scene and options, or with ``force``.
 
-    differs : lines that say what is not as it was
+    differs : a line for each scene key or PETSc option that has changed
     """
 
     def __init__(self, earlier: Earlier, scene: Scene, options: dict[str, str], force: bool):
-        """Compare scenes and PETSc's options. Raises InputError for what may not differ."""
+        """Compare scene and PETSc options with the earlier run. Raises InputError for changes."""
         self.earlier = earlier
         self.force = force
         self.stored = scene.stored
         self.differs = list(self._differences(scene, options))
         if self.differs and not force:
-            raise InputError("\n".join([*self.differs, "--force goes on all the same"]))
+            raise InputError("\n".join([*self.differs, "--force resumes in spite of changes"]))
         if fixed := [line for line in self.differs if line.startswith(FIXED)]:
-            raise InputError("\n".join([*fixed, "that cannot change within a file"]))
+            raise InputError("\n".join([*fixed, "these keys cannot change within a file"]))
         if (version := earlier.texts.get("msmpetsc_version")) != __version__:
             log.warning(
-                "%s was begun by msmpetsc %s, this is %s",
+                "%s was started by msmpetsc %s, this is %s",
                 earlier.path,
                 printable(str(version), 20),
                 __version__,
@@ -145,10 +150,11 @@ class Resumed:
 
     @property
     def is_done(self) -> bool:
-        """Return whether the file has all frames already."""
+        """Return whether the file already has all frames."""
         return self.earlier.finished >= self.stored
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
+        """Yield a line for each scene key and PETSc option that has changed."""
         earlier = self.earlier
         was = _with_an_effect(_stored(earlier))
         now = _with_an_effect(options)
@@ -160,7 +166,7 @@ class Resumed:
                 yield f"{key}: {_shown(was.get(key))} in {earlier.path}, {_shown(now.get(key))} now"
 
     def file(self, comm: MPI.Comm, attributes: dict[str, Any], gathers: bool) -> ResultFile:
-        """Open the file that the run writes into (collective)."""
+        """Open the file for writing, in place or as a copy if the run has changed (collective)."""
         earlier = self.earlier
         if not (self.differs or self.force) and earlier.planned == self.stored:
             return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE, gathers)
@@ -170,7 +176,7 @@ class Resumed:
         return ResultFile(earlier.path, comm, attributes, Begin.COPY, gathers)
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
-        """Raise InputError where the mesh makes another lattice than it did (collective)."""
+        """Raise InputError if the lattice differs from the earlier run's lattice (collective)."""
         lattice = model.lattice
         rows = {"lattice/nodes": lattice.nodes[: lattice.owned]}
         if not self.differs:
@@ -178,20 +184,23 @@ class Resumed:
         refuse_changed_lattice(comm, self.earlier.path, rows)
 
     def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop") -> None:
-        """Put the simulation where the last checkpoint was (collective)."""
+        """Restore the simulation from the last checkpoint, if any (collective)."""
         path = self.earlier.path
         saved = read_checkpoint(comm, path, simulation.model.lattice.owned)
         kept = 0
         if saved is not None:
             if saved.step >= simulation.steps:
-                end = f"it cannot end at step {simulation.steps}"
-                raise InputError(f"{path} has come to step {saved.step} already: {end}")
+                raise InputError(
+                    f"{path} has come to step {saved.step} already: "
+                    f"it cannot end at step {simulation.steps}"
+                )
             kept = simulation.stored_until(saved.step)
             if kept > self.earlier.finished:
-                raise InputError(f"{path} is damaged: it lacks frames of before its checkpoint")
+                raise InputError(f"{path} is damaged: it lacks frames from before its checkpoint")
             is_frame = (kept - 1) * simulation.every == saved.step
             on_root(comm, lambda: refuse_unlike_frame(path, kept - 1, is_frame))
-        if self.differs:  # later frames are of how it was
+        # later frames are of the unchanged scene
+        if self.differs:
             file.keep(kept)
         if saved is None:
             return
@@ -201,11 +210,12 @@ class Resumed:
 
 
 def flat(scene: Scene) -> dict[str, Any]:
-    """Return the scene's values by keys like "time.step" and "obstacle.0.point", those that are given."""
-    return dict(_leaves("", scene.model_dump(exclude=OF_NO_MATTER, exclude_none=True)))
+    """Return the values of a scene by key, for example "time.step" or "obstacle.0.point"."""
+    return dict(_leaves("", scene.model_dump(exclude=IGNORED_FIELDS, exclude_none=True)))
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield key and value of each leaf of nested tables below ``name``."""
     if isinstance(value, (list, tuple)) and any(isinstance(item, dict) for item in value):
         value = dict(enumerate(value))
     if not isinstance(value, dict):
@@ -216,9 +226,10 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _with_an_effect(options: dict[str, str]) -> dict[str, Any]:
-    """Return PETSc's options that have an effect on results, by what stands on the command line."""
+    """Return the PETSc options that affect results, with the dash of the command line."""
     return {f"-{name}": value for name, value in options.items() if not OF_NO_EFFECT.search(name)}
 
 
 def _shown(value: Any) -> str:
+    """Return a value as text, None as "none"."""
     return "none" if value is None else str(list(value) if isinstance(value, tuple) else value)

@@ -1,4 +1,4 @@
-"""A run, once PETSc has its options: prepared, its steps taken and observed, finished."""
+"""A run after PETSc has its options: preparation, steps, output, and the end."""
 
 import logging
 import shlex
@@ -46,10 +46,10 @@ from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What a run does, once its request is understood.
+    """The scene of a run, the earlier run that it continues, and the time of its beginning.
 
-    began  : count of perf_counter when that began [s]
-    logged : seconds in events of the process at that time; none where they are not measured
+    began  : perf_counter at the beginning of preparation [s]
+    logged : time in each logged event of the process until then [s]; empty without ``measure``
     """
 
     request: RunRequest
@@ -62,9 +62,9 @@ class RunPlan:
 def run_steps(
     comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, started: float
 ) -> int:
-    """Run from the start, or go on from an earlier run; return the exit status (collective).
+    """Run from the start or continue an earlier run; return the exit status (collective).
 
-    started : count of perf_counter at the start of the command [s]
+    started : perf_counter at the start of the command [s]
     """
     plan = prepare(comm, request, earlier)
     if (resumed := plan.resumed) and resumed.is_done:
@@ -77,10 +77,11 @@ def run_steps(
 
 
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
-    """Read the scene. Raises InputError for what can be refused before a model is made (collective)."""
+    """Read the scene and check it, without building a model (collective). Raises InputError."""
     refuse_early(comm)
     choose(comm, request.device)
-    began, logged = perf_counter(), {}
+    began = perf_counter()
+    logged: dict[str, float] = {}
     if request.measure:
         PETSc.Log.begin()
         logged = event_times()
@@ -92,9 +93,10 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, StepFailed | None]:
-    """Take the steps; after each, keep its frame and a checkpoint that is due (collective).
+    """Take the steps and write their frames and checkpoints (collective).
 
-    Returns where the steps ended, at the last or by a signal; what they cost; and the failure of one that ended them.
+    Returns the checkpoints with the signal that stopped the run, the cost, and the failure of a
+    step that ended the run.
     """
     failure = None
     if kernel_cache.is_empty():
@@ -126,19 +128,19 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                     signals.begin(file.abandon)
                     for frame in checkpoints.steps():
                         with cost.of_output():
-                            if (
-                                frame is not None and next(numbers) >= file.finished
-                            ):  # a run that goes on has some
+                            # a resumed file has the frames before its checkpoint
+                            if frame is not None and next(numbers) >= file.finished:
                                 file.append(frame)
                                 on_root(comm, xdmf.update)
                             stops = checkpoints.after_step(frame is not None)
                             if frame is not None:
-                                for see in observers:
-                                    see(frame)
+                                for observe in observers:
+                                    observe(frame)
                         if stops:
                             break
+        # the frames before the failure are kept
         except StepFailed as error:
-            failure = error  # the frames before it are worth a look
+            failure = error
         file.close(trim=not checkpoints.signal)
     return checkpoints, cost, failure
 
@@ -151,7 +153,7 @@ def finish(
     failure: StepFailed | None,
     started: float,
 ) -> int:
-    """Write what stands beside the result, tell the end, and return the exit status (collective).
+    """Write the files beside the result, log the end, and return the exit status (collective).
 
     Raises the StepFailed that ended the run.
     """
@@ -172,7 +174,7 @@ def finish(
 def lines_of_options(
     comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None
 ) -> list[str]:
-    """Return the options in PETSc's database of a run, or of a preset alone (collective)."""
+    """Return the PETSc options of a run, or of a preset without a scene (collective)."""
     refuse_early(comm)
     choose(comm, request.device)
     if request.scene or earlier:
@@ -190,7 +192,7 @@ def lines_of_options(
 
 
 def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
-    """Read the scene with what the request changes; --set comes last and wins."""
+    """Return the scene with the changes of the request, ``--set`` last. Raises InputError."""
     changes = request.overrides
     if isinstance(request.scene, Scene):
         scene = request.scene.changed(changes)
@@ -208,9 +210,10 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
 
 
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
-    """Return what the file says of the run that made it, with the user's PETSc options alone."""
+    """Return the attributes of the result file: versions, options, ranks, command and scene."""
     options = PETSc.Options().getAll().items()
-    file = request.file or scene.folder / "scene"  # where its paths start
+    # relative paths of a scene without a file start from its folder
+    file = request.file or scene.folder / "scene"
     return {
         "msmpetsc_version": __version__,
         "petsc_version": versions()["petsc"],
@@ -226,7 +229,7 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
 
 
 def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
-    """Open the file to write into: a new one, or that of the run that goes on (collective)."""
+    """Open the result file for writing, new or of the resumed run (collective)."""
     request = plan.request
     attributes = attributes_of(comm, plan.scene, request)
     if plan.resumed:
@@ -236,7 +239,7 @@ def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
-    """Build the model and say what it is made of (collective)."""
+    """Return the model after logging its size and checking it for a resume (collective)."""
     model = build_model(comm, plan.scene)
     log_model(comm, model)
     warn_of_long_steps(plan.scene, model)
@@ -248,11 +251,11 @@ def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
 def start_output(
     comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: TimeLoop
 ) -> int:
-    """Write the model, go on where an earlier run stopped, and make room for frames (collective).
+    """Write the model, restore a resumed run, and create the frame datasets (collective).
 
-    model : as it was built; the simulation's own may be on a GPU
+    model : in CPU memory, unlike the simulation's model, which may be on a GPU
 
-    Returns the number of frames of the steps taken so far.
+    Returns the number of frames up to the restored step.
     """
     write_model(comm, file, model)
     if plan.resumed:
@@ -262,17 +265,18 @@ def start_output(
 
 
 def write_companions(comm: MPI.Intracomm, request: RunRequest, whole: bool) -> list[Path]:
-    """Write the XDMF file, and draw a whole run where asked; return all files that it leaves, the result first.
+    """Write the XDMF file and a picture if requested; return all files of the run (collective).
 
-    Collective. Raises InputError.
+    whole : whether the run is complete; otherwise no picture is drawn
+
+    Raises InputError.
     """
     path = request.path
     left = [path, path.with_suffix(".xdmf")]
     on_root(comm, lambda: write_xdmf(path))
     if whole and request.picture:
-        from msmpetsc.view.sheet import (
-            contact_sheet,
-        )  # loads VTK: a second that other runs need not wait
+        # imported here, as loading VTK takes a second
+        from msmpetsc.view.sheet import contact_sheet
 
         left.append(path.with_suffix(".png"))
         on_root(comm, lambda: contact_sheet(path, left[-1]))

@@ -1,4 +1,4 @@
-"""The start of runs: PETSc gets its options, and only then what needs it is imported."""
+"""The Python interface of runs. Modules that use PETSc are imported after it has its options."""
 
 import inspect
 import logging
@@ -27,19 +27,24 @@ from msmpetsc.solve.petsc.words import words_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Source = str | PathLike[str] | Mapping[str, Any] | Scene  # a scene file, its tables, or a scene
+# a scene file, tables, or a scene
+Source = str | PathLike[str] | Mapping[str, Any] | Scene
 
 
 def asked_by(request: Callable[P, object]) -> Callable[[Callable[..., T]], Callable[P, T]]:
-    """Return a decorator that gives a function the arguments of a request, and their help."""
+    """Return a decorator that gives a function the signature of a request and its help texts."""
 
     def decorate(function: Callable[..., T]) -> Callable[P, T]:
         signature = inspect.signature(request).replace(
             return_annotation=function.__annotations__["return"]
         )
-        function.__signature__ = signature  # type: ignore[attr-defined]  # which help() shows
-        lines = (f"    {name:16} : {option.help}" for name, option in OPTIONS.items())
-        function.__doc__ = "\n".join([function.__doc__ or "", *lines, ""])
+        # help() shows __signature__
+        function.__signature__ = signature  # type: ignore[attr-defined]
+        summary, _, sections = inspect.cleandoc(function.__doc__ or "").partition("\n\n")
+        parameters = (f"{name} : optional\n    {option.help}" for name, option in OPTIONS.items())
+        function.__doc__ = "\n".join(
+            [summary, "", "Parameters", "----------", *parameters, "", sections]
+        )
         return function
 
     return decorate
@@ -47,12 +52,25 @@ def asked_by(request: Callable[P, object]) -> Callable[[Callable[..., T]], Calla
 
 @asked_by(RunRequest)
 def run(*values: Any, **keywords: Any) -> Path:
-    """Run a scene as ``msmpetsc run`` does, and return the path of its result (collective).
+    """Run a scene as ``msmpetsc run`` does and return the path of its result (collective).
 
+    Returns
+    -------
+    Path
+        Path of the result file.
+
+    Raises
+    ------
+    InputError
+        The scene or an option cannot be used; raised on all ranks.
+    StepFailed
+        A time step failed; raised on all ranks.
+    KeyboardInterrupt, SystemExit
+        SIGINT or SIGTERM stopped the run; ``resume="OUT.h5"`` continues it.
+
+    Examples
+    --------
         path = msmpetsc.run("scene.toml", "out/x.h5", frames=10, set={"material.density": 900.0})
-
-    Raises InputError and StepFailed on all ranks. Stopped by a signal, the run leaves a file that resume="OUT.h5"
-    takes up, and raises what Python raises there: KeyboardInterrupt for SIGINT, SystemExit for SIGTERM.
     """
     comm = MPI.COMM_WORLD
     with ending_together(comm):
@@ -66,36 +84,37 @@ def run(*values: Any, **keywords: Any) -> Path:
 
 
 def carry_out(comm: MPI.Intracomm, request: RunRequest) -> int:
-    """Carry out a run; return its exit status (collective)."""
+    """Run a request; return the exit status (collective)."""
     started = perf_counter()
-    with options_given(comm, request) as (asked, earlier):
-        from msmpetsc.app.running import run_steps  # PETSc, which has its options now
+    with options_given(comm, request) as (request, earlier):
+        from msmpetsc.app.running import run_steps
 
-        return run_steps(comm, asked, earlier, started)
+        return run_steps(comm, request, earlier, started)
 
 
 def options_shown(comm: MPI.Intracomm, request: RunRequest) -> list[str]:
-    """Return a run's options of PETSc as lines of a file; no mesh is read (collective)."""
-    with options_given(comm, request) as (asked, earlier):
+    """Return the PETSc options of a run as lines of an options file (collective)."""
+    with options_given(comm, request) as (request, earlier):
         from msmpetsc.app.running import lines_of_options
 
-        return lines_of_options(comm, asked, earlier)
+        return lines_of_options(comm, request, earlier)
 
 
 @contextmanager
 def options_given(
     comm: MPI.Intracomm, request: RunRequest
 ) -> Iterator[tuple[RunRequest, Earlier | None]]:
-    """Give PETSc the options of a request, and of the run that it goes on from (collective)."""
+    """Give PETSc the options of a request and of the run that it resumes (collective).
+
+    Yields the request with all options, and the earlier run or None.
+    """
     earlier = earlier_run(comm, request.resume, request.scene is not None)
     if earlier is not None:
         words = [*kept_options(earlier, request.petsc_words), *request.petsc_words]
         true_error = request.true_error or earlier.true_error or None
         request = replace(request, petsc_options=shlex.join(words), true_error=true_error)
-    with (
-        lent_options(comm, request.petsc_words),
-        np.errstate(all="ignore"),
-    ):  # a step tells of what overflows
+    # a step reports overflow itself
+    with lent_options(comm, request.petsc_words), np.errstate(all="ignore"):
         yield request, earlier
 
 
@@ -107,26 +126,53 @@ def frames(
     device: str | None = None,
     petsc_options: str | Mapping[str, Any] = "",
 ) -> Iterator[Frame]:
-    """Yield the frames of a scene, frame 0 first, and write no file; see ``Simulation``.
+    """Yield the frames of a scene without writing a file (collective).
 
-    for frame in msmpetsc.frames("scene.toml", set={"material.young_modulus": 2e5}):
-        print(frame.time, frame.position[:, 2].max())
+    Parameters
+    ----------
+    scene : path, mapping or Scene
+        Scene file, tables as in a scene file, or a checked scene.
+    frames : int, optional
+        Stop after this number of steps.
+    set : mapping, optional
+        Changes of the scene, for example {"time.step": 1e-3}.
+    device : {"cpu", "cuda"}, optional
+        Device; "cuda" is -mat_type aijcusparse.
+    petsc_options : str or mapping, optional
+        PETSc options, for example "-ksp_rtol 1e-3" or {"ksp_rtol": 1e-3, "ksp_view": None}.
+
+    Yields
+    ------
+    Frame
+        The start as frame 0, then the frame of each step, as in ``Simulation.frames``.
+
+    Examples
+    --------
+        for frame in msmpetsc.frames("scene.toml", set={"material.young_modulus": 2e5}):
+            print(frame.time, frame.position[:, 2].max())
     """
     return Simulation(scene, device=device, petsc_options=petsc_options).frames(frames, set=set)
 
 
 class Simulation:
-    """A scene that is run again and again, on all ranks; its lattice is kept while it may be.
+    """A scene for several runs that share cages, embedding and the network of springs.
 
-    simulation = msmpetsc.Simulation("scene.toml")
-    for modulus in (1e5, 2e5, 4e5):
-        *_, last = simulation.frames(set={"material.young_modulus": modulus})
+    These are kept as long as the tables of meshes and cages do not change. Material, loads,
+    starts and times may change from run to run. All methods are collective.
 
-    Cages, embedding and the springs' network are kept while mesh and cages stay as they are;
-    material, loads, starts and times may change from run to run.
+    Attributes
+    ----------
+    scene : Scene
+        The scene without the changes of a run.
+    model : Model or None
+        Model of the last run: lattice, embedding and, on rank 0, the surface. None before the
+        first run.
 
-    scene : as it was given
-    model : of the run begun last: lattice, embedding, on rank 0 the surface; None before the first
+    Examples
+    --------
+        simulation = msmpetsc.Simulation("scene.toml")
+        for modulus in (1e5, 2e5, 4e5):
+            *_, last = simulation.frames(set={"material.young_modulus": modulus})
     """
 
     def __init__(
@@ -136,39 +182,59 @@ class Simulation:
         device: str | None = None,
         petsc_options: str | Mapping[str, Any] = "",
     ):
-        """Read and check the scene; the mesh is read when the first run begins.
+        """Read and check the scene; the first run reads the mesh.
 
-        scene         : a file's path, tables as in a file, or a Scene
-        device        : "cpu" or "cuda"; cuda is -mat_type aijcusparse
-        petsc_options : for its runs alone: "-ksp_rtol 1e-3", or {"ksp_rtol": 1e-3, "ksp_view": None}
+        Parameters
+        ----------
+        scene, device, petsc_options
+            As for ``msmpetsc.frames``; the options are of this simulation's runs only.
 
-        Raises InputError.
+        Raises
+        ------
+        InputError
+            The scene or an option cannot be used.
         """
         if device not in (None, "cpu", "cuda"):
-            raise InputError(f"device is cpu or cuda, not {device!r}")
+            raise InputError(f"device must be cpu or cuda, not {device!r}")
         self.comm, self.device = MPI.COMM_WORLD, device
         if not isinstance(scene, Scene):
             scene = Scene.of(scene) if isinstance(scene, Mapping) else Scene.load(scene)
         self.scene = scene
         self.model: Model | None = None
         self._words = words_of(petsc_options)
-        self._shape: Geometry | None = None  # that the model was made of
+        self._geometry: Geometry | None = None
 
     def __repr__(self) -> str:
-        """Return one line: the scene, and the ranks that it is run on."""
+        """Return the scene, the device and the number of ranks in a line."""
         ranks = f"{self.comm.size} rank{'s' * (self.comm.size > 1)}"
         return f"Simulation({self.scene!r}, {self.device or 'cpu'}, {ranks})"
 
     def frames(
         self, frames: int | None = None, *, set: Mapping[str, Any] | None = None
     ) -> Iterator[Frame]:
-        """Yield the frames of a run from the start, frame 0 first (collective).
+        """Yield the frames of a run from the start (collective).
 
-        frames : stop after so many steps
-        set    : changes of the scene for this run: {"time.step": 1e-3, "solver.preset": "newton"}
+        Leaving the loop early ends the run; all ranks must leave it at the same frame.
 
-        Each frame has this rank's rows, the caller's own. To leave the loop early ends the run; all
-        ranks must do so at the same frame. Raises InputError at once, and StepFailed, on all ranks.
+        Parameters
+        ----------
+        frames : int, optional
+            Stop after this number of steps.
+        set : mapping, optional
+            Changes of the scene for this run, for example {"solver.preset": "newton"}.
+
+        Yields
+        ------
+        Frame
+            The start as frame 0, then the frame of each step. Arrays hold this rank's rows and
+            belong to the caller.
+
+        Raises
+        ------
+        InputError
+            The changed scene cannot be used; raised at the call, on all ranks.
+        StepFailed
+            A time step failed; raised in the loop, on all ranks.
         """
         scene = self.scene.changed(set or {})
         if frames is not None:
@@ -178,48 +244,55 @@ class Simulation:
         return self._steps(scene)
 
     def _steps(self, scene: Scene) -> Iterator[Frame]:
-        with ExitStack() as until_the_end:
-            with self._at_work():
-                steps = self._begin(scene, until_the_end)
+        """Yield the frames of a run and close its resources at the end (collective)."""
+        with ExitStack() as resources:
+            with self._guarded():
+                steps = self._begin(scene, resources)
             while True:
-                with self._at_work():
+                with self._guarded():
                     frame = next(steps, None)
                 if frame is None:
                     return
-                yield replace(frame, position=frame.position.copy())  # the next step needs these
+                # the next step still needs the frame's own positions
+                yield replace(frame, position=frame.position.copy())
 
-    def _begin(self, scene: Scene, until_the_end: ExitStack) -> Iterator[Frame]:
-        """Build what the run needs, or keep it, and return its steps (collective)."""
+    def _begin(self, scene: Scene, resources: ExitStack) -> Iterator[Frame]:
+        """Build the model, reusing the geometry if it fits, and return the steps (collective)."""
         start_for_runs(self.comm, self._words)
         from msmpetsc.solve import presets, refused_options, simulate
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
 
         words = [*self._words, f"-{OPTION}", AIJCUSPARSE] if self.device == "cuda" else self._words
-        alone = not +presets.in_use  # no other simulation is begun
+        # whether no other simulation is under way; + drops counts of zero
+        alone = not +presets.in_use
         if words and not alone:
             raise InputError(
-                "another simulation is under way: end it before one that has PETSc options or a device"
+                "another simulation is under way: end it before a run with PETSc options or a GPU"
             )
         if words:
-            until_the_end.enter_context(lent_options(self.comm, words))
+            resources.enter_context(lent_options(self.comm, words))
         if alone:
             refused_options.refuse_early(self.comm)
         choose(self.comm, self.device)
         simulate.refuse_bad_options(scene)
-        if self._shape is None or not self._shape.fits(scene):
-            self._shape = Geometry(self.comm, scene)
-        self.model = model = build_model(self.comm, scene, self._shape)
-        loop = until_the_end.enter_context(simulate.TimeLoop(self.comm, scene, model))
+        if self._geometry is None or not self._geometry.fits(scene):
+            self._geometry = Geometry(self.comm, scene)
+        self.model = model = build_model(self.comm, scene, self._geometry)
+        loop = resources.enter_context(simulate.TimeLoop(self.comm, scene, model))
         if alone:
             loop.refuse_unused_options()
         return loop.frames()
 
     @contextmanager
-    def _at_work(self) -> Iterator[None]:
-        """Show warnings on rank 0, and end all ranks at a failure, but not between frames."""
+    def _guarded(self) -> Iterator[None]:
+        """Log warnings on rank 0 and end all ranks at a failure in the block (collective).
+
+        The block is a step, not the caller's loop, whose errors are its own.
+        """
+        # a step reports overflow itself
         with (
             logged_on_root(self.comm, logging.WARNING),
             ending_together(self.comm),
-            np.errstate(all="ignore"),  # a step tells of what overflows
+            np.errstate(all="ignore"),
         ):
             yield

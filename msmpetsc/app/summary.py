@@ -1,4 +1,4 @@
-"""What a run says on stderr, from bodies and counts to the files it leaves; and what it cost."""
+"""The log of a run, from its bodies and counts to its files, and the record of its cost."""
 
 import json
 import platform
@@ -30,11 +30,13 @@ from msmpetsc.solve.instrumentation import times
 from msmpetsc.solve.petsc.events import FILES, OUTPUT
 from msmpetsc.solve.simulate import TimeLoop
 
-HARD = 20  # times the products of the median frame: a frame that takes more is named at the end
+# ratio of a frame's products to the median frame's products [-]; above it the log names
+# the hardest frame
+HARD = 20
 
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
-    """Log size, volume and mass of each body, counts, and the nodes that anchors and forces take (collective)."""
+    """Log size, volume and mass of each body, and the counts of cells and nodes (collective)."""
     lattice = model.lattice
     masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(model.bodies))
     shares = np.bincount(
@@ -49,22 +51,24 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
         name = f"body.{number}" if len(model.bodies) > 1 else "body"
         size = " x ".join(f"{length:.4g}" for length in body.bounds[1] - body.bounds[0])
         log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
-    held = int(lattice.pinned[: lattice.owned].sum())
+    own_pinned = int(lattice.pinned[: lattice.owned].sum())
     cells, springs, pinned = (
-        comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, held)
+        comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, own_pinned)
     )
     log.info(
         "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
-        cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
+        cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size,
+        "s" * (comm.size > 1),
     )  # fmt: skip
-    if model.taken:
-        log.info("%s", ", ".join(model.taken))
+    if model.node_counts:
+        log.info("%s", ", ".join(model.node_counts))
 
 
 def warn_of_long_steps(scene: Scene, model: Model) -> None:
-    """Warn of steps longer than the slowest motion of any body, which implicit steps damp away.
+    """Warn if the time step exceeds the slowest period of any body: implicit steps damp it away.
 
-    That is taken to be the bending of a bar of the body's longest and shortest side: of most bodies it is not so slow.
+    The period is that of a bending bar with the body's longest and shortest side, which is an
+    upper estimate for most bodies.
     """
     time = scene.time
     if time.integrator not in ("implicit-euler", "bdf2") or time.error is not None:
@@ -78,71 +82,72 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
     )
     if time.step > period > 0:
         log.warning(
-            "time.step is %.2g periods of the slowest vibration, about %.1g s, which it damps away: time.step = %.1g "
-            'shows it, time.integrator = "static" goes to rest at once',
+            "time.step is %.2g periods of the slowest vibration, about %.1g s, which it damps "
+            'away: time.step = %.1g resolves it, time.integrator = "static" goes to rest at once',
             time.step / period, period, period / STEPS_A_PERIOD,
         )  # fmt: skip
 
 
 def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:
-    """Log how long it took [s], and which files there are; the first of them holds the frames."""
+    """Log the duration of the run [s] and its files; the first file has the frames."""
     sizes = {path: tqdm.format_sizeof(path.stat().st_size, "B") for path in files if path.is_file()}
-    result, *others = (f"{path} ({size})" for path, size in sizes.items())
+    result, *companions = (f"{path} ({size})" for path, size in sizes.items())
     log.info("took %s, %s of it before the first step", duration(seconds), duration(setup))
-    log.info("left %d frame%s in %s", frames, "s" * (frames != 1), ", ".join([result, *others]))
+    log.info("left %d frame%s in %s", frames, "s" * (frames != 1), ", ".join([result, *companions]))
 
 
 def tell_stop(number: int, path: Path, simulation: TimeLoop) -> int:
-    """Say in one line how to go on after a signal; return the exit status of that signal."""
+    """Log the command that resumes a run after a signal; return the signal's exit status."""
     log.warning(
         "stopped by %s after step %d of %d (t = %.6g s); to go on: msmpetsc run --resume %s",
-        Signals(number).name, simulation.step, simulation.steps, simulation.step * simulation.time_step,
-        shlex.quote(str(path)),
+        Signals(number).name, simulation.step, simulation.steps,
+        simulation.step * simulation.time_step, shlex.quote(str(path)),
     )  # fmt: skip
     return STATUS[number]
 
 
 class Cost:
-    """What a run costs, summed frame by frame.
+    """The cost of a run, summed over its frames.
 
-    setup    : seconds until the first step
-    output   : seconds in which frames and checkpoints are written
-    stepping : seconds of the steps
-    products : with the Hessian, by frame
+    setup    : time before the first step [s]
+    output   : time to write frames and checkpoints [s]
+    stepping : time of the steps [s]
+    products : number of Hessian-vector products by frame
+    counts   : cells, nodes, springs and unknowns of all ranks
     """
 
     def __init__(self, comm: MPI.Comm, simulation: TimeLoop, setup: float):
-        self.comm, self.simulation, self.setup = comm, simulation, setup
+        self.comm = comm
+        self.simulation = simulation
+        self.setup = setup
         self.output = self.stepping = 0.0
         self.products: dict[int, int] = {}
         model = simulation.model
-        free = int(
-            (
-                ~simulation.environment.anchors.fixed_at(simulation.time_step)[
-                    : model.lattice.owned
-                ]
-            ).sum()
-        )
-        own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, free
-        self.counts = dict(
-            zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True)
-        )
+        lattice = model.lattice
+        fixed = simulation.environment.anchors.fixed_at(simulation.time_step)[: lattice.owned]
+        own_counts = {
+            "cells": len(lattice.cells),
+            "nodes": lattice.owned,
+            "springs": lattice.springs_owned,
+            "unknowns": int((~fixed).sum()),
+        }
+        self.counts = {name: comm.allreduce(number) for name, number in own_counts.items()}
 
     @contextmanager
     def of_output(self) -> Iterator[None]:
-        """Count the time of the block as that of output."""
+        """Add the time of the block to ``output``."""
         began = perf_counter()
         with OUTPUT, FILES:
             yield
         self.output += perf_counter() - began
 
     def count(self, frame: Frame) -> None:
-        """Count the steps since the frame before."""
+        """Add the steps since the previous frame."""
         self.stepping += frame.wall_time
         self.products[frame.index] = frame.products
 
     def log_hardest(self) -> None:
-        """Log which frame took the most products, if many times those of the median one."""
+        """Log the frame with the most products if they exceed HARD times the median."""
         working = [products for products in self.products.values() if products]
         hardest = max(self.products, key=lambda index: self.products[index], default=0)
         ratio = max(working, default=0) / np.median(working or [1])
@@ -155,9 +160,10 @@ class Cost:
     def write(
         self, path: Path, command: str, before: dict[str, float], failure: StepFailed | None = None
     ) -> None:
-        """Leave it all in a file (collective). Raises InputError where that cannot be written.
+        """Write the cost as JSON (collective). Raises InputError if the file cannot be written.
 
-        before : seconds in events of the process when the run began
+        command : command line of the run
+        before  : time in each logged event of the process before the run [s]
         """
         comm, simulation = self.comm, self.simulation
         device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"
@@ -166,18 +172,19 @@ class Cost:
             comm, before
         )
         record = {
-            "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
-            **self.counts,
+            "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size,
+            "command": command, **self.counts,
             "time": time,
             "products": sum(self.products.values()),
             "memory": comm.allreduce(peak_memory()),
-            "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
+            "failure": failure
+            and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
         }  # fmt: skip
         on_root(comm, lambda: write_whole(path, json.dumps(record, indent=1)))
 
 
 def refuse_unwritable(path: Path | None) -> None:
-    """Raise InputError for a file that cannot be written, before the run rather than after it."""
+    """Raise InputError for a file that cannot be written, so that a run fails before its steps."""
     if path:
         existed = path.exists()
         with plain_errors(path):

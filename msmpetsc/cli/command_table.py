@@ -1,4 +1,4 @@
-"""The table of commands: help, arguments and examples, from which the parser is made."""
+"""The table of commands with their help, arguments and examples, used to make the parser."""
 
 import argparse
 import sys
@@ -9,18 +9,17 @@ from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.app.request import OPTIONS, RunRequest, flag_of
 from msmpetsc.results.frame_choice import frames_in
 
-Argument = tuple[
-    tuple[str, ...], dict[str, Any]
-]  # names and keywords, as argparse's ``add_argument`` takes them
+# names and keywords for argparse's ``add_argument``
+Argument = tuple[tuple[str, ...], dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command.
+    """A command of the command line.
 
-    exclusive   : arguments of which only one may be given
-    starts_runs : whether it starts runs of its own
-    module      : in ``commands``, that carries it out; that of its name if empty
+    exclusive   : arguments that exclude each other
+    starts_runs : whether the command starts runs in other processes
+    module      : module in ``commands`` with its ``run`` function; the command's name if empty
     """
 
     help: str
@@ -33,7 +32,7 @@ class Command:
 
 
 class Shown(argparse.Action):
-    """Prints what its ``const``, a function, returns, and exits."""
+    """Action that prints the text returned by its ``const``, a function, and exits."""
 
     def __init__(self, option_strings: list[str], const: Any, help: str, **_: Any):
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, const=const, help=help)
@@ -44,7 +43,7 @@ class Shown(argparse.Action):
 
 
 def listed_presets() -> str:
-    """Return one line for each preset, which says when to use it."""
+    """Return a line for each preset that says when to use it."""
     from msmpetsc.solve.presets import find_preset, preset_names
 
     names = preset_names()
@@ -53,20 +52,21 @@ def listed_presets() -> str:
 
 
 def argument(*names: str, **keywords: Any) -> Argument:
-    """Return an argument of these names."""
+    """Return an argument for the table of commands."""
     return names, keywords
 
 
 def switch(name: str, about: str) -> Argument:
-    """Return an option that has no value."""
+    """Return an option without a value."""
     return argument(name, action="store_true", help=about)
 
 
 def arguments_of_run() -> tuple[Argument, ...]:
-    """Return the fields of a run request as arguments, without those that only Python takes."""
+    """Return the arguments of ``run``: the fields of a run request that are not Python's only."""
     taken = []
     for field in fields(RunRequest):
-        name, option = field.name, OPTIONS[field.name]
+        name = field.name
+        option = OPTIONS[name]
         about = option.help.replace("%", "%%")
         valued: dict[str, Any] = {
             "type": option.kind,
@@ -95,7 +95,7 @@ def arguments_of_run() -> tuple[Argument, ...]:
 
 
 def at_least_1(word: str) -> int:
-    """Return a word as an integer of at least 1, as argparse's ``type``."""
+    """Return a word as an integer of at least 1; a ``type`` for argparse."""
     if not word.isdecimal() or int(word) < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, not {word}")
     return int(word)
@@ -114,39 +114,48 @@ SET = argument(
     metavar="KEY=VALUE",
     help="override a scene key: cages.count=3000",
 )
-JSON = switch("--json", "print one JSON object and nothing else")
-SAID = (  # of every command
-    switch("--quiet", "no notes and no progress; warnings and errors stay"),
-    switch("--verbose", "notes with the time [ms]; of an error where it arose, too"),
+JSON = switch("--json", "print a JSON object only")
+# options of every command
+VERBOSITY = (
+    switch("--quiet", "show only warnings and errors"),
+    switch("--verbose", "show times [ms] in the log and a traceback of errors"),
 )
 
 
 def frames(about: str) -> Argument:
-    """Return ``--frames``, which selects frames of a result."""
+    """Return the option ``--frames``, which selects frames of a result."""
     return argument("--frames", metavar="0,10,20", type=frames_in, help=about)
 
 
 def ranks(about: str) -> Argument:
-    """Return ``--ranks``, of commands that start runs."""
+    """Return the option ``--ranks`` of commands that start runs."""
     return whole("--ranks", "R", about, default=1)
 
 
 RENDER = (
-    argument("subject", metavar="OUT.h5|SCENE.toml", type=checked_file, help="what is drawn"),
+    argument(
+        "subject", metavar="OUT.h5|SCENE.toml", type=checked_file, help="result or scene to draw"
+    ),
     argument(
         "-o", "--output", metavar="FILE", type=checked_file,
-        help="*.png, *.mp4, *.gif, *.webp or *.html; default: beside what is drawn, ending in .png",
+        help="*.png, *.mp4, *.gif, *.webp or *.html; default: OUT.png or SCENE.png",
     ),
-    frames("these frames; slices like 0:250:5 as Python counts"),
-    whole("--count", "N", "choose this many moments (default: the scene's picture.times, or 5)"),
+    frames("frames to draw; slices such as 0:250:5 as in Python"),
+    whole("--count", "N", "number of frames to choose (default: the scene's picture.times, or 5)"),
     argument("--eye", metavar="X,Y,Z", help="direction from the body to the eye (--eye=-1,2,0.5)"),
-    argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)"),
+    argument(
+        "--size", metavar="WxH",
+        help="size of a film (960x720), or largest size of a panel (460x1000) [px]",
+    ),
     argument(
         "--colour", metavar="FIELD",
         help="colour by displacement, speed, strain, stress or part, with a legend",
     ),
-    switch("--cells", "cut the body open: boundary cells red, interior ones blue"),
-    argument("--speed", type=float, metavar="S", help="simulated seconds a second (1, which is real time)"),
+    switch("--cells", "cut the body open: boundary cells in red, interior cells in blue"),
+    argument(
+        "--speed", type=float, metavar="S",
+        help="simulated seconds per second of the film (1: real time)",
+    ),
     SET,
 )  # fmt: skip
 COMMANDS = {
@@ -158,18 +167,21 @@ COMMANDS = {
             "msmpetsc new my.toml --from bunny_fall",
         ),
         (
-            argument("scene", nargs="?", type=checked_file, metavar="SCENE.toml", help="what is written"),
+            argument(
+                "scene", nargs="?", type=checked_file, metavar="SCENE.toml", help="scene to write"
+            ),
             argument(
                 "--mesh", type=checked_file, metavar="MESH",
-                help="a mesh file in or below the scene's folder, or a model",
+                help="mesh file in or below the scene's folder, or a model of `fetch --list`",
             ),
-            argument("--up", choices=("y", "z"), help="the mesh's upward axis; guessed if not given"),
-            argument("--from", dest="from_scene", metavar="NAME", help="copy this scene, see --list"),
+            argument("--up", choices=("y", "z"), help="mesh's upward axis; guessed by default"),
+            argument("--from", dest="from_scene", metavar="NAME", help="scene to copy, see --list"),
             switch("--list", "list the scenes that come with msmpetsc"),
             switch("--overwrite", "replace SCENE.toml if it exists"),
         ),
-        description="Measure a mesh and write a commented scene that runs at once, or copy one that comes with "
-        "msmpetsc; beside it the schema by which editors complete its keys.",
+        description="Measure a mesh and write a commented scene that is ready to run, or copy a "
+        "scene that comes with msmpetsc. Also write the JSON schema by which editors complete its "
+        "keys.",
     ),
     "run": Command(
         "simulate a scene",
@@ -181,37 +193,51 @@ COMMANDS = {
         ),
         (
             *arguments_of_run(),
-            switch("--show-options", "say which PETSc options a preset sets, as an options file"),
-            argument("--list-presets", action=Shown, const=listed_presets, help="say what each preset is for"),
+            switch("--show-options", "print the PETSc options of the preset as an options file"),
+            argument(
+                "--list-presets", action=Shown, const=listed_presets,
+                help="list the presets and when to use each",
+            ),
         ),
-        description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options (one dash) may follow.",
+        description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options, with a single "
+        "dash, may follow.",
     ),
     "inspect": Command(
-        "say what a scene would need on so many ranks",
+        "estimate the size and memory of a scene on a number of ranks",
         ("msmpetsc inspect my.toml --ranks 64", "msmpetsc inspect my.toml --json"),
         (SCENE, ranks("MPI ranks (1)"), SET, JSON),
-        description="Count cells, nodes, springs, ghosts and messages of each rank, and expect its memory.",
+        description="Count cells, nodes, springs, ghosts and messages of each rank, and estimate "
+        "its memory.",
     ),
     "study": Command(
         "sweep methods over scenes",
-        ("msmpetsc study my_study.toml --list", "msmpetsc study my_study.toml -o out/my_study --jobs 2"),
+        (
+            "msmpetsc study my_study.toml --list",
+            "msmpetsc study my_study.toml -o out/my_study --jobs 2",
+        ),
         (
             argument("study", type=checked_path, metavar="FILE.toml", help="study file"),
-            argument("-o", "--output", type=checked_path, metavar="FOLDER", help="default: out/FILE"),
-            switch("--full", "also what is marked full = true: the long cases"),
-            whole("--jobs", "N", "cases at a time (they slow each other)"),
-            switch("--restart", "forget the cases that are done"),
+            argument(
+                "-o", "--output", type=checked_path, metavar="FOLDER",
+                help="folder of the results; default: out/FILE",
+            ),
+            switch("--full", "also run the long cases, marked full = true"),
+            whole("--jobs", "N", "number of cases to run at a time (they slow each other)"),
+            switch("--restart", "run finished cases again"),
         ),
         (
-            argument("--part", metavar="I/N", help="only the I-th of N parts, for another machine or array task"),
-            switch("--list", "only say which cases there are, and which are done"),
+            argument(
+                "--part", metavar="I/N",
+                help="run only the I-th of N parts, for several machines or array tasks",
+            ),
+            switch("--list", "list the cases and which are done, and run nothing"),
         ),
-        "Run the cases of a study, each in its own process, into a table and a report. "
-        "Stopped, the same command goes on.",
+        "Run the cases of a study, each in its own process, and write a table and a report. "
+        "After a stop the same command continues.",
         starts_runs=True,
     ),
     "plan": Command(
-        "find the cheapest options that meet an error of the surface",
+        "find the cheapest options that meet a surface error",
         (
             "msmpetsc plan my.toml --surface-error 0.1 --write",
             "msmpetsc plan my.toml --surface-error 0.03 --frames 10",
@@ -220,32 +246,41 @@ COMMANDS = {
             SCENE,
             argument(
                 "--surface-error", type=float, metavar="E", default=0.1,
-                help="error of the surface, of its largest displacement: cells, step and solver together (0.1)",
+                help="error of cells, time step and solver together, over the surface's largest "
+                "displacement (0.1)",
             ),
-            whole("--frames", "N", "of the scene's steps, the first N (20)", default=20),
-            ranks("MPI ranks of the trials"),
-            switch("--write", "put the answer into the scene file"),
-            whole("--cells", "N", "of the finest trial; the scene's count"),
+            whole("--frames", "N", "number of the scene's steps in a trial (20)", default=20),
+            ranks("MPI ranks of the trials (1)"),
+            switch("--write", "write the chosen options into the scene file"),
+            whole("--cells", "N", "cells of the finest trial (the scene's cages.count)"),
             JSON,
         ),
-        description="Try lattices, integrators, time steps and errors of a step on the first frames of a scene, and "
-        "say which is the cheapest that meets the error. Exit status 3: none does.",
+        description="Try cell counts, integrators, time steps and step errors on the first frames "
+        "of a scene, and print the cheapest choice that meets the error. Exit status 3: no choice "
+        "meets it.",
         starts_runs=True,
     ),
     "compare": Command(
-        "say whether two results agree",
-        ("msmpetsc compare out/a.h5 out/b.h5 --rtol 1e-3", "msmpetsc compare out/a.h5 out/b.h5 --json"),
+        "compare two results",
+        (
+            "msmpetsc compare out/a.h5 out/b.h5 --rtol 1e-3",
+            "msmpetsc compare out/a.h5 out/b.h5 --json",
+        ),
         (
             argument("first", metavar="A.h5", type=checked_file),
             argument("second", metavar="B.h5", type=checked_file),
-            argument("--rtol", type=float, default=1e-6, metavar="E", help="relative error that still agrees (1e-6)"),
+            argument(
+                "--rtol", type=float, default=1e-6, metavar="E",
+                help="relative difference up to which results agree (1e-6)",
+            ),
             JSON,
         ),
-        description="Compare two results at the times that both have; of different lattices their surfaces alone. "
-        "Exit status 0: they agree; 1: they differ; 2: they cannot be compared.",
+        description="Compare two results at their common times; results on different lattices by "
+        "their surfaces only. Exit status 0: they agree; 1: they differ; 2: they cannot be "
+        "compared.",
     ),
     "render": Command(
-        "draw a result as a picture, a film or a page; or a scene before anything is run",
+        "draw a result as a picture, a film or a page; or draw a scene before it is run",
         (
             "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5",
             "msmpetsc render out/my.h5 -o out/my.mp4 --speed 0.1",
@@ -253,8 +288,8 @@ COMMANDS = {
             "msmpetsc render my.toml --cells",
         ),
         RENDER,
-        description="Draw some moments of a result side by side (*.png), a film (*.mp4, *.gif, *.webp), or a page for "
-        "a browser in which the body turns and its frames play (*.html). A scene is drawn as it lies.",
+        description="Draw some frames of a result side by side (*.png), a film (*.mp4, *.gif, "
+        "*.webp), or an interactive page for a browser (*.html). A scene is drawn at rest.",
     ),
     "export": Command(
         "write frames of a result in another format",
@@ -264,63 +299,81 @@ COMMANDS = {
         ),
         (
             argument("result", metavar="OUT.h5", type=checked_file),
-            argument("-o", "--output", metavar="FILE", type=checked_file, required=True, help="what to write"),
-            frames("these frames, or slices like 0:250:5; default: all, or the last (-1) of one"),
+            argument(
+                "-o", "--output", metavar="FILE", type=checked_file, required=True,
+                help="file to write; its ending chooses the format",
+            ),
+            frames(
+                "frames to write; slices such as 0:250:5; default: all frames, or the last frame "
+                "(-1) in a format of a single frame"
+            ),
         ),
-        description="Write frames of a result for another program; the name's ending says in which format: .glb "
-        "and .usd hold frames in time, .obj, .ply and .stl one frame.",
+        description="Write frames of a result for another program. Formats: .glb and .usd hold "
+        "many frames; .obj, .ply and .stl hold a single frame.",
     ),
     "series": Command(
-        "print energies, forces and places of probes of a result, a row a frame",
+        "print energies, forces and probe positions of a result, a row per frame",
         ("msmpetsc series out/my.h5 -o out/my.csv", "msmpetsc series out/my.h5 > out/my.csv"),
         (
             argument("result", metavar="OUT.h5", type=checked_file),
-            argument("-o", "--output", metavar="FILE.csv", type=checked_file, help="default: print them"),
-            switch("--overwrite", "replace FILE.csv"),
+            argument(
+                "-o", "--output", metavar="FILE.csv", type=checked_file,
+                help="file to write; default: standard output",
+            ),
+            switch("--overwrite", "replace FILE.csv if it exists"),
         ),
-        description="Write as CSV, for each frame, energies, momentum, loads, the reaction of each pin and anchor, the "
-        "push of each obstacle and of contacts on each body, and where the scene's probes are.",
+        description="Write as CSV, for each frame: energies, momentum, loads, reactions of pins "
+        "and anchors, contact forces of obstacles and on bodies, and positions of probes.",
     ),
     "check": Command(
-        "store a scene's numbers; say whether they still hold",
+        "check the numbers of a scene against stored numbers",
         (
             "msmpetsc check my.toml --update --cells 400 --frames 10",
             "msmpetsc check my.toml other.toml --ranks 2",
         ),
         (
-            argument("scenes", type=checked_file, nargs="+", metavar="SCENE", help="scene files (TOML)"),
+            argument(
+                "scenes", type=checked_file, nargs="+", metavar="SCENE", help="scene files (TOML)"
+            ),
             ranks("MPI ranks of the runs (1)"),
-            switch("--update", "store the numbers, in place of those stored before"),
-            whole("--cells", "N", "of --update: cages.count; the scene's if not given"),
-            whole("--frames", "N", "of --update: steps, the scene's at the most (20)"),
+            switch("--update", "store the numbers and replace the stored numbers"),
+            whole("--cells", "N", "cages.count, with --update; default: the scene's"),
+            whole("--frames", "N", "number of steps, with --update (20, or all if fewer)"),
             SET,
             JSON,
         ),
-        description="Run the first steps of scenes, each solved to 1e-9, and hold counts, energies, momentum and "
-        "places against those that --update stored. Exit status 0: all are as stored; 1: something differs.",
+        description="Run the first steps of scenes, each solved to 1e-9, and compare counts, "
+        "energies, momentum and positions with the numbers that --update has stored. Exit status "
+        "0: all agree; 1: a number differs.",
         starts_runs=True,
     ),
     "fetch": Command(
         "download named meshes, or list them",
         ("msmpetsc fetch --list", "msmpetsc fetch bunny armadillo"),
         (
-            argument("names", nargs="*", metavar="NAME", help="a model, see --list"),
-            switch("--list", "list the models and where they lie"),
+            argument("names", nargs="*", metavar="NAME", help="model, see --list"),
+            switch("--list", "list the models and where they are stored"),
         ),
     ),
     "keys": Command(
-        "list the keys of a scene, or of one of its tables: unit, default, range, meaning",
+        "list the keys of a scene or of a table: unit, default, range, meaning",
         ("msmpetsc keys", "msmpetsc keys material", "msmpetsc keys pin.region"),
-        (argument("table", nargs="?", metavar="TABLE", help="a table or a key: material, pin.region, time.step"),),
+        (
+            argument(
+                "table", nargs="?", metavar="TABLE",
+                help="table or key, for example material, pin.region or time.step",
+            ),
+        ),
     ),
     "schema": Command(
-        "print the JSON schema of a scene, for editors", ("msmpetsc schema > msmpetsc.schema.json",),
+        "print the JSON schema of a scene, for editors",
+        ("msmpetsc schema > msmpetsc.schema.json",),
         module="keys",
     ),
     "doctor": Command(
-        "say what is installed, and how to get what is not",
+        "check the installation and say how to complete it",
         ("msmpetsc doctor",),
-        description="Examine PETSc, MPI, the device, HDF5 and the packages of each extra. "
-        "Exit status 1: a run lacks something that it needs.",
+        description="Check PETSc, MPI, the GPU, HDF5 and the packages of each extra. Exit status "
+        "1: a requirement of runs is missing or broken.",
     ),
 }  # fmt: skip

@@ -1,6 +1,6 @@
-"""The entry point of the command line: it parses, carries out, and reports failures in one line and an exit status.
+"""The entry point of the command line: parse, run a command, report errors and exit status.
 
-What is imported at the top starts neither MPI nor PETSc, so that ``--help`` answers at once.
+The imports at the top start neither MPI nor PETSc, so that ``--help`` is fast.
 """
 
 import argparse
@@ -23,22 +23,26 @@ import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES
 from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
 from msmpetsc.app.ranks import world
-from msmpetsc.cli.command_table import COMMANDS, SAID, Shown
+from msmpetsc.cli.command_table import COMMANDS, VERBOSITY, Shown
 from msmpetsc.errors import InputError, MsmpetscError, did_you_mean, printable
 
-READING = ("render", "export", "compare", "series")  # the extra "render" is enough for these
+# commands that need the packages of the extra "render" only
+READING = ("render", "export", "compare", "series")
+# options with a single dash that are not PETSc's
 OUR_SHORT = ("-o", "-h")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; return 0, 2 for bad input, 3 for a step that failed (collective)."""
+    """Run a command and return its exit status (collective)."""
     words = sys.argv[1:] if arguments is None else arguments
     args = argparse.Namespace(verbose=False)
     comm = world()
     try:
         with ending_together(comm):
-            args = parsed(words)  # --help and --version leave from here
-            comm = world(started=args.command == "run")  # the other commands are for one process
+            # --help and --version exit here
+            args = parsed(words)
+            # only `run` may use several ranks
+            comm = world(started=args.command == "run")
         extra = "render" if args.command in READING else "run"
         level = logging.WARNING if args.quiet else logging.INFO
         with logged_on_root(comm, level, args.verbose), ending_together(comm, extra):
@@ -52,7 +56,8 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("msmpetsc: rank 0: interrupted", file=sys.stderr, flush=True)
         return STATUS_INTERRUPTED
-    except BrokenPipeError:  # its reader went away: entry_point ends quietly
+    # the reader of the output has gone: entry_point exits quietly
+    except BrokenPipeError:
         raise
     except Exception:
         print(f"msmpetsc: rank 0: {traceback.format_exc()}", file=sys.stderr, flush=True)
@@ -60,20 +65,25 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def carry_out(args: argparse.Namespace, ranks: int) -> int:
-    """Carry out a command on so many ranks; return its exit status. Raises InputError where it is for one."""
+    """Run a command and return its exit status.
+
+    Raises InputError on several ranks for a command that is for a single process.
+    """
     command = COMMANDS[args.command]
     if ranks > 1 and args.command != "run":
         raise InputError(f"{args.command} is for one process: start it without mpiexec")
-    if command.starts_runs:  # SIGTERM ends those, too, as Ctrl-C does
+    # SIGTERM, like Ctrl-C, then also ends the runs that the command has started
+    if command.starts_runs:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    status: int = import_module(f"msmpetsc.cli.commands.{command.module or args.command}").run(args)
+    module = import_module(f"msmpetsc.cli.commands.{command.module or args.command}")
+    status: int = module.run(args)
     return status
 
 
 def entry_point() -> None:
-    """Run the installed ``msmpetsc``.
+    """Run the installed ``msmpetsc`` and exit.
 
-    It ends quietly, as other programs do, when who reads what it prints goes away: ``msmpetsc doctor | head -1``.
+    The program exits quietly if the reader of its output closes the pipe, as ``head -1`` does.
     """
     try:
         try:
@@ -81,16 +91,13 @@ def entry_point() -> None:
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        for stream in (
-            sys.stdout,
-            sys.stderr,
-        ):  # what is left to be written, at the exit too, has no reader
-            os.dup2(nowhere, stream.fileno())
+        # discard buffered output, which Python would flush at exit
+        devnull = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(devnull, stream.fileno())
         status = 128 + signal.SIGPIPE
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # all is done: one more could only spoil the status
+    # a late Ctrl-C must not change the exit status
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(status)
 
 
@@ -98,7 +105,7 @@ def entry_point() -> None:
 
 
 def parsed(words: list[str]) -> argparse.Namespace:
-    """Parse a whole command line: our own arguments, and PETSc's options. Raises InputError."""
+    """Return the parsed arguments of a command line with PETSc options. Raises InputError."""
     ours, petsc = split_petsc_options(words)
     if ours and ours[0] not in COMMANDS and not ours[0].startswith("-"):
         word = printable(ours[0], 60)
@@ -120,31 +127,33 @@ def parsed(words: list[str]) -> argparse.Namespace:
 
 
 def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
-    """Split words into ours and PETSc's options, which have one dash and may have a value."""
+    """Return our words, and the PETSc options, which have a single dash and may have a value."""
     ours: list[str] = []
     petsc: list[str] = []
     for before, word in pairwise(["", *words]):
-        ends_it = word.startswith("--") or word in OUR_SHORT or word.endswith(".toml")
-        value = _is_petsc_option(before) and not ends_it
-        (petsc if value or _is_petsc_option(word) else ours).append(word)
+        is_ours = word.startswith("--") or word in OUR_SHORT or word.endswith(".toml")
+        is_value = _is_petsc_option(before) and not is_ours
+        (petsc if is_value or _is_petsc_option(word) else ours).append(word)
     return ours, petsc
 
 
 def _is_petsc_option(word: str) -> bool:
+    """Return whether a word is a PETSc option: a single dash and a letter."""
     return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for our options with one dash, and PETSc options where none are taken."""
+    """Raise InputError for our options with a single dash, and for unexpected PETSc options."""
     name = ours[0] if ours else ""
-    if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
+    # argparse handles -h and a missing command
+    if name not in COMMANDS:
         return
     valid = option_names(name)
     for word in petsc:
         doubled = f"-{word.partition('=')[0]}"
-        if doubled in valid and not (
-            name == "run" and doubled == "--help"
-        ):  # PETSc has a -help, too
+        # PETSc also has a -help
+        is_petsc_help = name == "run" and doubled == "--help"
+        if doubled in valid and not is_petsc_help:
             raise InputError(f"{word}: options of one dash are PETSc's, did you mean {doubled!r}?")
     if petsc and name != "run":
         raise InputError(
@@ -153,30 +162,31 @@ def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that prints on rank 0 only, and raises InputError."""
+    """An argument parser that prints on rank 0 only and raises InputError."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(re.sub(r"^argument (\S+): (?=must )", r"\1 ", message))
 
-    def _print_message(
-        self, message: str, file: Any = None
-    ) -> None:  # where argparse prints help and version
+    # argparse prints help and version by this method
+    def _print_message(self, message: str, file: Any = None) -> None:
         if world().rank == 0:
             super()._print_message(message, file)
 
 
 def versions_line() -> str:
-    """Return the versions of this package, PETSc, MPI and Python; what cannot be loaded says so."""
+    """Return the versions of msmpetsc, PETSc, MPI and Python, "no PETSc" if it cannot be loaded."""
     petsc = "no PETSc"
     mpi = "no MPI"
-    with suppress(Exception):  # it is missing, or built for another: each in its own way
+    # a missing or incompatible library may raise any exception
+    with suppress(Exception):
         from petsc4py import PETSc
 
         petsc = f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
     with suppress(Exception):
         from mpi4py import MPI
 
-        mpi = re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()  # "Open MPI v5.0.7"
+        # for example "Open MPI v5.0.7"
+        mpi = re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()
     return f"msmpetsc {msmpetsc.__version__} ({petsc}, {mpi}, Python {platform.python_version()})"
 
 
@@ -198,7 +208,7 @@ def command_parser() -> Parser:
         )
         for names, keywords in command.arguments:
             add.add_argument(*names, **keywords)
-        for choice in filter(None, (command.exclusive, SAID)):
+        for choice in filter(None, (command.exclusive, VERBOSITY)):
             group = add.add_mutually_exclusive_group()
             for names, keywords in choice:
                 group.add_argument(*names, **keywords)
@@ -206,9 +216,9 @@ def command_parser() -> Parser:
 
 
 def option_names(command: str) -> list[str]:
-    """Return the options of a command, such as "--preset"."""
+    """Return the names of a command's options, for example "--preset"."""
     known = COMMANDS[command]
-    given = (*known.arguments, *known.exclusive, *SAID)
+    given = (*known.arguments, *known.exclusive, *VERBOSITY)
     return ["--help", *(name for names, _ in given for name in names if name.startswith("-"))]
 
 

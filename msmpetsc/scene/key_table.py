@@ -1,4 +1,4 @@
-"""The keys of a scene as a table, out of its schema: default, range, meaning and unit of each."""
+"""The keys of a scene as a table made from its schema: default, range, meaning and unit."""
 
 import re
 from collections.abc import Iterator
@@ -11,17 +11,20 @@ from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import toml_value
 
-SCHEMA_FILE = "msmpetsc.schema.json"  # which a scene's first line names, for editors
+# name of the schema file; the first line of a scene names it for editors
+SCHEMA_FILE = "msmpetsc.schema.json"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-UNREACHED = 1e18  # a bound beyond it only keeps numbers within a double or a 64-bit integer
-NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")  # the number of a [[table]]
+# least bound that is not shown [-]; it only keeps numbers within their type
+HIDDEN_BOUND = 1e18
+# the number of a [[table]] in a key
+NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")
 
 
 class SceneKey(NamedTuple):
-    """A key of a scene file, in words.
+    """The documentation of a key of a scene file.
 
-    name : as ``--set`` takes it, N for the number of a [[table]]: "pin.N.region.box"
+    name : as in ``--set``, with N for the number of a [[table]], for example "pin.N.region.box"
     """
 
     name: str
@@ -31,14 +34,14 @@ class SceneKey(NamedTuple):
 
 
 class WithoutNull(GenerateJsonSchema):
-    """A JSON schema without null, which TOML lacks: a key that may be absent has its kind."""
+    """Generator of a JSON schema without null, which TOML lacks."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
-        """Return the schema of the kind alone."""
+        """Return the schema of an optional value without the null alternative."""
         return self.generate_inner(schema["schema"])
 
     def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
-        """Return the schema without a default that is null."""
+        """Return the schema of a value without a null default."""
         return {
             name: value
             for name, value in super().default_schema(schema).items()
@@ -52,23 +55,27 @@ def json_schema() -> dict[str, Any]:
 
 
 def keys(prefix: str = "") -> list[SceneKey]:
-    """Return all keys, or those of a table or of this name. Raises InputError where there is none."""
+    """Return the key of a name, the keys of a table, or all keys.
+
+    Raises InputError for an unknown name.
+    """
     schema = json_schema()
-    every = list(_keys(schema, schema, ""))
-    wanted = NUMBERED.sub("", prefix)
+    all_keys = list(_keys(schema, schema, ""))
+    name = NUMBERED.sub("", prefix)
     chosen = [
         key
-        for key in every
-        if f"{NUMBERED.sub('', key.name)}.".startswith(f"{wanted}." if wanted else "")
+        for key in all_keys
+        if f"{NUMBERED.sub('', key.name)}.".startswith(f"{name}." if name else "")
     ]
     if not chosen:
-        names = [NUMBERED.sub("", key.name) for key in every]
+        names = [NUMBERED.sub("", key.name) for key in all_keys]
         tables = {name.rpartition(".")[0] for name in names} - {""}
-        raise InputError(f"a scene has no key {prefix!r}{did_you_mean(wanted, [*tables, *names])}")
+        raise InputError(f"a scene has no key {prefix!r}{did_you_mean(name, [*tables, *names])}")
     return chosen
 
 
 def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterator[SceneKey]:
+    """Yield the keys of a table of the JSON schema and of the tables inside it."""
     one_of = [name for choice in table.get("oneOf", ()) for name in choice["required"]]
     for name, field in table["properties"].items():
         inner = field.get("items", field).get("$ref", "").rpartition("/")[2]
@@ -94,7 +101,7 @@ def _bounds(field: dict[str, Any]) -> str:
     bounds = [
         f"{sign} {field[word]:g}"
         for word, sign in BOUNDS.items()
-        if abs(field.get(word, UNREACHED)) < UNREACHED
+        if abs(field.get(word, HIDDEN_BOUND)) < HIDDEN_BOUND
     ]
     kind = {"boolean": "true | false", "integer": "whole", "array": "list", "string": "text"}.get(
         field.get("type", "")

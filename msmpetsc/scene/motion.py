@@ -1,4 +1,4 @@
-"""Tables of what moves the body: its start, gravity, pins, anchors, forces."""
+"""Scene tables of motion and loads: start, gravity, pins, anchors and forces."""
 
 from itertools import pairwise
 from typing import Annotated, Self
@@ -20,35 +20,37 @@ from msmpetsc.scene.values import (
 
 
 class Twist(Table):
-    """Turned ever further along an axis through the middle of the rest bounding box."""
+    """A rotation that grows along an axis through the centre of the rest bounding box."""
 
-    axis: Direction = Field(description="of any length but zero [-]")
+    axis: Direction = Field(description="twist axis of any nonzero length [-]")
     degrees: float = Field(
         lt=1e6,
         gt=-1e6,
-        description="turn of the far end against the near one, right-handed about the axis [degrees]",
+        description="rotation of the far end relative to the near end, right-handed about the "
+        "axis [degrees]",
     )
 
 
 class Start(Table):
-    """How the body is at time 0, if not at rest in its rest shape: scaled, twisted, then scattered.
+    """The state of a body at time 0: its rest shape scaled, then twisted, then scattered.
 
-    Nodes that are pinned or led stay where they are.
+    Pinned and anchored nodes stay at their rest positions without velocity.
     """
 
     scale: Vector = Field(
         (1.0, 1.0, 1.0),
-        description="factors along the axes, about the middle of the rest bounding box: "
-        "0 flattens, a negative one mirrors [-]",
+        description="scale factors along x, y, z about the centre of the rest bounding box; "
+        "0 flattens, a negative factor mirrors [-]",
     )
-    twist: Twist | None = Field(None, description="a turn that grows along an axis")
+    twist: Twist | None = Field(None, description="a rotation that grows along an axis")
     scatter: float = Field(
         0.0,
         ge=0,
         le=1,
-        description="every node goes so much of the way to a random place in the rest bounding box [-]",
+        description="fraction of the way that each node moves to a random point of the rest "
+        "bounding box [-]",
     )
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s]")
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="velocity of all nodes [m/s]")
     spin: Vector = Field(
         (0.0, 0.0, 0.0), description="angular velocity about the centre of mass [rad/s]"
     )
@@ -63,20 +65,20 @@ class Start(Table):
 
 
 class Gravity(Table):
-    """A uniform field."""
+    """Uniform gravity."""
 
-    acceleration: Vector = Field(description="[m/s^2]")
+    acceleration: Vector = Field(description="gravitational acceleration [m/s^2]")
 
 
 class Pose(Table):
-    """A displacement and a turn at a time of a path."""
+    """A displacement and a rotation at a time of a path."""
 
-    time: Positive = Field(description="when it is reached [s]")
-    by: Vector = Field((0.0, 0.0, 0.0), description="displacement from the start [m]")
+    time: Positive = Field(description="time at which the pose is reached [s]")
+    by: Vector = Field((0.0, 0.0, 0.0), description="displacement since time 0 [m]")
     turn: Vector = Field(
         (0.0, 0.0, 0.0),
-        description="turn from the start, right-handed about this vector's direction by its length, also by more than "
-        "360 [degrees]",
+        description="rotation vector since time 0: right-handed about its direction, its length "
+        "is the angle, which may exceed 360 [degrees]",
     )
 
 
@@ -88,20 +90,20 @@ def _ascending(path: tuple[Pose, ...]) -> tuple[Pose, ...]:
 
 Path = Annotated[ListOf[Pose], AfterValidator(_ascending)]
 
-PATH = "from no displacement at time 0 in straight lines through these, and staying at the last"
+PATH = "poses, interpolated linearly from rest at time 0; the last pose is kept"
 
 
 class Pin(Table):
-    """Nodes that stay where they are."""
+    """Nodes that stay at their rest positions."""
 
-    region: Region = Field(description="the nodes held")
+    region: Region = Field(description="the pinned nodes")
 
 
 class ForceTable(Table):
-    """A force that changes with time: straight lines between values, the first before them and the last after them."""
+    """A force that is piecewise linear in time, and constant before and after the table."""
 
-    times: ListOf[NotNegative] = Field(description="ascending [s]")
-    values: ListOf[Vector] = Field(description="one for each time [N]")
+    times: ListOf[NotNegative] = Field(description="ascending times [s]")
+    values: ListOf[Vector] = Field(description="total force at each time [N]")
 
     @model_validator(mode="after")
     def _fits_together(self) -> "ForceTable":
@@ -114,7 +116,7 @@ class ForceTable(Table):
         return self
 
 
-# of one kind or the other: a plain union would report both for a mistake in one
+# a tagged union: a plain union would report the problems of both alternatives
 Total = Annotated[
     Annotated[Vector, Tag(TAGS[0])] | Annotated[ForceTable, Tag(TAGS[1])],
     Discriminator(lambda total: TAGS[isinstance(total, dict | ForceTable)]),
@@ -122,41 +124,46 @@ Total = Annotated[
 
 
 class Force(Table):
-    """A force on a part of the body."""
+    """A force on the nodes of a region."""
 
     one_of = ("total", "function")
-    region: Region = Field(description="the nodes pulled")
+    region: Region = Field(description="the nodes that the force acts on")
     total: Total | None = Field(
         None,
-        description="sum over the nodes, spread by mass, always the same, or { times = [s], values = [N] } with "
-        "straight lines between [N]",
+        description="total force, distributed over the nodes by mass: a constant vector, or "
+        "{ times = [s], values = [N] }, interpolated linearly [N]",
     )
     function: FunctionName | None = Field(
         None,
-        description="name of a force of positions, velocities and time, registered in Python or installed",
+        description="name of a force function of positions, velocities and time, registered in "
+        "Python or installed",
     )
-    start: float = Field(0.0, description="acts from this time [s]")
-    stop: float | None = Field(None, description="acts until this time [s]; to the end if absent")
+    start: float = Field(0.0, description="time from which the force acts [s]")
+    stop: float | None = Field(
+        None, description="time until which the force acts [s]; to the end if absent"
+    )
 
     _after_start = field_validator("stop")(after_start)
 
     @property
     def pulls(self) -> bool:
-        """Return whether the force is not zero at some time."""
+        """Return whether the force may be nonzero at some time."""
         if self.total is None:
-            return True  # a function, which may
+            return True
         values = self.total.values if isinstance(self.total, ForceTable) else (self.total,)
         return any(map(any, values))
 
 
 class AnchorTable(Table):
-    """Nodes that are led along a path as one rigid body."""
+    """Nodes that move along a prescribed path as a rigid body."""
 
-    region: Region = Field(description="the nodes led")
-    path: Path = Field(min_length=1, description=f"how they move: {PATH} [s, m, degrees]")
+    region: Region = Field(description="the nodes that move along the path")
+    path: Path = Field(min_length=1, description=f"motion of the nodes: {PATH} [s, m, degrees]")
     center: Vector | None = Field(
         None,
-        description="point at rest about which they turn, and which the path leads along; if absent the centre of mass "
-        "of the nodes [m]",
+        description="centre of rotation at time 0, which moves along the path [m]; the nodes' "
+        "centre of mass if absent",
     )
-    stop: Positive | None = Field(None, description="let go at this time [s]; never if absent")
+    stop: Positive | None = Field(
+        None, description="time at which the nodes are released [s]; never if absent"
+    )

@@ -1,4 +1,4 @@
-"""The tables of what stands in the way of the body, and of its surface in its own."""
+"""Scene tables of contact: obstacles, and contact of the surface with itself."""
 
 from typing import Literal
 
@@ -19,14 +19,18 @@ from msmpetsc.scene.values import (
 )
 
 FRICTION_SPEED = (
-    "how far a second what friction holds gives way before friction is whole: times a step, its elastic slip; "
-    "1% of the smallest body's longest side a second if absent [m/s]"
+    "regularisation of friction: slip speed below which friction is elastic, so that the elastic "
+    "slip in a step is this speed times the step [m/s]; if absent, 1% of the smallest body's "
+    "longest side per second"
 )
 
-BARRIER = "barrier"  # response
-NODES_ALONE = "reflect", "penalty", "exchange"
-MET = "box", "sphere", "mesh"  # shapes whose surface may meet that of the bodies
+BARRIER = "barrier"
+# responses that act on nodes, not on the surface
+NODE_RESPONSES = "reflect", "penalty", "exchange"
+# shapes that may have response = "barrier"
+BARRIER_SHAPES = "box", "sphere", "mesh"
 
+# required keys of each shape
 NEEDED = {
     "plane": ("point", "normal"),
     "box": ("box",),
@@ -37,54 +41,59 @@ NEEDED = {
 
 
 class ObstacleTable(Table):
-    """What nodes bounce off or are pressed by: it may move, and be there for a while only."""
+    """A solid that bodies bounce off or are pressed by; it may move, appear and disappear."""
 
     shape: Literal["plane", "box", "sphere", "mesh", "function"] = Field(
-        description="kind of obstacle"
+        description="shape of the obstacle"
     )
     point: Vector | None = Field(None, description="a point of the plane [m]")
     normal: UnitVector | None = Field(
-        None, description="of the plane, towards its free side, normalised on reading [-]"
+        None, description="normal of the plane towards its free side, of any nonzero length [-]"
     )
     box: Box | None = Field(
-        None, description="two corners of the box, each coordinate of the first the lower [m]"
+        None, description="two corners of the box, the lower coordinates first [m]"
     )
     center: Vector | None = Field(
         None,
-        description="of the sphere, or of a barrier the point at rest about which its path turns [m]",
+        description="centre of the sphere; of a barrier, the centre of rotation at time 0 [m]",
     )
-    radius: Positive | None = Field(None, description="of the sphere [m]")
+    radius: Positive | None = Field(None, description="radius of the sphere [m]")
     mesh: MeshTable | None = Field(
-        None, description="a closed surface, of which the inside is meant"
+        None, description="a closed surface whose inside is the obstacle"
     )
     function: FunctionName | None = Field(
         None,
-        description="name of a signed distance to a surface, registered in Python or installed",
+        description="name of a signed distance function, registered in Python or installed",
     )
-    path: Path = Field((), description=f"how it moves: {PATH} [s, m, degrees]")
-    start: NotNegative = Field(0.0, description="is there from this time [s]")
+    path: Path = Field((), description=f"motion of the obstacle: {PATH} [s, m, degrees]")
+    start: NotNegative = Field(0.0, description="time from which the obstacle exists [s]")
     stop: Positive | None = Field(
-        None, description="is there until this time [s]; to the end if absent"
+        None, description="time until which the obstacle exists [s]; to the end if absent"
     )
     response: Literal["reflect", "penalty", "exchange", "barrier"] = Field(
         "reflect",
-        description="what happens on touching: barrier keeps the whole surface out, as [self_contact] says; the others "
-        "keep out nodes, and exchange is the paper's",
+        description="contact response: reflect, penalty and exchange (the paper's) keep nodes out; "
+        "barrier keeps the whole surface out, with the keys of [self_contact]",
     )
     restitution: float | None = Field(
         None,
         ge=0,
         le=1,
-        description="of nodes that strike: normal speed after over before; 1 if absent [-]",
+        description='restitution of nodes that strike, with response = "reflect" or "exchange": '
+        "normal speed after over before; 1 if absent [-]",
     )
     stiffness: Positive | None = Field(
         None,
-        description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent',
+        description='force on a node over its depth, with response = "penalty" [N/m]; 10 times '
+        "the stiffest spring if absent",
     )
     friction: NotNegative | None = Field(
-        None, description='of "penalty": Coulomb\'s coefficient; 0 if absent [-]'
+        None,
+        description='Coulomb friction coefficient, with response = "penalty"; 0 if absent [-]',
     )
-    friction_speed: Positive | None = Field(None, description=f'of "penalty": {FRICTION_SPEED}')
+    friction_speed: Positive | None = Field(
+        None, description=f'with response = "penalty", {FRICTION_SPEED}'
+    )
 
     _after_start = field_validator("stop")(after_start)
 
@@ -99,12 +108,13 @@ class ObstacleTable(Table):
         uses |= dict.fromkeys(("stiffness", "friction", "friction_speed"), ("penalty",))
         uses |= {
             "restitution": ("reflect", "exchange"),
-            "stop": NODES_ALONE,
+            "stop": NODE_RESPONSES,
             "center": ("sphere", "barrier"),
         }
-        if self.response == BARRIER and (self.shape not in MET or self.start):
+        if self.response == BARRIER and (self.shape not in BARRIER_SHAPES or self.start):
+            shapes = " and ".join(BARRIER_SHAPES)
             raise rule(
-                f'has response = "barrier", which is for {" and ".join(MET)} that are there from the start'
+                f'has response = "barrier", which is for {shapes} that are there from the start'
             )
         turns = any(any(pose.turn) for pose in self.path)
         if turns and (self.response != BARRIER or self.center is None):
@@ -116,19 +126,20 @@ class ObstacleTable(Table):
 
 
 class SelfContactTable(Table):
-    """The surface does not cross itself, nor one part of it another."""
+    """Contact that keeps the surfaces of all bodies from crossing themselves and each other."""
 
     distance: Positive | None = Field(
         None,
-        description="parts nearer than this push each other [m]; if absent the greatest of 3e-4 of the rest bounding "
-        "box's diagonal, the median distance of a coarser surface from the body's own, and 1/64 of a cell or "
-        "the least gap at rest if that is less",
+        description="distance at which surface parts start to repel each other [m]; if absent the "
+        "greatest of 3e-4 of the rest bounding box's diagonal, the median distance of a coarser "
+        "surface from the body's own, and the lesser of 1/64 of a cell and the least gap at rest",
     )
-    friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
+    friction: NotNegative = Field(0.0, description="Coulomb friction coefficient [-]")
     friction_speed: Positive | None = Field(None, description=FRICTION_SPEED)
     surface: int | None = Field(
         None,
         ge=4,
         lt=2**63,
-        description="triangles of a coarser surface that meets itself in its place [-]; the whole surface if absent",
+        description="triangles of a coarser surface used for contact [-]; the surface itself if "
+        "absent",
     )

@@ -1,4 +1,4 @@
-"""Problems of a scene file in plain words: key path, what is wrong, the value, the nearest valid name, the line."""
+"""Messages for the problems of a scene file: key path, fault, value, nearest valid name, line."""
 
 import json
 import re
@@ -13,19 +13,19 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from msmpetsc.errors import nearest, printable
 
 KeyPath = tuple[str | int, ...]
-Broken = tuple[str, PydanticCustomError]  # a key of a table, and the rule that it breaks
+# a key of a table, and the rule that it breaks
+Broken = tuple[str, PydanticCustomError]
 
-SEARCHED_LINES, SEARCHED = (
-    300,
-    30_000,
-)  # lines, characters: finding a line parses every prefix of the file: 0.2 s
-TAGS = (
-    "a vector",
-    "a table",
-)  # of the kinds of a value that may be either: pydantic adds them to the path of its key
-MOST_REPORTED = 100  # problems of a file
+# largest scene [lines], [characters] whose line numbers are searched; the search parses
+# every prefix of the text
+MAX_LINES, MAX_CHARACTERS = 300, 30_000
+# tags of a union of a vector and a table; pydantic adds them to the path of a key
+TAGS = ("a vector", "a table")
+# largest number of problems in a message [-]; more would fill the screen
+MAX_REPORTED = 100
 
-WORDS = {  # pydantic's error types: {gt} and the like are its own figures
+# message of each pydantic error type; pydantic fills in {gt} and similar fields
+WORDS = {
     "missing": "required, but missing",
     "finite_number": "must be a finite number, got {got}",
     "float_type": "must be a number, got {got}",
@@ -46,7 +46,8 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "rule": "{words}, got {got}",
     "one_of": "must give exactly one of {names}; has {given}",
 }
-EXAMPLES = {  # of tables, lists of tables and vectors that are taken for a number or a name
+# examples of tables, lists of tables and vectors, shown if a value has another type
+EXAMPLES = {
     "mesh": '{ source = "body.ply" }',
     "cages": "{ count = 3000 }",
     "material": "{ young_modulus = 1e5, density = 1000 }",
@@ -66,8 +67,10 @@ EXAMPLES = {  # of tables, lists of tables and vectors that are taken for a numb
     "body": '[{ mesh = { source = "body.ply" } }]',
     "region": "{ box = [[0, 0, 0.9], [1, 1, 1]], relative = true }",
     "pin": "[{ region = { box = [[0, 0, 0], [1, 1, 0.1]], relative = true } }]",
-    "part": "[{ region = { box = [[0, 0, 0], [1, 1, 0.1]], relative = true }, young_modulus = 1e6 }]",
-    "anchor": "[{ region = { box = [[0, 0, 0.9], [1, 1, 1]] }, path = [{ time = 1.0, by = [0, 0, 0.1] }] }]",
+    "part": "[{ region = { box = [[0, 0, 0], [1, 1, 0.1]], relative = true }, "
+    "young_modulus = 1e6 }]",
+    "anchor": "[{ region = { box = [[0, 0, 0.9], [1, 1, 1]] }, "
+    "path = [{ time = 1.0, by = [0, 0, 0.1] }] }]",
     "path": "[{ time = 1.0, by = [0, 0, 0.1] }]",
     "force": "[{ region = { box = [[0, 0, 0.9], [1, 1, 1]] }, total = [0, 0, -1] }]",
     "total": "[0, 0, -1]",
@@ -77,23 +80,22 @@ EXAMPLES = {  # of tables, lists of tables and vectors that are taken for a numb
 
 
 def rule(words: str, *others: str) -> PydanticCustomError:
-    """Return a broken rule in plain words; ``others`` are the further keys that it depends on."""
+    """Return a broken rule with its message; ``others`` are further keys that it depends on."""
     return PydanticCustomError("rule", "rule", {"words": words, "others": others})
 
 
 def unknown_name(valid: Iterable[str]) -> PydanticCustomError:
-    """Return the problem of a name that is none of ``valid``."""
+    """Return the problem of a name that is not in ``valid``."""
     return PydanticCustomError("unknown_name", "unknown name", {"valid": list(valid)})
 
 
 def one_of_problems(data: Any, names: tuple[str, ...], known: list[str]) -> list[InitErrorDetails]:
-    """Return the problem, if any, that not exactly one of ``names`` is a key of ``data``."""
+    """Return a problem unless exactly one of ``names`` is a key of ``data``."""
     if not names or not isinstance(data, dict):
         return []
     given = [name for name in names if name in data]
-    misspelt = not given and any(
-        key not in known for key in data
-    )  # reported as unknown: one mistake, one line
+    # a misspelt key is reported as unknown: a second line would repeat the mistake
+    misspelt = not given and any(key not in known for key in data)
     if len(given) == 1 or misspelt:
         return []
     context = {"names": ", ".join(names), "given": " and ".join(given) or "none", "inner": given}
@@ -103,24 +105,28 @@ def one_of_problems(data: Any, names: tuple[str, ...], known: list[str]) -> list
 
 
 def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]:
-    """Return the problems of one table, to be raised again together with others.
+    """Return pydantic's problems of a table in a form that can be raised again.
 
-    known: the table's keys. An unknown key gets them to choose the nearest from, and a missing key that
-    an unknown one nearly spells is left out. A list that is too short is one problem, not one an item.
+    An unknown key gets the table's keys for a suggestion. A missing key that is probably a
+    misspelt unknown key is dropped. The missing items of a short list become a single problem.
+
+    known : keys of the table
     """
     errors = error.errors(include_url=False)
     unknown = [e["loc"][0] for e in errors if e["type"] == "extra_forbidden" and len(e["loc"]) == 1]
-    meant = {_nearest(key, known) for key in unknown[:MOST_REPORTED]}
+    meant = {_nearest(key, known) for key in unknown[:MAX_REPORTED]}
     problems: dict[Any, InitErrorDetails] = {}
     for number, e in enumerate(errors):
-        kind, context = e["type"], dict(e.get("ctx", {}))
+        kind = e["type"]
+        context = dict(e.get("ctx", {}))
         loc = tuple(key for key in e["loc"] if key not in TAGS)
         identity: Any = number
         if kind == "extra_forbidden" and len(loc) == 1:
             context["valid"] = known
         elif kind == "missing" and isinstance(loc[-1], int):
-            kind, identity, context = "too_few", loc[:-1], {"length": loc[-1] + 1}
-            loc = loc[:-1]
+            kind = "too_few"
+            context = {"length": loc[-1] + 1}
+            identity = loc = loc[:-1]
         elif kind == "missing" and len(loc) == 1 and loc[0] in meant:
             continue
         custom = PydanticCustomError(kind, "{kind}", context)
@@ -131,36 +137,38 @@ def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]
 def problem_lines(
     path: Path, error: ValidationError, text: str, overrides: dict[KeyPath, str]
 ) -> list[str]:
-    """Return a line for each problem: file, key, what is wrong, and the line of ``text`` or the override at fault."""
+    """Return a line for each problem: file, key, fault, and the place of the fault.
+
+    The place is an override, or a line of ``text``.
+    """
     prefixes = _prefixes(text)
     lines = []
     problems = error.errors(include_url=False)
-    for e in problems[:MOST_REPORTED]:
-        culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
-        depths = [_depth(data, e["loc"]) for _, data in prefixes]  # of a key, or a table around it
+    for e in problems[:MAX_REPORTED]:
+        override = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
+        # the first prefix that has the key, or else the innermost table around it
+        depths = [_depth(data, e["loc"]) for _, data in prefixes]
         deepest = max(depths, default=0)
-        number = prefixes[depths.index(deepest)][0] if deepest else None
-        where = (
-            f" (--set {as_given(culprit)}{_in_place(e, culprit)})"
-            if culprit
-            else f" (line {number})"
-            if number
-            else ""
-        )
+        where = ""
+        if override:
+            where = f" (--set {as_given(override)}{_replacement(e, override)})"
+        elif deepest:
+            where = f" (line {prefixes[depths.index(deepest)][0]})"
         key = ".".join(
             key if re.fullmatch(r"[\w-]+", key) else _got(key) for key in map(str, e["loc"])
         )
         lines.append(": ".join(filter(None, [str(path), key, f"{_words(e)}{where}"])))
-    more = len(problems) - MOST_REPORTED
+    more = len(problems) - MAX_REPORTED
     return [*lines, f"{path}: and {more} more"] if more > 0 else lines
 
 
 def as_given(value: Any) -> str:
-    """Return ``value`` on one line, shortened; an override as it was typed."""
+    """Return ``value`` as a shortened line; a string keeps its form without quotes."""
     if isinstance(value, str):
         shown = " ".join(value.split())
     elif isinstance(value, float):
-        shown = repr(float(value))  # a number of NumPy 2 shows its type
+        # the repr of a NumPy 2 scalar includes its type
+        shown = repr(float(value))
     else:
         try:
             shown = json.dumps(value, ensure_ascii=False, default=str)
@@ -170,6 +178,7 @@ def as_given(value: Any) -> str:
 
 
 def _got(value: Any) -> str:
+    """Return ``value`` as a shortened line, a string in quotes."""
     return (
         as_given(value)
         if not isinstance(value, str)
@@ -178,7 +187,9 @@ def _got(value: Any) -> str:
 
 
 def _words(e: ErrorDetails) -> str:
-    kind, context = e["type"], e.get("ctx", {})
+    """Return the message of a problem, without its place."""
+    kind = e["type"]
+    context = e.get("ctx", {})
     key = e["loc"][-1] if e["loc"] else ""
     if kind in ("model_type", "tuple_type") and key in EXAMPLES:
         return WORDS[kind].format(got=f"{_got(e['input'])}; for example {key} = {EXAMPLES[key]}")
@@ -193,26 +204,30 @@ def _words(e: ErrorDetails) -> str:
     return WORDS.get(kind, "is not valid, got {got}").format(got=_got(e["input"]), **figures)
 
 
-def _in_place(e: ErrorDetails, override: str) -> str:
-    """Return how an override takes the place of the key that excludes it: nothing else removes a key of a file."""
+def _replacement(e: ErrorDetails, override: str) -> str:
+    """Return an override of the whole table, the only way to remove the key that excludes it."""
     *table, key = override.partition("=")[0].split(".")
     if e["type"] != "one_of" or tuple(table) != e["loc"] or not table:
         return ""
-    return f"; in place of all keys there: --set '{'.'.join(table)}={{{key}={override.partition('=')[2]}}}'"
+    value = override.partition("=")[2]
+    return f"; in place of all keys there: --set '{'.'.join(table)}={{{key}={value}}}'"
 
 
 def _nearest(word: Any, valid: list[str]) -> str | None:
+    """Return the valid name most similar to a word of any case; None if no name is similar."""
     return nearest(str(word).lower()[:100], valid)
 
 
 def _suggestion(word: Any, valid: list[str]) -> str:
+    """Return the most similar valid name as a question, or else all valid names."""
     near = _nearest(word, valid)
     return f"did you mean {near!r}?" if near else f"valid: {', '.join(valid)}"
 
 
 def _concerns(e: ErrorDetails, keys: KeyPath) -> bool:
-    """Return whether an override of ``keys`` has a part in the problem: it set the key, a part of it, or its table."""
-    loc, context = e["loc"], e.get("ctx", {})
+    """Return whether an override of ``keys`` set the key at fault, a part of it, or its table."""
+    loc = e["loc"]
+    context = e.get("ctx", {})
     if e["type"] == "one_of":
         suspects = [(*loc, name) for name in context["inner"]]
     else:
@@ -221,14 +236,15 @@ def _concerns(e: ErrorDetails, keys: KeyPath) -> bool:
 
 
 def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
-    """Return for each statement of a TOML text the line it starts on, and what the text holds up to its end.
+    """Return the first line of each TOML statement, with the data of the text up to its end.
 
-    A statement ends where the text up to there parses.
+    A statement ends at the first line up to which the text parses.
     """
     lines = text.split("\n")
-    if len(lines) > SEARCHED_LINES or len(text) > SEARCHED:
+    if len(lines) > MAX_LINES or len(text) > MAX_CHARACTERS:
         return []
-    statements, start = [], 1
+    statements = []
+    start = 1
     for end in range(1, len(lines) + 1):
         try:
             data = tomllib.loads("\n".join(lines[:end]) + "\n")
@@ -240,7 +256,7 @@ def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
 
 
 def _depth(data: Any, loc: KeyPath) -> int:
-    """Return how many keys of ``loc`` lead somewhere in ``data``."""
+    """Return the number of leading keys of ``loc`` that exist in ``data``."""
     for depth, key in enumerate(loc):
         inside = (isinstance(data, dict) and key in data) or (
             isinstance(data, list) and key in range(len(data))

@@ -1,4 +1,4 @@
-"""Scene file (TOML) and what the command line changes in it -> a checked Scene."""
+"""Read a scene file (TOML), apply overrides, and return a checked Scene."""
 
 import shlex
 import tomllib
@@ -17,21 +17,28 @@ from msmpetsc.scene.problems import KeyPath, as_given, problem_lines
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
-OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
-MESHES = (  # those of geometry/readers.py
+# tables that a study file has and a scene file has not
+OF_STUDIES = {"scene", "sweep", "map"}
+# endings of the mesh formats that geometry/readers.py reads
+MESH_NAMES = (
     ".ply", ".mz3", ".vtu", ".vtk", ".msh", ".inp", ".bdf", ".obj", ".stl", ".off", ".glb", ".gltf",
 )  # fmt: skip
-Changes = Mapping[str, Any] | Iterable[str]  # {"cages.count": 3000}, or ["cages.count=3000"]
-LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
+# for example {"cages.count": 3000} or ["cages.count=3000"]
+Changes = Mapping[str, Any] | Iterable[str]
+# largest scene file [byte]; so that it may list the numbers of painted points
+MAX_BYTES = 2**24
 
 
 class Scene(SceneFile):
-    """A scene as read: its tables, its TOML text as run, and the folder its paths start from.
+    """A checked scene: its tables, its TOML text, and the folder that its paths start from.
 
+    Changes are overrides as in ``--set``: keys of a scene, with items of lists by number
+    ("pin.0.region").
+
+    Examples
+    --------
         scene = msmpetsc.Scene.load("scenes/bunny_fall.toml", {"cages.count": 3000})
         softer = scene.changed({"material.young_modulus": 2e4})
-
-    Changes are those of ``--set``: any key of a scene, items of lists by number ("pin.0.region").
     """
 
     text: str = Field("", description="the TOML text, overrides included")
@@ -39,18 +46,41 @@ class Scene(SceneFile):
 
     @classmethod
     def load(cls, path: str | PathLike[str], changes: Changes = ()) -> "Scene":
-        """Read a scene file. Raises InputError naming every problem, one a line."""
+        """Return the checked scene of a file.
+
+        Parameters
+        ----------
+        path : path
+            Scene file (TOML).
+        changes : mapping or iterable of str
+            Overrides, for example {"cages.count": 3000} or ["cages.count=3000"].
+
+        Raises
+        ------
+        InputError
+            Has a line for each problem of the scene.
+        """
         return load_scene(Path(path), changes)
 
     @classmethod
     def of(
         cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Changes = ()
     ) -> "Scene":
-        """Make a scene of tables as a file would have them: {"mesh": {"source": "body.obj"}, ...}.
+        """Return a checked scene of tables, for example {"mesh": {"source": "body.obj"}, ...}.
 
-        folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
+        Parameters
+        ----------
+        tables : mapping
+            Tables as in a scene file; numpy arrays stand for lists.
+        folder : path
+            Folder that relative paths start from. Paths may lead outside it.
+        changes : mapping or iterable of str
+            Overrides, as for ``load``.
 
-        Raises InputError naming every problem, one a line.
+        Raises
+        ------
+        InputError
+            Has a line for each problem of the scene.
         """
         path = Path(folder) / "scene"
         data = plain(tables)
@@ -62,11 +92,22 @@ class Scene(SceneFile):
             raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
     def changed(self, changes: Changes) -> "Scene":
-        """Return this scene with changes, checked as a whole. Raises InputError."""
+        """Return a checked copy of the scene with changes.
+
+        Parameters
+        ----------
+        changes : mapping or iterable of str
+            Overrides, as for ``load``.
+
+        Raises
+        ------
+        InputError
+            Has a line for each problem of the changed scene.
+        """
         return Scene.of(toml_of(self.text), self.folder, changes) if changes else self
 
     def __repr__(self) -> str:
-        """Return one line: title, meshes, cells, integrator and steps; ``text`` has all of it."""
+        """Return title, cells, meshes, integrator and steps in one line."""
         meshes = ", ".join(mesh.source for mesh in self.meshes.values())
         cages, time = self.cages, self.time
         cells = (
@@ -78,15 +119,15 @@ class Scene(SceneFile):
 
 
 def load_scene(path: str | Path, changes: Changes = (), by_user: bool = True) -> Scene:
-    """Read and check a scene file.
+    """Return the checked scene of a file.
 
-    changes : a value in TOML may be a bare word, which is a string; they replace or insert before anything is checked
-    by_user : whether the changes are a user's own words, which may name files outside the folder; a file's may not
+    changes : overrides, applied before the check; a bare word as a value is a string
+    by_user : whether the user wrote the changes, which may then name files outside the folder
 
-    Raises InputError naming every problem of the file, one a line.
+    Raises InputError with a line for each problem of the scene.
     """
     path = Path(path)
-    if path.name.lower().endswith(MESHES) and path.is_file():
+    if path.name.lower().endswith(MESH_NAMES) and path.is_file():
         scene, mesh = (shlex.quote(str(name)) for name in (path.with_suffix(".toml"), path))
         raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {scene} --mesh {mesh}")
     return scene_of(path, _read(path, "scene"), changes, by_user)
@@ -95,9 +136,10 @@ def load_scene(path: str | Path, changes: Changes = (), by_user: bool = True) ->
 def scene_of(
     path: Path, text: str, changes: Changes = (), by_user: bool = True, to_read: bool = True
 ) -> Scene:
-    """Check the text of a scene file as ``load_scene`` does the file.
+    """Return the checked scene of a text, as ``load_scene`` does for a file.
 
-    to_read : whether the files that it names are to be read
+    path    : of the scene file, which messages name and relative paths start from
+    to_read : whether the files that the scene names will be read, and so must be allowed
     """
     data = _parse(path, text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
@@ -110,12 +152,16 @@ def scene_of(
 
 
 def _given(scene: SceneFile) -> dict[str, Any]:
-    """Return the tables that a scene has: of mesh and body it has but one."""
+    """Return the tables that were given, so that absent ``mesh`` or ``body`` stays absent."""
     return {name: getattr(scene, name) for name in scene.model_fields_set}
 
 
 def _checked(path: Path, data: dict[str, Any], text: str, keys: dict[KeyPath, str]) -> SceneFile:
-    """Return the tables checked; of a problem InputError names the line of ``text`` or the override of these keys."""
+    """Return the checked tables. Raises InputError with a line for each problem.
+
+    text : TOML text of ``data``, in which problems are located
+    keys : override of each overridden key path
+    """
     try:
         return SceneFile.model_validate(data)
     except ValidationError as error:
@@ -123,18 +169,19 @@ def _checked(path: Path, data: dict[str, Any], text: str, keys: dict[KeyPath, st
 
 
 def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Return text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    """Return text and data of a TOML file. Raises InputError that calls it a ``kind`` file."""
     text = _read(path, kind)
     return text, _parse(path, text)
 
 
 def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | None) -> None:
-    """Raise InputError if the scene names a file outside its folder, links followed, that the user did not name.
+    """Raise InputError if a file that the user did not name is outside the scene's folder.
 
-    given : keys of the user's own words; None where a user cannot give any
+    given : key paths that the user set; None if the changes are not the user's
     """
     for keys, name in scene.named_files():
-        if any(keys[: len(own)] == own for own in given or ()) or lies_below(path.parent, name):
+        by_user = any(keys[: len(user_keys)] == user_keys for user_keys in given or ())
+        if by_user or lies_below(path.parent, name):
             continue
         key = ".".join(map(str, keys))
         allows = "" if given is None else f"; --set {key}=PATH allows it"
@@ -144,29 +191,32 @@ def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | N
 
 
 def lies_below(folder: Path, name: str) -> bool:
-    """Return whether a path from ``folder`` leads to what lies in it, links followed."""
+    """Return whether a path relative to ``folder`` stays in or below it, with links followed."""
     path = folder / name
     try:
-        with suppress(
-            FileNotFoundError, NotADirectoryError, PermissionError
-        ):  # whoever opens it says so
-            path.resolve(strict=True)  # from Python 3.13 on a loop of links is an error only so
+        # a missing file is reported by the code that opens it
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            # from Python 3.13 on only a strict resolve fails for a loop of links
+            path.resolve(strict=True)
         return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a long name
+    # a loop of links, a null character, or a name that is too long
+    except (OSError, RuntimeError, ValueError):
         return False
 
 
 def _read(path: Path, kind: str) -> str:
+    """Return the text of a file. Raises InputError that calls it a ``kind`` file."""
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise InputError(f"{path}: is a pipe or a device, not a {kind} file")
         with open(path, "rb") as file:
-            content = file.read(LONGEST + 1)
-        if len(content) > LONGEST:
+            content = file.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
             raise InputError(
-                f"{path}: is too long for a {kind} file: more than {LONGEST / 2**20:g} MiB"
+                f"{path}: is too long for a {kind} file: more than {MAX_BYTES / 2**20:g} MiB"
             )
-        return content.decode("utf-8-sig")  # -sig: some editors begin with a byte order mark
+        # -sig drops a byte order mark, which some editors write
+        return content.decode("utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{path}: no such {kind} file") from None
     except IsADirectoryError:
@@ -180,6 +230,7 @@ def _read(path: Path, kind: str) -> str:
 
 
 def _parse(path: Path, text: str) -> dict[str, Any]:
+    """Return the data of a TOML text. Raises InputError that names ``path``."""
     try:
         return toml_of(text)
     except tomllib.TOMLDecodeError as error:
@@ -188,14 +239,16 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
         raise InputError(f"{path}: is not TOML: {problem}") from None
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply") from None
-    except ValueError:  # all that tomllib leaves to int(): Python's limit on digits
+    # from int(), for more digits than Python allows
+    except ValueError:
         raise InputError(f"{path}: has an integer of too many digits") from None
 
 
 def _override(data: dict[str, Any], override: str) -> KeyPath:
-    """Carry out a "key.path=value" in ``data``; returns the key path."""
+    """Apply an override "key.path=value" to ``data`` and return its key path."""
     try:
-        if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text
+        # Python reads bytes of the command line that are not UTF-8 as surrogates
+        if any("\ud800" <= letter <= "\udfff" for letter in override):
             raise InputError("is not UTF-8 text")
         name, equals, raw = override.partition("=")
         path = tuple(
@@ -207,17 +260,18 @@ def _override(data: dict[str, Any], override: str) -> KeyPath:
         if len(path) > DEEPEST:
             raise InputError("is nested too deeply")
         value = _override_value(raw.strip())
-        holder: Any = data
-        for key, following in pairwise(path):
-            empty: Any = [] if isinstance(following, int) else {}
-            holder = _put(holder, key, empty, replace=False)
-        _put(holder, path[-1], value, replace=True)
+        container: Any = data
+        for key, next_key in pairwise(path):
+            empty: Any = [] if isinstance(next_key, int) else {}
+            container = _put(container, key, empty, replace=False)
+        _put(container, path[-1], value, replace=True)
     except InputError as error:
         raise InputError(f"--set {as_given(override)}: {error}") from None
     return path
 
 
 def _override_value(raw: str) -> Any:
+    """Return the value of an override: TOML, or else a bare string. Raises InputError."""
     try:
         parsed = toml_of(f"value = {raw}")
     except (ValueError, RecursionError):
@@ -229,20 +283,24 @@ def _override_value(raw: str) -> Any:
     return parsed["value"]
 
 
-def _put(holder: Any, key: str | int, value: Any, replace: bool) -> Any:
-    """Put ``value`` at ``key`` of a table or list (where absent, or ``replace``); returns what is there then."""
-    if isinstance(holder, dict):
+def _put(container: Any, key: str | int, value: Any, replace: bool) -> Any:
+    """Set ``key`` of a table or list to ``value`` and return the value at ``key``.
+
+    An existing value is kept unless ``replace``. Raises InputError for a key that cannot be set.
+    """
+    if isinstance(container, dict):
         key = str(key)
-        if replace or key not in holder:
-            holder[key] = value
-    elif not isinstance(holder, list):
-        raise InputError(f"{key!r} has no place in {as_given(holder)}, which is no table or list")
-    elif not isinstance(key, int) or key > len(holder):
+        if replace or key not in container:
+            container[key] = value
+    elif not isinstance(container, list):
         raise InputError(
-            f"{key!r} is no item of a list of {len(holder)}: the next would be {len(holder)}"
+            f"{key!r} has no place in {as_given(container)}, which is no table or list"
         )
-    elif key == len(holder):
-        holder.append(value)
+    elif not isinstance(key, int) or key > len(container):
+        size = len(container)
+        raise InputError(f"{key!r} is no item of a list of {size}: the next would be {size}")
+    elif key == len(container):
+        container.append(value)
     elif replace:
-        holder[key] = value
-    return holder[key]
+        container[key] = value
+    return container[key]

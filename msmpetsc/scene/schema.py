@@ -1,4 +1,4 @@
-"""The schema of a scene file: frozen, validated tables. What a key means and its unit stand in its description."""
+"""The schema of a scene file: frozen, validated tables with meaning and unit of each key."""
 
 from collections.abc import Iterator
 from itertools import chain
@@ -23,31 +23,33 @@ from msmpetsc.scene.values import (
     Vector,
 )
 
-MOST_CONTRAST = 1e6  # of parts: at 1e8 a squashed body took newton over 1,200 iterations a step
-OF_REGIONS = ("part", "pin", "anchor", "force")  # tables that take a region of one body, or of all
+# largest ratio of stiffnesses or densities in a scene [-]; so that CG converges
+MAX_CONTRAST = 1e6
+# tables with a region, of a body or of the whole scene
+OF_REGIONS = ("part", "pin", "anchor", "force")
 
 
 class BodyTable(Table):
-    """One of several bodies. Regions of its tables are of this body alone."""
+    """A body of a scene with several bodies. Regions in its tables select from this body only."""
 
-    mesh: MeshTable = Field(description="its closed surface")
+    mesh: MeshTable = Field(description="closed surface of the body")
     material: OwnMaterial | None = Field(
-        None, description="what it is made of, where that is not the scene's material"
+        None, description="material of the body; the scene's material if absent"
     )
-    part: ListOf[PartTable] = Field((), description="cells of it of another material")
+    part: ListOf[PartTable] = Field((), description="cells of another material")
     start: Start | None = Field(
-        None, description="how it is at time 0; as the scene's start says if absent"
+        None, description="state of the body at time 0; the scene's start if absent"
     )
-    pin: ListOf[Pin] = Field((), description="nodes of it that stay where they are")
-    anchor: ListOf[AnchorTable] = Field((), description="nodes of it led along a path")
-    force: ListOf[Force] = Field((), description="forces on parts of it")
+    pin: ListOf[Pin] = Field((), description="nodes that stay at their rest positions")
+    anchor: ListOf[AnchorTable] = Field((), description="nodes that move along a prescribed path")
+    force: ListOf[Force] = Field((), description="forces on parts of the body")
 
 
 class OfBody(NamedTuple):
-    """A table that takes a region, and whose nodes or cells it means.
+    """A table with a region, and the body that the region selects from.
 
-    path : of its key in the scene
-    body : number of the body; None: of all
+    path : key path of the table in the scene
+    body : number of the body; None for all bodies
     """
 
     path: KeyPath
@@ -56,70 +58,75 @@ class OfBody(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Return the path as messages have it, "body.1.pin.0"."""
+        """Return the key path as a string, for example "body.1.pin.0"."""
         return ".".join(map(str, self.path))
 
 
 def held_by(scene: Any) -> Iterator[OfBody]:
-    """Yield the tables of pins, then of anchors: of two that hold a node the first has it."""
+    """Yield the tables of pins, then of anchors. A node in several tables belongs to the first."""
     for kind in ("pin", "anchor"):
         yield from scene.tables(kind)
 
 
 def unlike_the_material(scene: Any) -> Iterator[Broken]:
-    """Yield the rules that bodies and parts break beside the material.
+    """Yield the broken rules between the scene's material and the materials of bodies and parts.
 
-    Stiffness and Young's modulus are two ways to name all springs.
+    All materials must give the same key, Young's modulus or stiffness.
     """
-    others: dict[str, OwnMaterial] = {part.key: part.table for part in scene.tables("part")}
-    others |= {
+    materials: dict[str, OwnMaterial] = {part.key: part.table for part in scene.tables("part")}
+    materials |= {
         f"body.{number}.material": body.material
         for number, body in enumerate(scene.body)
         if body.material
     }
-    for key, other in others.items():
+    for key, material in materials.items():
+        table = key.partition(".")[0]
         for name in Material.one_of:
-            if getattr(other, name) is not None and getattr(scene.material, name) is None:
+            if getattr(material, name) is not None and getattr(scene.material, name) is None:
                 words = f"may give {name} only where material does, as {key} does"
-                yield key.partition(".")[0], rule(words, "material")
-        if other.poisson_ratio is not None and scene.material.poisson is None:
-            words = f'may give poisson_ratio only where material.law = "neo-hookean", as {key} does'
-            yield key.partition(".")[0], rule(words, "material")
+                yield table, rule(words, "material")
+        if material.poisson_ratio is not None and scene.material.poisson is None:
+            words = f'may give poisson_ratio only with material.law = "neo-hookean", as {key} does'
+            yield table, rule(words, "material")
     for name in (*Material.one_of, "density"):
         values = {
             key: value
-            for key, table in others.items()
-            if (value := getattr(table, name)) is not None
+            for key, material in materials.items()
+            if (value := getattr(material, name)) is not None
         }
         given = [*values.values(), *filter(None, [getattr(scene.material, name)])]
-        if values and max(given) > MOST_CONTRAST * min(given):
-            yield (
-                next(reversed(values)).partition(".")[0],
-                rule(
-                    f"has {name} of {min(given):g} to {max(given):g} in one run: more than {MOST_CONTRAST:g} to 1, "
-                    "which is as good as rigid, is not solved; pin or lead the stiff part"
-                ),
+        if values and max(given) > MAX_CONTRAST * min(given):
+            words = (
+                f"has {name} of {min(given):g} to {max(given):g} in one run: a ratio above "
+                f"{MAX_CONTRAST:g}, which is as good as rigid, is not solved; pin or anchor the "
+                "stiff part"
             )
+            yield next(reversed(values)).partition(".")[0], rule(words)
 
 
 def regions_of_no_body(scene: Any) -> Iterator[Broken]:
-    """Yield the rules that regions which are of one body break in tables of all bodies."""
+    """Yield a broken rule for each region of all bodies that is relative or painted."""
     for kind in OF_REGIONS:
         for number, table in enumerate(getattr(scene, kind) if scene.body else ()):
             if table.region.relative or table.region.painted is not None:
                 sort = "relative" if table.region.relative else "painted"
-                words = f"may have no {sort} region beside [[body]], as {kind}.{number} has: whose it is only "
-                yield kind, rule(f"{words}[[body.{kind}]] says", "body")
+                words = (
+                    f"may have no {sort} region beside [[body]], as {kind}.{number} has: move it "
+                    f"into [[body.{kind}]], which names the body"
+                )
+                yield kind, rule(words, "body")
 
 
 class Solver(Table):
-    """Solver of a step."""
+    """Solver of a time step."""
 
     preset: PresetName = Field("newton", min_length=1, description="named set of PETSc options")
     error: float | None = Field(
-        None, gt=0, lt=1, description="relative error of a step to aim at [-]"
+        None, gt=0, lt=1, description="target relative error of a step; the preset's if absent [-]"
     )
-    max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
+    max_iterations: Count | None = Field(
+        None, description="largest number of outer iterations in a step [-]"
+    )
 
 
 class Safety(Table):
@@ -127,40 +134,43 @@ class Safety(Table):
 
     on_failure: Literal["stop", "substep", "fallback"] = Field(
         "stop",
-        description="stop the run; take that step in shorter ones; or solve it with a slower, robust method",
+        description="stop the run; divide the step into shorter steps; or solve the step with a "
+        "slower, robust method",
     )
 
 
 class Probe(Table):
-    """A point of the body that is followed."""
+    """A material point whose position is stored in each frame."""
 
     one_of = ("point", "group")
-    name: FileName = Field(description="of its columns in `msmpetsc series`")
+    name: FileName = Field(description="name of the probe's columns in `msmpetsc series`")
     point: Vector | None = Field(
-        None, description="where it is at rest; it goes with the cell that it lies in [m]"
+        None, description="rest position; the probe follows the cell that contains it [m]"
     )
     group: GroupName | None = Field(
         None,
-        description="name that a mesh gives to triangles: the point of them nearest to their middle [-]",
+        description="group of triangles in the mesh file: the probe is their point nearest to "
+        "their centre [-]",
     )
 
 
 class Output(Table):
-    """Choice of what the result file stores beside the lattice."""
+    """The optional content of the result file."""
 
     surface: bool = Field(True, description="store the surface of every frame")
     stress: bool = Field(
         False,
-        description='store stress and strain energy of every frame; with material.law = "neo-hookean"',
+        description="store stress and strain energy of every frame, "
+        'with material.law = "neo-hookean"',
     )
-    probe: ListOf[Probe] = Field((), description="points of the body whose places are stored")
-    every: Count = Field(1, description="store every N-th step only, and the last [-]")
+    probe: ListOf[Probe] = Field((), description="points of the body whose positions are stored")
+    every: Count = Field(1, description="store every N-th step and the last step [-]")
 
     @field_validator("probe")
     @classmethod
     def _has_distinct_names(cls, probes: tuple[Probe, ...]) -> tuple[Probe, ...]:
         if len({probe.name for probe in probes}) < len(probes):
-            raise rule("must have a name of its own for each")
+            raise rule("must give each probe a different name")
         return probes
 
 
@@ -169,49 +179,52 @@ class Picture(Table):
 
     eye: Direction | None = Field(
         None,
-        description="direction from the body to the eye, of any length; across its longer side if absent [-]",
+        description="direction from the body to the eye, of any nonzero length; across the body's "
+        "longer side if absent [-]",
     )
     times: ListOf[NotNegative] = Field(
-        (), description="moments drawn beside the start [s]; chosen by their energies if absent"
+        (), description="times drawn besides the start [s]; chosen from the energies if absent"
     )
 
 
 class SceneFile(Table):
-    """What may stand in a scene file; ``SceneFile.model_json_schema()`` is its schema."""
+    """The tables of a scene file; ``SceneFile.model_json_schema()`` is its JSON schema."""
 
     one_of = ("mesh", "body")
-    title: str = Field("", description="for the reader")
-    mesh: MeshTable | None = Field(None, description="the closed surface of the one body")
-    cages: CagesTable = Field(description="the cells that fill it")
-    material: Material = Field(description="what it is made of")
-    time: Time = Field(description="time step and duration")
+    title: str = Field("", description="title for the reader")
+    mesh: MeshTable | None = Field(None, description="closed surface of the only body")
+    cages: CagesTable = Field(description="cells that fill the body")
+    material: Material = Field(description="material of the body")
+    time: Time = Field(description="time step, duration and integrator")
     body: ListOf[BodyTable] = Field(
-        (), min_length=1, description="each of several bodies, in place of mesh"
+        (), min_length=1, description="tables of several bodies, in place of mesh"
     )
     part: ListOf[PartTable] = Field((), description="cells of another material")
     start: Start | None = Field(
-        None, description="how it is at time 0; at rest in its rest shape if absent"
+        None, description="state at time 0; at rest in the rest shape if absent"
     )
-    gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
-    obstacle: ListOf[ObstacleTable] = Field((), description="what nodes bounce off")
+    gravity: Gravity | None = Field(None, description="uniform gravity; none if absent")
+    obstacle: ListOf[ObstacleTable] = Field((), description="solids that bodies bounce off")
     self_contact: SelfContactTable | None = Field(
-        None, description="what keeps the surface from crossing itself"
+        None, description="contact of surfaces with themselves and each other; none if absent"
     )
-    pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
-    anchor: ListOf[AnchorTable] = Field((), description="nodes led along a path")
+    pin: ListOf[Pin] = Field((), description="nodes that stay at their rest positions")
+    anchor: ListOf[AnchorTable] = Field((), description="nodes that move along a prescribed path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
     solver: Solver = Field(
-        default_factory=lambda: Solver.model_validate({}), description="how a step is solved"
+        default_factory=lambda: Solver.model_validate({}), description="solver of a time step"
     )
     safety: Safety = Field(
         default_factory=lambda: Safety.model_validate({}),
-        description="what is done about a failed step",
+        description="recovery of steps that fail",
     )
     output: Output = Field(
-        default_factory=lambda: Output.model_validate({}), description="what is stored"
+        default_factory=lambda: Output.model_validate({}),
+        description="optional content of the result file",
     )
     picture: Picture = Field(
-        default_factory=lambda: Picture.model_validate({}), description="how the result is drawn"
+        default_factory=lambda: Picture.model_validate({}),
+        description="view of the result in pictures",
     )
 
     @model_validator(mode="before")
@@ -220,9 +233,12 @@ class SceneFile(Table):
         return one_state(data)
 
     def broken_rules(self) -> Iterator[Broken]:
-        """Yield the rules that the tables break among each other."""
+        """Yield the broken rules between different tables."""
         if self.output.stress and self.material.poisson is None:
-            words = f'may not have stress = true with material.law = "{self.material.law}": springs have no stress'
+            words = (
+                f'may not have stress = true with material.law = "{self.material.law}": '
+                "springs have no stress"
+            )
             yield "output", rule(words, "material")
         yield from chain(
             unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self)
@@ -230,34 +246,37 @@ class SceneFile(Table):
 
     @property
     def stored(self) -> int:
-        """Return the number of frames, frame 0 included."""
+        """Return the number of stored frames, frame 0 included."""
         return self.stored_until(self.time.steps)
 
     def stored_until(self, step: int) -> int:
-        """Return the number of frames of the first steps: of every ``every``-th and of the last."""
+        """Return the number of frames stored up to a step, frame 0 included."""
         every = self.output.every
         return 1 + (-(-step // every) if step == self.time.steps else step // every)
 
     @property
     def meshes(self) -> dict[KeyPath, MeshTable]:
-        """Return the surface of each body, by the path of its key."""
+        """Return the mesh table of each body by its key path."""
         if self.mesh is not None:
             return {("mesh",): self.mesh}
         return {("body", number, "mesh"): body.mesh for number, body in enumerate(self.body)}
 
     @property
     def touching(self) -> SelfContactTable | None:
-        """How surfaces touch: those of the bodies, or where these may cross, theirs and obstacles'; None if none do."""
-        meets = any(obstacle.response == BARRIER for obstacle in self.obstacle)
-        return self.self_contact or (SelfContactTable.model_validate({}) if meets else None)
+        """Return the settings of surface contact; None without self-contact and barriers.
+
+        Barriers without [self_contact] use its defaults.
+        """
+        has_barrier = any(obstacle.response == BARRIER for obstacle in self.obstacle)
+        return self.self_contact or (SelfContactTable.model_validate({}) if has_barrier else None)
 
     @property
     def starts(self) -> list[Start | None]:
-        """Return the starts of all bodies at time 0."""
+        """Return the start table of each body, None for a body at rest."""
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, kind: str) -> Iterator[OfBody]:
-        """Yield the tables of a kind: the scene's own, which are of all bodies, then each body's."""
+        """Yield the tables of a kind: the scene's own, for all bodies, then those of each body."""
         for number, table in enumerate(getattr(self, kind)):
             yield OfBody((kind, number), None, table)
         for body, tables in enumerate(self.body):
@@ -265,7 +284,7 @@ class SceneFile(Table):
                 yield OfBody(("body", body, kind, number), body, table)
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:
-        """Yield key path and name of each file that it names; a mesh's name may be one of the registry's too."""
+        """Yield key path and name of each file; the name of a mesh may be a registry name."""
         solids = {
             ("obstacle", number, "mesh"): o.mesh
             for number, o in enumerate(self.obstacle)

@@ -1,7 +1,4 @@
-"""The table of simulated time, and the rules of a scene that depend on its integrator.
-
-In statics, where nothing moves, much has no meaning; exchange and a surface that meets itself want implicit steps.
-"""
+"""The table of simulated time, and the rules between the integrator and other tables."""
 
 from collections.abc import Iterator
 from typing import Any, Final
@@ -11,42 +8,46 @@ from pydantic import ConfigDict, Field, ValidationInfo, field_validator
 from msmpetsc.scene.problems import Broken, rule
 from msmpetsc.scene.values import IntegratorName, Positive, Table, only_for
 
-MOST_STEPS = 10**9
-STATIC: Final = "static"  # time.integrator
+# largest number of steps [-]; far above any run
+MAX_STEPS = 10**9
+STATIC: Final = "static"
 IMPLICIT = ("implicit-euler", "bdf2")
-OF_TIME = ("path", "times", "start", "stop")  # keys of what comes, goes or moves
+# keys of tables that depend on time
+TIME_KEYS = ("path", "times", "start", "stop")
 
 
-def _wanted_in_motion(schema: dict[str, Any]) -> None:
-    """Say in the JSON schema that only statics need no step and duration (``one_state``)."""
+def _require_times(schema: dict[str, Any]) -> None:
+    """Require step and duration in the JSON schema, except for statics (``one_state``)."""
     is_static = {"properties": {"integrator": {"const": STATIC}}, "required": ["integrator"]}
     schema.update({"if": is_static, "else": {"required": schema.pop("required")}})
 
 
 class Time(Table):
-    """Simulated time."""
+    """Simulated time and its integrator."""
 
-    model_config = ConfigDict(json_schema_extra=_wanted_in_motion)
+    model_config = ConfigDict(json_schema_extra=_require_times)
     step: Positive = Field(
-        description="time step; required but of statics that stay the same if absent [s]"
+        description="time step; optional only for statics with constant loads [s]"
     )
     duration: Positive = Field(
-        description="simulated time; required but of statics that stay the same if absent [s]"
+        description="simulated time; optional only for statics with constant loads [s]"
     )
     integrator: IntegratorName = Field(
         "implicit-euler",
-        description="how a step is taken: solved at once, of first or second order; in explicit substeps; or as a "
-        "state of equilibrium",
+        description="time integrator: implicit-euler (first order), bdf2 (second order), verlet "
+        "(explicit substeps), or static (an equilibrium in each step)",
     )
     substep: Positive | None = Field(
         None,
-        description='longest substep of integrator = "verlet"; under the stability limit if absent [s]',
+        description='longest substep, with integrator = "verlet"; from the stability limit if '
+        "absent [s]",
     )
     error: float | None = Field(
         None,
         gt=0,
         lt=1,
-        description="of the motion, relative: steps are as long as it allows, all alike if absent [-]",
+        description="target relative error of the motion, which chooses the step lengths; equal "
+        "steps if absent [-]",
     )
 
     _has_a_use = field_validator("substep")(only_for("integrator", "verlet"))
@@ -56,7 +57,7 @@ class Time(Table):
     @classmethod
     def _holds_a_step(cls, duration: float, info: ValidationInfo) -> float:
         step = info.data.get("step", duration)
-        if duration / step > MOST_STEPS:
+        if duration / step > MAX_STEPS:
             raise rule(f"holds too many steps of {step:g} s", "step")
         if round(duration / step) < 1:
             raise rule(f"must hold at least one step of {step:g} s", "step")
@@ -69,9 +70,10 @@ class Time(Table):
 
 
 def one_state(data: Any) -> Any:
-    """Return a scene's data, unchecked, with its one state where nothing changes in time: it wants no step or duration.
+    """Return the unchecked data of a scene, with step and duration added to constant statics.
 
-    Of step and duration, either says how long the other is.
+    Statics with constant loads have a single state. If only step or duration is given, the other
+    is equal to it; if both are absent, both are 1 s.
     """
     time = data.get("time") if isinstance(data, dict) else None
     if not isinstance(time, dict) or time.get("integrator") != STATIC:
@@ -80,15 +82,15 @@ def one_state(data: Any) -> Any:
         if (
             isinstance(load.get("total"), dict)
             or "function" in load
-            or any(name in load for name in OF_TIME)
+            or any(name in load for name in TIME_KEYS)
         ):
             return data
-    one = time.get("step", time.get("duration", 1.0))
-    return {**data, "time": {"step": one, "duration": one, **time}}
+    single = time.get("step", time.get("duration", 1.0))
+    return {**data, "time": {"step": single, "duration": single, **time}}
 
 
 def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield what moves or presses the bodies of a scene, unchecked."""
+    """Yield the unchecked tables of anchors, forces and obstacles, with those of each body."""
     for name in ("anchor", "force", "obstacle", "body"):
         given = tables.get(name)
         for table in given if isinstance(given, list | tuple) else ():
@@ -97,15 +99,16 @@ def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
-    """Yield the rules that tables of a scene break by its integrator."""
+    """Yield the broken rules between the integrator and other tables."""
     integrator = scene.time.integrator
     if scene.material.retardation_time and integrator not in IMPLICIT:
         words = (
-            f'may not have integrator = "{integrator}" where material.retardation_time is given: '
+            f'may not have integrator = "{integrator}" with material.retardation_time: use '
+            '"implicit-euler" or "bdf2"'
         )
-        yield "time", rule(f'{words}"implicit-euler" and "bdf2" have', "material")
+        yield "time", rule(words, "material")
     if integrator == STATIC:
-        yield from _moving(scene)
+        yield from _broken_by_statics(scene)
     if scene.touching and integrator not in IMPLICIT:
         words = f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"'
         barrier = "" if scene.self_contact else 'with response = "barrier" '
@@ -113,48 +116,54 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
     for number, obstacle in enumerate(scene.obstacle):
         if obstacle.response != "exchange":
             continue
-        if integrator == "bdf2":  # a step would see that nodes were set back
-            words = f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: it sets nodes back by '
-            yield "obstacle", rule(f'{words}one step; "reflect" and "penalty" go', "time")
-        if scene.touching:
-            words = f'may not have response = "exchange" where surfaces meet, as obstacle.{number} has it: that moves '
-            yield (
-                "obstacle",
-                rule(
-                    f'{words}nodes past each other; "reflect" and "penalty" press', "self_contact"
-                ),
+        # BDF2 would see the nodes that "exchange" moves back
+        if integrator == "bdf2":
+            words = (
+                f'may not have response = "exchange" with time.integrator = "bdf2", as '
+                f"obstacle.{number} has: it moves nodes back by one step; use "
+                'response = "reflect" or "penalty"'
             )
+            yield "obstacle", rule(words, "time")
+        if scene.touching:
+            words = (
+                f'may not have response = "exchange" with surface contact, as obstacle.{number} '
+                'has: it moves nodes past each other; use response = "reflect" or "penalty"'
+            )
+            yield "obstacle", rule(words, "self_contact")
 
 
-def _moving(scene: Any) -> Iterator[Broken]:
-    """Yield the rules that a scene of statics breaks by what moves, depends on motion or rubs."""
+def _broken_by_statics(scene: Any) -> Iterator[Broken]:
+    """Yield the broken rules of a static scene: damping, velocities, force functions, impacts."""
     if scene.material.damping:
-        words = (
-            f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves'
-        )
+        words = f'may not have integrator = "{STATIC}" with material.damping: nothing moves'
         yield "time", rule(words, "material")
     bodies = [("body", f"body.{number}.", body) for number, body in enumerate(scene.body)]
-    for key, whose, tables in [("", "", scene), *bodies]:
+    for key, prefix, tables in [("", "", scene), *bodies]:
         if tables.start is not None and (any(tables.start.velocity) or any(tables.start.spin)):
-            words = f'{key and f"{whose}start "}may have no velocity or spin where time.integrator = "{STATIC}": '
-            yield key or "start", rule(f"{words}there is no inertia", "time")
+            words = (
+                f"{key and f'{prefix}start '}may have no velocity or spin with "
+                f'time.integrator = "{STATIC}": there is no inertia'
+            )
+            yield key or "start", rule(words, "time")
         for number, force in enumerate(tables.force):
             if force.function is not None:
-                words = f'may be no function where time.integrator = "{STATIC}", as {whose}force.{number} is: it is '
-                yield (
-                    key or "force",
-                    rule(f"{words}that of the state before, which is not at rest under it", "time"),
+                words = (
+                    f'may be no function with time.integrator = "{STATIC}", as '
+                    f"{prefix}force.{number} is: it is evaluated at the previous state, so the "
+                    "static state would not balance it"
                 )
+                yield key or "force", rule(words, "time")
     for number, obstacle in enumerate(scene.obstacle):
         if obstacle.response not in ("penalty", "barrier"):
-            words = f'may not {obstacle.response} where time.integrator = "{STATIC}", as obstacle.{number} does: '
-            yield (
-                "obstacle",
-                rule(f'{words}nothing strikes it; response = "penalty" presses', "time"),
+            words = (
+                f'may not {obstacle.response} with time.integrator = "{STATIC}", as '
+                f'obstacle.{number} does: nothing strikes it; use response = "penalty"'
             )
+            yield "obstacle", rule(words, "time")
         if obstacle.friction:
-            words = f'may have no friction where time.integrator = "{STATIC}", as obstacle.{number} has: it depends on '
-            yield (
-                "obstacle",
-                rule(f"{words}the way there, which steps in motion with damping take", "time"),
+            words = (
+                f'may have no friction with time.integrator = "{STATIC}", as obstacle.{number} '
+                "has: friction depends on the motion; use an implicit integrator with "
+                "material.damping"
             )
+            yield "obstacle", rule(words, "time")

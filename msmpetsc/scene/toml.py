@@ -1,6 +1,6 @@
-"""Text to TOML data, guarded against what takes for ever to parse; and values as TOML has them.
+"""Conversion between TOML text and data, with a limit on nesting.
 
-It needs none of the packages that check a scene.
+This module imports no package beyond Python's own, so that reading a result can use it.
 """
 
 import json
@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 from os import PathLike, fspath
 from typing import Any
 
-DEEPEST = 50  # parts of a key: tomllib takes time by their square
+# largest number of parts in a dotted key [-]; tomllib's time is quadratic in it
+DEEPEST = 50
 KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 DEEP_KEY = re.compile(
     rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPEST}}}", re.MULTILINE
@@ -18,14 +19,17 @@ DEEP_KEY = re.compile(
 
 
 def toml_of(text: str) -> dict[str, Any]:
-    """Return the text's data. Raises ValueError for what is not TOML, RecursionError for what is nested too deeply."""
+    """Return the data of a TOML text.
+
+    Raises ValueError for text that is not TOML, RecursionError for data nested too deeply.
+    """
     if DEEP_KEY.search(text):
         raise RecursionError
     return tomllib.loads(text)
 
 
 def plain(value: Any) -> Any:
-    """Return a value as TOML has it: arrays and tuples as lists, numpy's numbers as Python's, paths as strings."""
+    """Return a value in TOML's types: arrays as lists, numpy scalars as numbers, paths as text."""
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, PathLike):
@@ -36,7 +40,7 @@ def plain(value: Any) -> Any:
 
 
 def toml_value(value: Any) -> str:
-    """Return a value as it stands in a line of TOML; a key that is None is absent."""
+    """Return a value as a line of TOML, without the keys whose value is None."""
     value = plain(value)
     if isinstance(value, dict):
         return (
@@ -52,7 +56,7 @@ def toml_value(value: Any) -> str:
 
 
 def overrides_of(changes: Mapping[str, Any] | Iterable[str]) -> list[str]:
-    """Return changes {"cages.count": 3000} as words of ``--set``, "cages.count=3000"; or the words."""
+    """Return changes as values of ``--set``: {"cages.count": 3000} as ["cages.count=3000"]."""
     if isinstance(changes, Mapping):
         return [f"{key}={toml_value(value)}" for key, value in changes.items()]
     return [changes] if isinstance(changes, str) else list(changes)

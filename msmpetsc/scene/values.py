@@ -1,4 +1,4 @@
-"""Types of the values of a scene's keys, and the table that all tables are."""
+"""Types of the values in a scene, and the base class of its tables."""
 
 import json
 import math
@@ -28,19 +28,21 @@ def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    # divided by the largest component first, so that no square over- or underflows
     longest = max(map(abs, _nonzero(vector)))
-    x, y, z = (
-        c / longest for c in vector
-    )  # or the squares of very large or small components leave the range
+    x, y, z = (c / longest for c in vector)
     length = math.hypot(x, y, z)
     return x / length, y / length, z / length
 
 
-Positive = Annotated[float, Field(gt=0, lt=1e60)]  # so that its fourth power is still a number
+# below 1e60, so that the fourth power is finite
+Positive = Annotated[float, Field(gt=0, lt=1e60)]
 NotNegative = Annotated[float, Field(ge=0, lt=1e60)]
-Count = Annotated[int, Field(gt=0, lt=2**63)]  # TOML's integers have 64 bits
+# TOML's integers have 64 bits
+Count = Annotated[int, Field(gt=0, lt=2**63)]
 T = TypeVar("T")
-ListOf = Annotated[tuple[T, ...], Strict(False)]  # not strict: TOML has lists, no tuples
+# not strict, as TOML has lists but no tuples
+ListOf = Annotated[tuple[T, ...], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
 Direction = Annotated[Vector, AfterValidator(_nonzero)]
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
@@ -59,7 +61,7 @@ def _printable(name: str) -> str:
 
 
 def _painted(value: Any) -> str | tuple[int, ...]:
-    """Return a file's name, or numbers of points."""
+    """Return the name of a file of point numbers, or the numbers. Raises a broken rule."""
     if isinstance(value, str) and 0 < len(value) <= 1000:
         return _printable(value)
     numbers = isinstance(value, list | tuple) and all(
@@ -71,6 +73,7 @@ def _painted(value: Any) -> str | tuple[int, ...]:
 
 
 def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | None:
+    """Return ``stop`` as a pydantic validator; raise a broken rule unless stop > start."""
     start = info.data.get("start")
     if stop is not None and start is not None and stop <= start:
         raise rule(f"must be > start = {start:g}", "start")
@@ -78,7 +81,7 @@ def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | N
 
 
 def only_for(key: str, *values: str) -> Callable[..., Any]:
-    """Return the validator of what only matters where another key of its table has one of these values."""
+    """Return a validator of a key that is allowed only if another key has a given value."""
 
     def check(cls: Any, given: Any, info: ValidationInfo) -> Any:
         if info.data.get(key, values[0]) not in values:
@@ -96,7 +99,7 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
 
 
 def _as_name(value: Any) -> Any:
-    """Return the name of a group that is given by its number."""
+    """Return the number of a group as its name; return any other value unchanged."""
     return str(value) if type(value) is int else value
 
 
@@ -110,13 +113,16 @@ Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
 
 
 def _one_of_in_schema(schema: dict[str, Any], table: type["Table"]) -> None:
-    """Say in a table's JSON schema of which keys exactly one must be given."""
+    """Add the alternative keys of a table (``one_of``) to its JSON schema."""
     if table.one_of:
         schema["oneOf"] = [{"required": [name]} for name in table.one_of]
 
 
 class Table(BaseModel):
-    """A table of the scene file; ``one_of`` names the keys of which exactly one must be given."""
+    """Base class of the tables of a scene file.
+
+    one_of : alternative keys, of which a table must give a single key
+    """
 
     model_config = ConfigDict(
         frozen=True,
@@ -128,13 +134,13 @@ class Table(BaseModel):
     one_of: ClassVar[tuple[str, ...]] = ()
 
     def broken_rules(self) -> Iterator[Broken]:
-        """Yield the rules between its keys that a table breaks, each key sound by itself."""
+        """Yield the broken rules between keys that are valid by themselves."""
         return iter(())
 
     @model_validator(mode="wrap")
     @classmethod
     def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
-        """Add what pydantic does not check, and lose none of what it does."""
+        """Return the checked table; raise all problems, pydantic's and our own, together."""
         known = list(cls.model_fields)
         problems = one_of_problems(data, cls.one_of, known)
         try:

@@ -118,7 +118,7 @@ def test_what_no_machine_holds_is_refused_before_it_is_made(folder, monkeypatch,
         assert words in command_error(*command)
 
 
-RESULT, PICTURE, JSON = "is named *.h5 or *.hdf5", "is named *.png", "is named *.json"
+RESULT, PICTURE, JSON = "be named *.h5 or *.hdf5", "be named *.png", "be named *.json"
 WRONG = [
     *[(["run", "scene.toml", "-o", name], RESULT)
       for name in ("x.vtk", "x.h5.gz", "x", "scene.toml")],

@@ -150,7 +150,7 @@ def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Pat
     refused = {
         "takes the scene's name": ["new", "my.toml"],
         "takes": ["new", "--mesh", "ball.ply"],
-        "is named *.toml": ["new", "my.txt", "--mesh", "ball.ply"],
+        "must be named *.toml": ["new", "my.txt", "--mesh", "ball.ply"],
         "no file": ["new", "my.toml", "--mesh", "gone.ply"],
         "encloses no volume": ["new", "my.toml", "--mesh", "flat.ply"],
         "nor below it": ["new", "my.toml", "--mesh", str(ball)],

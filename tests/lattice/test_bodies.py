@@ -290,7 +290,7 @@ MISTAKES = [
     ),
     (
         {"part": [{"region": {"painted": [1]}, "density": 1.0}]},
-        "as part.0 has: whose it is only [[body.part]] says",
+        "as part.0 has: move it into [[body.part]]",
     ),
     ({"body": []}, "body: must have at least 1 item"),
 ]
@@ -303,7 +303,7 @@ IN_A_BODY = [
     ),
     (
         "body.2.part.0.density=1e14",
-        "body: has density of 1000 to 1e+14 in one run: more than 1e+06 to 1",
+        "body: has density of 1000 to 1e+14 in one run: a ratio above 1e+06",
     ),
     (
         "body.1.pin.0.region.box=[[7, 7, 7], [8, 8, 8]]",

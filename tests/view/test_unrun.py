@@ -60,5 +60,5 @@ def test_what_a_scene_has_not_got(tmp_path, words, line):
 
 
 def test_a_mesh_is_none_of_what_is_drawn(ball):
-    with pytest.raises(InputError, match=r"is named \*.h5 or \*.hdf5 or \*.toml"):
+    with pytest.raises(InputError, match=r"must be named \*.h5 or \*.hdf5 or \*.toml"):
         render(ball)

@@ -1,4 +1,4 @@
-"""``msmpetsc compare``: the differences of two results, and the first frame and node that differ."""
+"""``msmpetsc compare``: print the differences of two results, with the first frame and node."""
 
 import argparse
 import json
@@ -33,32 +33,30 @@ def run(args: argparse.Namespace) -> int:
     with Result(args.first) as first, Result(args.second) as second:
         comparison, notes = compared(first, second)
         fields = {field.name: record(field, comparison, args.rtol) for field in comparison.fields}
-        most = max(len(first.frames.time), len(second.frames.time))
-        apart = len(comparison.pairs) < most
-        agree = not apart and all(field["first_above"] is None for field in fields.values())
+        frames = len(comparison.pairs)
+        times_differ = frames < max(len(first.frames.time), len(second.frames.time))
+        agree = not times_differ and all(field["first_above"] is None for field in fields.values())
         if args.json:
-            shown = {
+            record_of_all = {
                 "agree": agree,
                 "rtol": args.rtol,
-                "frames": len(comparison.pairs),
+                "frames": frames,
                 "fields": fields,
+                "left_out": list(comparison.left_out),
+                "notes": notes,
             }
-            print(
-                json.dumps(
-                    shown | {"left_out": list(comparison.left_out), "notes": notes}, indent=1
-                )
-            )
+            print(json.dumps(record_of_all, indent=1))
         else:
             print("\n".join([*notes, *not_shared(first, second, comparison), HEAD]))
             print("\n".join(row(name, field) for name, field in fields.items()))
             print("\n".join(first_difference(first, comparison, args.rtol)))
-            if apart:
-                print("they have not the same times, which counts as different")
+            if times_differ:
+                print("the results have different times, which counts as a difference")
     return int(not agree)
 
 
 def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
-    """Compare two results, by surfaces alone if lattices differ, and return notes on that."""
+    """Return the comparison of two results, by surfaces only if lattices differ, and notes."""
     try:
         return compare(first, second), []
     except DifferentLattices as error:
@@ -71,12 +69,13 @@ def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
     overall = np.sqrt(np.mean(mean.errors**2))
     return comparison, [
         f"{differ}: their surfaces alone are compared",
-        f"surface error {overall:.3g}: rms over the surface and time, of the largest displacement in {second.path}",
+        f"surface error {overall:.3g}: rms over the surface and time, relative to the largest "
+        f"displacement in {second.path}",
     ]
 
 
 def record(field: FieldError, comparison: Comparison, rtol: float) -> dict[str, Any]:
-    """Return the differences of a field, with frames numbered as in the first file."""
+    """Return the greatest difference of a field, with frame numbers of the first file."""
     greatest = int(np.argmax(field.errors))
     first = field.first_above(rtol)
     return {
@@ -101,13 +100,17 @@ def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterato
     shared = len(comparison.pairs)
     if counts != [shared, shared]:
         span = f"from {comparison.times[0]:g} s to {comparison.times[-1]:g} s"
-        yield f"{counts[0]} and {counts[1]} frames, of which {shared} have the same time, {span}: these are compared"
+        yield (
+            f"{counts[0]} and {counts[1]} frames, of which {shared} have the same time, {span}: "
+            "these are compared"
+        )
     for name in comparison.left_out:
-        yield f"{name} is in {first.path if name in first.frames else second.path} only: not compared"
+        path = first.path if name in first.frames else second.path
+        yield f"{name} is in {path} only: not compared"
 
 
 def first_difference(result: Result, comparison: Comparison, rtol: float) -> Iterator[str]:
-    """Yield the first frame that differs, and its node of the largest difference."""
+    """Yield lines on the first frame that differs and on the node that differs most there."""
     firsts = {
         field.name: first
         for field in comparison.fields
@@ -118,7 +121,8 @@ def first_difference(result: Result, comparison: Comparison, rtol: float) -> Ite
         return
     first = min(firsts.values())
     names = ", ".join(name for name, index in firsts.items() if index == first)
-    yield f"they differ from frame {comparison.pairs[first, 0]} on, t = {comparison.times[first]:g} s: {names}"
+    frame = comparison.pairs[first, 0]
+    yield f"they differ from frame {frame} on, t = {comparison.times[first]:g} s: {names}"
     for field in comparison.fields:
         if field.name in ("position", "surface") and field.name in firsts:
             yield farthest(result, comparison, field, firsts[field.name])
@@ -126,9 +130,11 @@ def first_difference(result: Result, comparison: Comparison, rtol: float) -> Ite
 
 
 def farthest(result: Result, comparison: Comparison, field: FieldError, first: int) -> str:
-    """Return which node or surface point differs most at a frame, with its rest position."""
-    number, rest_rows = field.worst[first], rest_of(result, field.name)
+    """Return a line on the node or surface point that differs most at a frame."""
+    number = field.worst[first]
+    rest_rows = rest_of(result, field.name)
     rest = f", at rest at {point_text(rest_rows[number])}" if rest_rows is not None else ""
     kind = "node" if field.name == "position" else "surface point"
-    off = f"{field.errors[first] * (field.scale or 1.0):.3g} m off at frame {comparison.pairs[first, 0]}"
-    return f"{kind} {number}{rest}, is {off}, farther than any other"
+    difference = field.errors[first] * (field.scale or 1.0)
+    frame = comparison.pairs[first, 0]
+    return f"{kind} {number}{rest}, is {difference:.3g} m off at frame {frame}, more than the rest"

@@ -1,6 +1,6 @@
-"""``msmpetsc doctor``: what is installed, what is missing and the command that brings it, and what is broken.
+"""``msmpetsc doctor``: check the installation and print a remedy for each missing package.
 
-What could end the process, libraries that do not fit together above all, is loaded in one of its own.
+Each probe runs in a process of its own, as incompatible libraries may end the process.
 """
 
 import argparse
@@ -18,8 +18,10 @@ from msmpetsc.app.ranks import environment, last_error
 from msmpetsc.errors import EXTRAS
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
-PATIENCE = 60  # [s] that a library may take to load
-PROBES = {  # programs that say what they find, or nothing
+# time limit of a probe [s]; far above the time to load a library
+PATIENCE = 60
+# program of each probe, which prints its finding, or nothing
+PROBES = {
     "PETSc": """
 import numpy
 from petsc4py import PETSc
@@ -47,50 +49,60 @@ if writable():
     print(f"kept in {writable()}")
 """,
 }
-NOTHING = {  # what it means if they say nothing
+# state and message of a probe that prints nothing
+NOTHING = {
     "PETSc": (BROKEN, "a PETSc of real double numbers is needed (--with-scalar-type=real)"),
     "MPI": (BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI"),
     "GPU": (MISSING, "no CUDA device on this machine"),
     "kernels": (
         MISSING,
-        "no folder can keep them: each process compiles them, a minute; NUMBA_CACHE_DIR names one",
+        "no folder can store them, so that each process compiles them for a minute: set "
+        "NUMBA_CACHE_DIR to a writable folder",
     ),
 }
-BRINGS = {  # of packages whose names alone do not say how to get them
+# commands that install packages which pip alone does not install
+BRINGS = {
     "petsc4py": "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'",
     "mpi4py": "apt install python3-mpi4py openmpi-bin, or pip install 'msmpetsc[run]'",
     "cupy": "pip install 'msmpetsc[cuda]'",
 }
-NO_INSTALL = {"cuda", "peers"}  # extras for few machines: what lacks them lacks nothing
-NEEDED = {"PETSc", "MPI", "HDF5", "extra run"}  # by every run
+# extras for few machines, not reported if they are missing
+NO_INSTALL = {"cuda", "peers"}
+# requirements of every run
+NEEDED = {"PETSc", "MPI", "HDF5", "extra run"}
 
-Finding = tuple[str, str, str]  # what, its state, and in words
+# name of a probe or extra, its state, and a message
+Finding = tuple[str, str, str]
 
 
 def run(_: argparse.Namespace) -> int:
-    """Print the findings; return 1 where a run lacks something that it needs."""
+    """Print the findings; return 1 if a requirement of runs is missing or broken."""
     lacking = False
-    for what, state, words in findings():
-        print(f"{state:8} {what:16} {words}", flush=True)
-        lacking |= state != OK and what in NEEDED
+    for name, state, message in findings():
+        print(f"{state:8} {name:16} {message}", flush=True)
+        lacking |= state != OK and name in NEEDED
     return int(lacking)
 
 
 def findings() -> Iterator[Finding]:
-    """Yield the findings of all probes, then those of the packages of each extra."""
+    """Yield the findings of all probes, of msmpetsc itself, and of the packages of each extra."""
     for name, code in PROBES.items():
-        has_ranks = name == "MPI" and find_spec("mpi4py")  # or mpiexec would say something else
-        state, words = probed(code, *(("mpiexec", "-n", "2") if has_ranks else ()))
-        if not words:
-            state, words = NOTHING[name]
-        yield name, state, words.replace("\n", ", ")
+        # without mpi4py, mpiexec would print a message of its own
+        has_ranks = name == "MPI" and find_spec("mpi4py")
+        state, message = probed(code, *(("mpiexec", "-n", "2") if has_ranks else ()))
+        if not message:
+            state, message = NOTHING[name]
+        yield name, state, message.replace("\n", ", ")
     folder = Path(msmpetsc.__file__).parent
     yield "msmpetsc", OK, f"{msmpetsc.__version__} in {folder}, Python {platform.python_version()}"
     yield from packages()
 
 
 def probed(code: str, *launcher: str) -> tuple[str, str]:
-    """Return the state of a probe run in its own Python, with its output or the reason of its failure."""
+    """Run a probe in a Python of its own; return its state, and its output or failure.
+
+    launcher : words before the Python command, for example "mpiexec", "-n", "2"
+    """
     command = [*launcher, sys.executable, "-c", code]
     try:
         done = subprocess.run(
@@ -108,22 +120,25 @@ def probed(code: str, *launcher: str) -> tuple[str, str]:
         return BROKEN, f"does not answer within {PATIENCE} s: {' '.join(launcher)}"
     if done.returncode == 0:
         return OK, done.stdout.strip()
-    if gone := re.search(r"^ModuleNotFoundError: No module named '(\w+)'$", done.stderr, re.M):
-        return MISSING, f"{gone[1]}: {BRINGS.get(gone[1], f'pip install {gone[1]}')}"
+    if missing := re.search(r"^ModuleNotFoundError: No module named '(\w+)'$", done.stderr, re.M):
+        name = missing[1]
+        return MISSING, f"{name}: {BRINGS.get(name, f'pip install {name}')}"
     return BROKEN, last_error(done.stderr)[:160] or f"ends with status {done.returncode}"
 
 
 def packages() -> Iterator[Finding]:
-    """Yield whether the packages of each extra are installed and can be imported."""
+    """Yield for each extra whether its packages are installed and can be imported."""
     all_names = sorted({name for names in EXTRAS.values() for name in names})
     with ThreadPoolExecutor() as pool:
-        states = pool.map(probed, (f"import {name}" for name in all_names))
-    found = dict(zip(all_names, states, strict=True))
+        probes = pool.map(probed, (f"import {name}" for name in all_names))
+    results = dict(zip(all_names, probes, strict=True))
     for extra, names in EXTRAS.items():
-        gone = [name for name in names if found[name][0] == MISSING]
-        if broken := [f"{name}: {found[name][1]}" for name in names if found[name][0] == BROKEN]:
+        missing = [name for name in names if results[name][0] == MISSING]
+        broken = [f"{name}: {results[name][1]}" for name in names if results[name][0] == BROKEN]
+        if broken:
             yield f"extra {extra}", BROKEN, "; ".join(broken)
-        elif gone and not (extra in NO_INSTALL and len(gone) == len(names)):
-            yield f"extra {extra}", MISSING, f"{', '.join(gone)}: pip install 'msmpetsc[{extra}]'"
-        elif not gone:
+        elif missing and not (extra in NO_INSTALL and len(missing) == len(names)):
+            remedy = f"{', '.join(missing)}: pip install 'msmpetsc[{extra}]'"
+            yield f"extra {extra}", MISSING, remedy
+        elif not missing:
             yield f"extra {extra}", OK, ", ".join(names)

@@ -1,4 +1,4 @@
-"""``msmpetsc export``: frames of a result in the format of another program."""
+"""``msmpetsc export``: write frames of a result in another format."""
 
 import argparse
 
@@ -7,7 +7,7 @@ from msmpetsc.results.reader import refuse_deadly
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export the result and print the path of what was written; return the exit status."""
+    """Export the result and print the path of the file; return the exit status."""
     refuse_deadly(args.result)
     print(export(args.result, args.output, args.frames))
     return 0

@@ -1,9 +1,9 @@
-"""``msmpetsc inspect``: groups of meshes, counts and memory of a scene, without a run.
+"""``msmpetsc inspect``: print mesh groups, counts and memory of a scene without a run.
 
-memory of a rank  =  PROGRAM + FACTOR (bytes of its arrays while A is assembled), or W is made if that is more
-
-Ranks own equal parts of cells and of nodes along the Morton curve; those that R ranks make themselves, by a sample
-(comm.SortedKeys), are as large within an eighth.
+The memory of a rank is the program plus the larger of two peaks: FACTOR times the arrays during
+the assembly of A, and the construction of W. The estimate gives ranks equal parts of cells and
+nodes along the Morton curve. The parts of a run, made by sampling (comm.SortedKeys), agree with
+these within an eighth.
 """
 
 import argparse
@@ -35,34 +35,38 @@ from msmpetsc.scene.body import CagesTable
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.petsc.initialise import initialise
 
-MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
+# largest lattice built to count [cells]; counts of a larger lattice are scaled
+MOST_BUILT = 200_000
+# largest number of ranks [-]; far above any machine
 MOST_RANKS = 10**6
-PROGRAM, FACTOR = (
-    0.29e9,
-    2.1,
-)  # [byte] of a rank without arrays, and times those, as runs of newton show it
-BYTES = np.array(
-    [145, 41, 24]
-)  # of a lattice's arrays for a cell, a node, ghosts too, and a spring
-BYTES_OF_POINT = (
-    14 * 64 * 8
-)  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
+# memory of a rank without arrays [byte]; measured in runs with the preset newton
+PROGRAM = 0.29e9
+# peak memory over the arrays of a rank [-]; measured in runs with the preset newton
+FACTOR = 2.1
+# memory of the lattice for a cell, a node (ghosts included) and a spring [byte]
+BYTES = np.array([145, 41, 24])
+# peak memory for a surface point with 64 weights while W is made [byte]; measured with
+# the embedding "affine"
+BYTES_OF_POINT = 14 * 64 * 8
 GB = 1e9
 SPRINGS = "springs; of a rank, shared ones too"
-WIDTH = 36  # of the first column
-NO_LIMIT = 1 << 40  # cells: the scene's own limit is for runs
-INNER_SPRINGS = 13  # of each cell, where cells have neighbours on all sides
+# width of the first column [characters]
+WIDTH = 36
+# limit on cells of the counted lattice [-]; cages.max_cells is for runs only
+NO_LIMIT = 1 << 40
+# springs of a cell with neighbours on all sides [-]
+INNER_SPRINGS = 13
 
 
 @dataclass(frozen=True)
 class Partition:
-    """What each rank holds, one number a rank, (R,): whole where they were counted, fractions where they were scaled.
+    """Counts (R,) of each rank, counted or scaled from a smaller lattice.
 
-    cells, nodes : that the rank owns
-    ghosts       : nodes of others that its springs reach
-    cut          : springs of which it owns one end
-    nonzeros     : of its rows of A: of each node the diagonal and the far ends of its springs
-    neighbours   : ranks that its ghosts come from: messages that it gets in one exchange, and sends
+    cells, nodes : owned by the rank
+    ghosts       : nodes of other ranks at the far ends of its springs
+    cut          : springs between an owned node and a ghost
+    nonzeros     : of the rank's rows of A, a diagonal entry and an entry for each spring of a node
+    neighbours   : ranks that own its ghosts, the number of messages in a ghost exchange
     """
 
     cells: Array
@@ -74,47 +78,47 @@ class Partition:
 
     @property
     def springs(self) -> Array:
-        """Number of springs (R,) that each rank keeps."""
+        """Return the number of springs (R,) that each rank stores."""
         springs: Array = (self.nonzeros - self.nodes + self.cut) / 2
         return springs
 
     @property
     def all_springs(self) -> float:
-        """Number of springs, each counted once."""
+        """Return the number of springs, each counted once."""
         return float(self.springs.sum() - self.cut.sum() / 2)
 
     def scaled(self, cells: float) -> "Partition":
-        """Return the partition of the same body with more cells on as many ranks.
+        """Return the partition of the same body with more cells on the same number of ranks.
 
-        What fills it grows with the cells, the surface with their power 2/3; ghosts and cut springs
-        as they do around a cube of as many nodes as a rank has.
+        The volume part of a count grows as the cells, the surface part as their power 2/3. Ghosts
+        and cut springs grow as the nodes around a cube of a rank's nodes.
         """
-        nodes = self.nodes.sum()
-        before = self.cells.sum()
-        f = cells / before
-        grown = cells + (nodes - before) * f ** (2 / 3)
-        springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * before) * f ** (2 / 3)
-        side, side_before = np.cbrt(np.array([grown, nodes]) / len(self.nodes))
-        around = ((side + 2) ** 3 - side**3) / (
-            (side_before + 2) ** 3 - side_before**3
-        )  # nodes around a cube
-        nonzeros = self.nonzeros * (grown + 2 * springs) / self.nonzeros.sum()
-        held = (
-            self.cells * f,
-            self.nodes * grown / nodes,
-            self.ghosts * around,
-            self.cut * around,
-            nonzeros,
+        old_nodes = self.nodes.sum()
+        old_cells = self.cells.sum()
+        ratio = cells / old_cells
+        surface_ratio = ratio ** (2 / 3)
+        nodes = cells + (old_nodes - old_cells) * surface_ratio
+        springs = INNER_SPRINGS * cells
+        springs += (self.all_springs - INNER_SPRINGS * old_cells) * surface_ratio
+        side, old_side = np.cbrt(np.array([nodes, old_nodes]) / len(self.nodes))
+        ghost_ratio = ((side + 2) ** 3 - side**3) / ((old_side + 2) ** 3 - old_side**3)
+        return Partition(
+            cells=self.cells * ratio,
+            nodes=self.nodes * nodes / old_nodes,
+            ghosts=self.ghosts * ghost_ratio,
+            cut=self.cut * ghost_ratio,
+            nonzeros=self.nonzeros * (nodes + 2 * springs) / self.nonzeros.sum(),
+            neighbours=self.neighbours,
         )
-        return Partition(*held, self.neighbours)
 
 
 def partition_of(
     bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int
 ) -> tuple[Partition, int]:
-    """Return the partition among ``ranks`` ranks, and the cells of the lattice that it was counted on.
+    """Return the partition among ``ranks`` ranks, and the number of cells of the counted lattice.
 
-    That lattice has about MOST_BUILT cells where more are wanted, and its numbers are scaled.
+    If the scene has more than MOST_BUILT cells, a lattice of about MOST_BUILT cells is counted,
+    and its counts are scaled.
     """
     h = wanted.cell_size or estimated_size(bodies, wanted.count or 0)
     cells = float(wanted.count or estimated_cells(bodies, h))
@@ -129,24 +133,32 @@ def partition_of(
 
 
 def count_partition(lattice: Topology, ranks: int) -> Partition:
-    """Return the partition among ``ranks`` ranks of a lattice that is whole, built on one rank."""
-    cell_rank, rank = (
-        np.arange(n) * ranks // n for n in (len(lattice.corners), len(lattice.octants))
+    """Return the partition among ``ranks`` ranks of a whole lattice, built on a single rank."""
+    cells = len(lattice.corners)
+    nodes = len(lattice.octants)
+    rank_of_cell = np.arange(cells) * ranks // cells
+    rank_of_node = np.arange(nodes) * ranks // nodes
+    rank_of_end = rank_of_node[lattice.springs]
+    is_cut = rank_of_end[:, 0] != rank_of_end[:, 1]
+    # the far end of each cut spring is a ghost of the rank at its near end
+    near_rank = rank_of_end[is_cut].ravel()
+    far_node = lattice.springs[is_cut][:, ::-1].ravel()
+    ghosts = np.unique(near_rank * nodes + far_node)
+    ghost_rank = ghosts // nodes
+    owner = rank_of_node[ghosts % nodes]
+    neighbour_rank = np.unique(ghost_rank * ranks + owner) // ranks
+
+    def per_rank(rank_of: Array) -> Array:
+        return np.bincount(rank_of, minlength=ranks)
+
+    return Partition(
+        cells=per_rank(rank_of_cell),
+        nodes=per_rank(rank_of_node),
+        ghosts=per_rank(ghost_rank),
+        cut=per_rank(near_rank),
+        nonzeros=per_rank(np.append(rank_of_node, rank_of_end)),
+        neighbours=per_rank(neighbour_rank),
     )
-    of_end = rank[lattice.springs]
-    across = of_end[:, 0] != of_end[:, 1]
-    to, node = of_end[across].ravel(), lattice.springs[across][:, ::-1].ravel()
-    ghosts = np.unique(to * len(rank) + node)
-    holder, owner = ghosts // len(rank), rank[ghosts % len(rank)]
-    holders = (
-        cell_rank,
-        rank,
-        holder,
-        to,
-        np.append(rank, of_end),
-        np.unique(holder * ranks + owner) // ranks,
-    )
-    return Partition(*(np.bincount(rank_of, minlength=ranks) for rank_of in holders))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -158,7 +170,7 @@ def run(args: argparse.Namespace) -> int:
     scene = load_scene(args.scene, args.set)
     before = peak_memory()
     bodies = read_bodies(MPI.COMM_WORLD, scene)
-    mesh = peak_memory() - before
+    mesh_bytes = peak_memory() - before
     partition, counted = partition_of(bodies, scene.cages, args.ranks)
     cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
@@ -174,8 +186,9 @@ def run(args: argparse.Namespace) -> int:
         for mesh, surface in zip(scene.meshes.values(), surfaces, strict=True)
     }
     report = {
-        "scene": str(args.scene), "ranks": args.ranks, "counted": counted, "counts": counts_of(scene, partition),
-        "memory": over_ranks(memory_of(partition, stored, mesh)), "groups": groups,
+        "scene": str(args.scene), "ranks": args.ranks, "counted": counted,
+        "counts": counts_of(scene, partition),
+        "memory": over_ranks(memory_of(partition, stored, mesh_bytes)), "groups": groups,
     }  # fmt: skip
     if args.json:
         print(json.dumps(report, indent=1))
@@ -185,7 +198,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def counts_of(scene: Scene, partition: Partition) -> dict[str, dict[str, float]]:
-    """Return the counts of cells, nodes, springs and messages: total, mean and maximum of a rank."""
+    """Return counts of cells, nodes, springs and messages: total, mean and maximum over ranks."""
     rows = {
         "cells": partition.cells,
         "nodes": partition.nodes,
@@ -221,24 +234,24 @@ def print_counts(report: dict[str, Any]) -> None:
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
     for source, groups in report["groups"].items():
         if groups:
-            print(
-                f"\ngroups of {source}: {listed([f'{name} ({count} triangles)' for name, count in groups.items()])}"
-            )
+            names = [f"{name} ({count} triangles)" for name, count in groups.items()]
+            print(f"\ngroups of {source}: {listed(names)}")
 
 
-def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh: float) -> Floats:
-    """Return the memory (R,) of each rank [byte].
+def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh_bytes: float) -> Floats:
+    """Return the estimated memory (R,) of each rank [byte].
 
-    surfaces : that are stored
-    mesh     : bytes that reading and preparing them took, on rank 0
+    surfaces   : surfaces that the result stores
+    mesh_bytes : memory that reading and preparing the meshes took, on rank 0 [byte]
     """
     from msmpetsc.solve.linear.operators import assembly_bytes
     from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
 
-    nodes, springs = partition.nodes + partition.ghosts, partition.springs
+    nodes = partition.nodes + partition.ghosts
+    springs = partition.springs
     arrays = BYTES @ np.array([partition.cells, nodes, springs]) + nodes * BYTES_OF_NODE
     arrays += assembly_bytes(nodes, springs, partition.nonzeros)
     points = sum(len(surface.points) for surface in surfaces)
     needed: Floats = PROGRAM + np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / len(nodes))
-    needed[0] = max(needed[0], PROGRAM + mesh)
+    needed[0] = max(needed[0], PROGRAM + mesh_bytes)
     return needed

@@ -1,4 +1,4 @@
-"""``msmpetsc keys``, ``msmpetsc schema``: the keys of a scene, as a table or a JSON schema."""
+"""``msmpetsc keys``, ``msmpetsc schema``: print the keys of a scene as a table or JSON schema."""
 
 import argparse
 import json
@@ -9,7 +9,7 @@ HEAD = ("key", "default", "range", "meaning [unit]")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one line for each key, or the schema; return the exit status."""
+    """Print a line for each key, or the schema; return the exit status."""
     if args.command == "schema":
         print(json.dumps(json_schema(), indent=1))
         return 0

@@ -1,8 +1,9 @@
-"""``msmpetsc new``: a first scene for a mesh of one's own, or a copy of one that comes with msmpetsc.
+"""``msmpetsc new``: write a first scene for a mesh, or copy a scene that comes with msmpetsc.
 
-The mesh is measured; its unit and its upward axis are guessed, its faults and parts counted. The body either falls on
-the ground or, long and lying, is clamped at one end and bends under its weight. Young's modulus follows from the size,
-so that any body deforms visibly; the step from the period of its slowest motion.
+The command measures the mesh, guesses its unit and upward axis, and counts its faults and parts.
+A long horizontal body is clamped at an end and bends under its weight; any other body falls on
+the ground. Young's modulus is chosen so that the body deforms visibly. The time step is a
+fraction of the period of its slowest motion.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
 from msmpetsc.backend.arrays import Floats
-from msmpetsc.build import USUAL
+from msmpetsc.build import USUAL_SIDES
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.prepare import part_labels
@@ -31,30 +32,50 @@ from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
 
-SHIPPED = (
-    Path(msmpetsc.__file__).parent / "shipped"
-)  # the scenes that a wheel holds, too; in a clone a link to scenes/
-MILLIMETRE = 1e-3  # [m]
-Y_BY_DEFINITION = (".glb", ".gltf")  # points upwards in such files
-SOLE = 0.02  # of the height: what lies so near to the lowest point may stand on the ground
-FEET = 0.5  # share of the sole that counts less where it is flat, as a table's top is: feet are likelier below
-SURER = 0.1  # by so much y must stand better than z to be upwards
-G, DENSITY = 9.81, 1000.0  # [m/s^2], [kg/m^3]
-USUAL_SIZE = 0.3  # [m], where the file's unit cannot be guessed
-SLENDER = 2.5  # times its other sides: so long a body is a beam
-DROP = 0.2  # of the height, that a body falls
-ACROSS, CELLS = 3, (1000, 8000)  # cells across the mean thickness, within these counts
-SINKING = 100  # rho g H in Young's modulus, of a body that falls
-SAG, CLAMPED = 0.15, 0.05  # of a beam's length: what its end sinks by, what is clamped
+# folder of the shipped scenes, which a wheel also has; in a clone a link to scenes/
+SHIPPED = Path(msmpetsc.__file__).parent / "shipped"
+MILLIMETRE = 1e-3
+# formats whose definition has y upwards
+Y_UP_FORMATS = (".glb", ".gltf")
+# distance above the lowest point within which a point stands on the ground [height]
+SOLE = 0.02
+# loss of stability of a flat base [-]; a table stands on its feet, not on its top
+FLAT_PENALTY = 0.5
+# excess of y's uprightness over z's to take y as upwards [-]; z is the usual axis
+SURER = 0.1
+# gravity [m/s^2]
+G = 9.81
+# density of the body [kg/m^3]; water
+DENSITY = 1000.0
+# longest side if the unit of the file cannot be guessed [m]; a typical model
+DEFAULT_SIZE = 0.3
+# length of a beam [its other sides]
+SLENDER = 2.5
+# height above the ground of a falling body [its height]
+DROP = 0.2
+# cells across the mean thickness [-]; so that thin parts bend
+ACROSS = 3
+# least and largest number of cells [-]; so that a run takes a minute or so
+CELLS = (1000, 8000)
+# Young's modulus of a falling body [rho g H]; its own weight compresses it by 1%
+STIFFNESS = 100
+# deflection of a beam's end under its weight [length]
+SAG = 0.15
+# clamped part of a beam [length]
+CLAMPED = 0.05
+# duration after any fall [periods of the slowest motion]
 PERIODS = 3
-DEBRIS = 0.01  # of the area: all parts but the largest together
-COLUMN = 39  # where comments begin
-TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"  # y upwards becomes z upwards
+# largest total area of loose parts to drop [total area]
+DEBRIS = 0.01
+# column of comments
+COLUMN = 39
+# preparation step that turns y upwards into z upwards
+TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"
 GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the scene, or list those that come with msmpetsc; return the exit status."""
+    """Write the scene, or list the shipped scenes; return the exit status."""
     if args.list:
         titles = shipped_titles()
         print(
@@ -63,7 +84,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.scene is None or (args.mesh is None) == (args.from_scene is None):
         raise InputError(
-            "new takes the scene's name and --mesh MESH or --from NAME: msmpetsc new my.toml --mesh my.ply"
+            "new takes the scene's name and --mesh MESH or --from NAME: "
+            "msmpetsc new my.toml --mesh my.ply"
         )
     refuse_other_format("new", args.scene, SCENE_NAMES)
     if args.scene.exists() and not args.overwrite:
@@ -72,7 +94,8 @@ def run(args: argparse.Namespace) -> int:
         text = f"#:schema {SCHEMA_FILE}\n{shipped_text(args.from_scene)}"
     else:
         text = drafted(args.mesh, args.scene, args.up)
-    scene_of(args.scene, text, to_read=False)  # so that nothing is written that run would refuse
+    # raise before writing a scene that run would refuse
+    scene_of(args.scene, text, to_read=False)
     write_whole(args.scene.with_name(SCHEMA_FILE), json.dumps(json_schema(), indent=1) + "\n")
     write_whole(args.scene, text)
     print(f"{args.scene}\nto run it: msmpetsc run {quote(str(args.scene))} --picture")
@@ -80,9 +103,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def drafted(mesh: Path, scene: Path, up: str | None) -> str:
-    """Return the text of a scene for a mesh, a file or a registry name. Raises InputError.
+    """Return the text of a scene for a mesh file or a registry name. Raises InputError.
 
-    up : the mesh's upward axis, "y" or "z"; None: y of glTF, and where the body stands better on y than on z
+    up : the mesh's upward axis, "y" or "z"; None for a guess: y for glTF, or if the body stands
+        better with y upwards than with z upwards
     """
     source = str(mesh) if str(mesh) in MODELS else path_from(scene, mesh)
     surface = load(source, scene.parent)
@@ -90,7 +114,7 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     warnings = check_encloses(surface, report)
     if up is None:
         is_y = (
-            mesh.suffix.lower() in Y_BY_DEFINITION
+            mesh.suffix.lower() in Y_UP_FORMATS
             or uprightness(surface, 1) > uprightness(surface, 2) + SURER
         )
         up = "y" if is_y else "z"
@@ -108,13 +132,14 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
 
 
 def path_from(scene: Path, mesh: Path) -> str:
-    """Return the path of a mesh from its scene's folder. Raises InputError for one elsewhere."""
+    """Return the path of a mesh relative to its scene. Raises InputError for a mesh elsewhere."""
     folder = scene.parent
     if not mesh.exists():
-        locate(str(mesh), Path())  # says what it is not
+        # raises the error of a missing mesh
+        locate(str(mesh), Path())
     if not lies_below(folder, str(mesh.resolve())):
         raise InputError(
-            f"{mesh} is not in {folder.resolve()}, nor below it, where a scene has its meshes: "
+            f"{mesh} is not in {folder.resolve()}, nor below it, as a scene requires: "
             "write the scene beside its mesh"
         )
     return str(mesh.resolve().relative_to(folder.resolve()))
@@ -133,7 +158,8 @@ def shipped_text(name: str) -> str:
     titles = shipped_titles()
     if name not in titles:
         raise InputError(
-            f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: msmpetsc new --list"
+            f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: "
+            "msmpetsc new --list"
         )
     return (SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
 
@@ -143,38 +169,45 @@ def shipped_text(name: str) -> str:
 
 @dataclass(frozen=True)
 class MeshMeasures:
-    """Measures of a mesh for its first scene, in metres and with z upwards."""
+    """Measures of a mesh for its first scene, with z upwards.
 
-    up: str  # the upward axis of the file
-    unit: float | None  # of that [m]; None where neither metres nor millimetres give a usual body
-    sides: Floats  # (3,) of the bounding box
-    thickness: float  # mean: twice the volume over the area
+    up        : upward axis of the file
+    unit      : unit of the file [m]; None if neither metres nor millimetres give a usual size
+    sides     : of the bounding box (3,) [m]
+    thickness : mean thickness, twice the volume over the area [m]
+    volume    : enclosed volume [m^3]
+    report    : in the unit of the file
+    parts     : fraction of the area (p,) of each connected part, the largest first
+    """
+
+    up: str
+    unit: float | None
+    sides: Floats
+    thickness: float
     volume: float
     triangles: int
-    report: SurfaceReport  # in the unit of the file
-    parts: Floats  # (p,) share of the area that each connected part has, the largest first
+    report: SurfaceReport
+    parts: Floats
 
     @property
     def beam_axis(self) -> int | None:
-        """The horizontal axis along which the body is a beam; None for any other."""
-        along = int(np.argmax(self.sides))
-        return (
-            along
-            if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max()
-            else None
-        )
+        """Return the horizontal axis of a beam; None for a body that is no horizontal beam."""
+        longest = int(np.argmax(self.sides))
+        is_slender = self.sides[longest] >= SLENDER * np.delete(self.sides, longest).max()
+        return longest if longest < 2 and is_slender else None
 
     @property
     def unit_words(self) -> str:
-        """The unit of the file in words."""
+        """Return a phrase on the unit of the file."""
         if self.unit is None:
             return "the unit of the file is unknown"
         return f"the file is taken to be in {'mm' if self.unit == MILLIMETRE else 'm'}"
 
     @property
     def words(self) -> str:
-        """Triangles, boundary and parts in words."""
-        boundary, parts = "closed", "1 part"
+        """Return a phrase on triangles, boundary and parts."""
+        boundary = "closed"
+        parts = "1 part"
         if not self.report.closed:
             boundary = f"open ({self.report.boundary_edges} boundary edges)"
         if len(self.parts) > 1:
@@ -183,10 +216,10 @@ class MeshMeasures:
 
 
 def measured(surface: Surface, report: SurfaceReport, up: str) -> MeshMeasures:
-    """Measure a surface of a file with the axis ``up`` upwards."""
+    """Return the measures of a file's surface, whose axis ``up`` points upwards."""
     sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
     unit = unit_of(float(sides.max()))
-    metres = unit or USUAL_SIZE / sides.max()
+    metres = unit or DEFAULT_SIZE / sides.max()
     faces = trimesh.Trimesh(surface.points, surface.triangles, process=False)
     areas = np.bincount(part_labels(surface), faces.area_faces)
     return MeshMeasures(
@@ -202,52 +235,57 @@ def measured(surface: Surface, report: SurfaceReport, up: str) -> MeshMeasures:
 
 
 def unit_of(side: float) -> float | None:
-    """Return the unit [m] in which a body of this longest side has a usual size, metres before millimetres."""
-    return next((unit for unit in (1.0, MILLIMETRE) if USUAL[0] <= side * unit <= USUAL[1]), None)
+    """Return the unit [m] in which a longest side has a usual size: metres, millimetres or None."""
+    low, high = USUAL_SIDES
+    return next((unit for unit in (1.0, MILLIMETRE) if low <= side * unit <= high), None)
 
 
 def uprightness(surface: Surface, axis: int) -> float:
-    """Return how much likelier a body stands with this axis upwards than downwards, in [-1, 1].
+    """Return the excess in [-1, 1] of a body's stability with an axis upwards over downwards.
 
-    A chair stands well on its feet and badly on its head; lying on its back it does both, a little.
+    A chair is stable on its feet and unstable on its head, but on its side about equally stable
+    both ways.
     """
-    return stands(surface, axis, 1) - stands(surface, axis, -1)
+    return stability(surface, axis, 1) - stability(surface, axis, -1)
 
 
-def stands(surface: Surface, axis: int, way: int) -> float:
-    """Return how well a body stands with this axis upwards (way 1) or downwards (-1): the share of
-    its ground plan that it stands on, less where it stands on a face rather than on feet.
+def stability(surface: Surface, axis: int, sign: int) -> float:
+    """Return the stability in [0, 1] of a body with an axis upwards (sign 1) or downwards (-1).
 
-    That is the convex hull of its lowest points; nothing where its centre is not above it.
+    The base is the convex hull of the lowest points in the ground plan. The stability is the area
+    of the base over the area of the hull of all points. A base that is a flat face instead of
+    feet lowers it. If the centre of the surface is not above the base, it is zero.
     """
-    used, plan = np.unique(surface.triangles), np.delete(surface.points, axis, axis=1)
-    height = way * surface.points[:, axis]
+    used = np.unique(surface.triangles)
+    plan = np.delete(surface.points, axis, axis=1)
+    height = sign * surface.points[:, axis]
     height -= height[used].min()
-    low = height <= SOLE * height[used].max()
+    is_low = height <= SOLE * height[used].max()
+    # qhull fails for a base that is an edge or a corner
     try:
-        hull, ground = ConvexHull(plan[used[low[used]]]), ConvexHull(plan[used])
-    except QhullError:  # an edge or a corner
+        base = ConvexHull(plan[used[is_low[used]]])
+        whole = ConvexHull(plan[used])
+    except QhullError:
         return 0.0
     areas = trimesh.Trimesh(surface.points, surface.triangles, process=False).area_faces
     centre = areas @ plan[surface.triangles].mean(axis=1) / areas.sum()
-    if not (hull.equations[:, :2] @ centre + hull.equations[:, 2] <= 0).all():
+    if not (base.equations[:, :2] @ centre + base.equations[:, 2] <= 0).all():
         return 0.0
-    lowest = surface.triangles[low[surface.triangles].all(axis=1)]
+    lowest = surface.triangles[is_low[surface.triangles].all(axis=1)]
     flat = np.insert(plan, 2, 0.0, axis=1)
-    face = (
-        trimesh.Trimesh(flat, lowest, process=False).area / hull.volume
-    )  # in two dimensions the volume is an area
-    return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
+    # the volume of a hull in two dimensions is an area
+    flatness = trimesh.Trimesh(flat, lowest, process=False).area / base.volume
+    return float(base.volume / whole.volume * (1 - FLAT_PENALTY * min(flatness, 1.0)))
 
 
 # ---- the scene
 
 
 def draft(source: str, title: str, mesh: MeshMeasures) -> str:
-    """Return the text of a scene for a mesh, ``source`` as the scene will name it."""
+    """Return the text of a scene for a mesh that the scene names ``source``."""
     head = [
         f"#:schema {SCHEMA_FILE}",
-        "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
+        "# A first draft by msmpetsc new: adjust every value. All keys: msmpetsc keys",
         f"title = {json.dumps(title, ensure_ascii=False)}",
     ]
     moved = _falling(mesh) if mesh.beam_axis is None else _clamped(mesh, mesh.beam_axis)
@@ -255,11 +293,12 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
 
 
 def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
-    """Return the table of the mesh, with comments on its defects."""
+    """Return the lines of the table of the mesh, with comments on its defects."""
     report = mesh.report
     lines = ["[mesh]", line(f"source = {json.dumps(source, ensure_ascii=False)}", mesh.words)]
-    lines.append(f"# {mesh.up} is taken for upwards: msmpetsc new --up says another axis")
-    steps = {}  # with the reason
+    lines.append(f"# {mesh.up} is taken for upwards: msmpetsc new --up sets another axis")
+    # reason of each preparation step
+    steps = {}
     if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
         steps['"largest_part"'] = (
             f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area"
@@ -273,11 +312,13 @@ def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
         lines.append(f"prepare = [{', '.join(steps)}]")
     if not report.closed:
         lines.append(
-            '# open: the winding number decides what is inside; prepare = ["repair"] would close it'
+            "# open: the winding number decides which cells are inside; "
+            'prepare = ["repair"] closes the mesh'
         )
     if len(mesh.parts) > 1 and '"largest_part"' not in steps:
         lines.append(
-            '# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap'
+            "# parts that share no cell move separately; "
+            'prepare = ["union"] joins parts that overlap'
         )
     lines.append(
         line(f"size = {plain(mesh.sides.max(), 5)}", f"longest side [m]; {mesh.unit_words}")
@@ -287,81 +328,87 @@ def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
         lines.append(
             line(
                 f"base = [0, 0, {drop}]",
-                "middle of the bottom at the start [m]: it falls a fifth of its height",
+                "centre of the bottom face [m]: the body falls a fifth of its height",
             )
         )
     return lines
 
 
 def _cages(body: MeshMeasures) -> list[str]:
-    aim = body.volume * (ACROSS / body.thickness) ** 3
-    count = int(float(plain(min(max(aim, CELLS[0]), CELLS[1]), 1)))
+    """Return the lines of the table of cages."""
+    target = body.volume * (ACROSS / body.thickness) ** 3
+    count = int(float(plain(min(max(target, CELLS[0]), CELLS[1]), 1)))
     across = body.thickness * (count / body.volume) ** (1 / 3)
     return [
         "[cages]",
         line(
             f"count = {count}",
-            f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}",
+            f"cells; {across:.1f} across the mean thickness of {body.thickness:.2g} m",
         ),
     ]
 
 
 def _falling(body: MeshMeasures) -> list[str]:
-    """Return the tables of a body that falls on the ground."""
+    """Return the lines of the tables of a body that falls on the ground."""
     height = float(body.sides[2])
-    young = SINKING * DENSITY * G * height
-    period = 4 * height / math.sqrt(young / DENSITY)  # of waves along the height
+    young = STIFFNESS * DENSITY * G * height
+    # of a standing quarter wave along the height, with the speed sqrt(E / rho)
+    period = 4 * height / math.sqrt(young / DENSITY)
     fall = math.sqrt(2 * DROP * height / G)
     ground = [
         "[[obstacle]]",
         line(
             'shape = "plane"',
-            "the ground: the body is no beam that lies, so it falls rather than hangs",
+            "the ground; the body is no horizontal beam, so it falls",
         ),
         line("point = [0, 0, 0]", "[m]"),
         line("normal = [0, 0, 1]", "towards the free side"),
         line('response = "penalty"', 'or "reflect", with a restitution'),
         line("friction = 0.5", "Coulomb's coefficient"),
     ]
-    material = _material(young, f"its own weight presses it together by about {100 / SINKING:g}%")
+    material = _material(young, f"its own weight compresses it by about {100 / STIFFNESS:g}%")
     return [*material, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
 
 
 def _clamped(body: MeshMeasures, axis: int) -> list[str]:
-    """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
-    length, thick = float(body.sides[axis]), float(body.sides[2])
-    young = (
-        1.5 * DENSITY * G * length**3 / (thick**2 * SAG)
-    )  # q l^4 / 8 E I = SAG l under its weight
-    period = bending_period(length, thick, young, DENSITY)
-    along = np.eye(3, dtype=int)[axis]
-    point = ", ".join(f"{CLAMPED * each:g}" for each in along)
-    normal = ", ".join(str(-each) for each in along)
+    """Return the lines of the tables of a body that is clamped at an end.
+
+    The body counts as an Euler-Bernoulli beam of full rectangular section.
+    """
+    length = float(body.sides[axis])
+    thickness = float(body.sides[2])
+    # deflection of the end under the weight: q l^4 / 8 E I = SAG l
+    young = 1.5 * DENSITY * G * length**3 / (thickness**2 * SAG)
+    period = bending_period(length, thickness, young, DENSITY)
+    direction = np.eye(3, dtype=int)[axis]
+    point = ", ".join(f"{CLAMPED * component:g}" for component in direction)
+    normal = ", ".join(str(-component) for component in direction)
     region = f"half_space = {{ point = [{point}], normal = [{normal}] }}, relative = true"
     pin = [
-        line("[[pin]]", "the body is long and lies: one end does not move"),
+        line("[[pin]]", "the body is a horizontal beam: an end is clamped"),
         f"region = {{ {region} }}",
     ]
-    material = _material(young, f"its end would sink by about {100 * SAG:g}% of its length")
+    material = _material(young, f"its end sinks by about {100 * SAG:g}% of its length")
     return [*material, "", *_time(PERIODS * period, period), "", *GRAVITY, "", *pin]
 
 
 def _material(young: float, effect: str) -> list[str]:
+    """Return the lines of the table of the material."""
     return [
         "[material]",
         line(f"young_modulus = {plain(young, 1)}", f"[Pa]; {effect}"),
         line(f"density = {plain(DENSITY, 4)}", "[kg/m^3], as water"),
-        line('law = "neo-hookean"', 'a solid; "linear" has the paper\'s springs'),
+        line('law = "neo-hookean"', 'a solid; "linear": the paper\'s springs'),
         line("poisson_ratio = 0.25", "[-]; tissue has 0.45, rubber 0.49"),
     ]
 
 
 def _time(duration: float, period: float) -> list[str]:
-    """Return the table of time for a motion whose slowest part has this period [s]."""
+    """Return the lines of the table of time for a duration [s] and a slowest period [s]."""
     step = float(plain(period / STEPS_A_PERIOD, 1))
     return [
         "[time]",
-        line(f"step = {step:g}", f"[s]; the slowest motion takes about {period:.2g} s"),
+        line(f"step = {step:g}", f"[s]; the slowest motion has a period of about {period:.2g} s"),
         line(f"duration = {step * math.ceil(duration / step):.6g}", "[s]"),
     ]
 
@@ -372,5 +419,5 @@ def line(setting: str, comment: str) -> str:
 
 
 def plain(value: float, digits: int) -> str:
-    """Return a number with so many digits in short TOML notation: 0.12, 3e5."""
+    """Return a number with a number of digits in short TOML notation, for example 3e5."""
     return f"{value:.{digits}g}".replace("e+0", "e")

@@ -1,4 +1,4 @@
-"""``msmpetsc plan``: the cheapest way to simulate a scene to an error of its surface."""
+"""``msmpetsc plan``: find the cheapest options that meet an error of a scene's surface."""
 
 import argparse
 import json
@@ -34,7 +34,8 @@ def run(args: argparse.Namespace) -> int:
     target = args.surface_error
     if not 0 < target < 1:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
-    with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
+    # with --json the table of trials goes to stderr
+    with redirect_stdout(sys.stderr) if args.json else nullcontext():
         plan = size_all(args, target)
         print_size(plan, target)
         command = print_command(args, plan.choice) if plan.met else None
@@ -44,12 +45,13 @@ def run(args: argparse.Namespace) -> int:
             "error": plan.choice.budget.total,
             "command": command,
         }
-        print(json.dumps(record, indent=1, default=str))  # of paths the names
+        # default=str writes paths as text
+        print(json.dumps(record, indent=1, default=str))
     return 0 if plan.met else NOTHING_MEETS
 
 
 def print_command(args: argparse.Namespace, choice: Choice) -> str:
-    """Print and return the command that runs the choice, and write the choice into the scene if asked to."""
+    """Print and return the command that runs the choice; with --write, also write the scene."""
     answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}}
     changes = [word for change in overrides(args.scene, answer) for word in ("--set", change)]
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes])
@@ -61,33 +63,35 @@ def print_command(args: argparse.Namespace, choice: Choice) -> str:
 
 
 def size_all(args: argparse.Namespace, target: float) -> SizePlan:
-    """Run the trials in a temporary folder and print each."""
+    """Run the trials in a temporary folder, print each trial, and return the plan."""
     asked = Asked(target, args.frames, args.cells, args.ranks)
     with (
         tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder,
         closing(Processes()) as processes,
     ):
-        runs = Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
+        # warm processes: only the ratios of the costs matter
+        runs = Bench(Path(folder), processes, warm=True)
         sizer = Sizer(args.scene, runs, asked, print_size_trial)
         print(HEAD, flush=True)
         return sizer.plan()
 
 
 def print_size_trial(trial: SizeTrial | str) -> None:
-    """Print one line for a trial, or a note."""
+    """Print a line for a trial, or a note."""
     if isinstance(trial, str):
         print(trial, flush=True)
         return
     method = trial.method
     goal = "" if method.step_error is None else f"{method.step_error:.1e}"
     print(
-        f"{method.integrator:16} {method.time_step:13.4g} {goal:>10} {trial.cells:8.0f} {trial.cost:10.3g}",
+        f"{method.integrator:16} {method.time_step:13.4g} {goal:>10} "
+        f"{trial.cells:8.0f} {trial.cost:10.3g}",
         flush=True,
     )
 
 
 def print_size(plan: SizePlan, target: float) -> None:
-    """Print the choice with the parts of its error, and what bounds it."""
+    """Print the choice with the parts of its error and its limitations."""
     choice = plan.choice
     print(
         "\ncheapest:"
@@ -102,4 +106,4 @@ def print_size(plan: SizePlan, target: float) -> None:
     for name, error in vars(choice.budget).items():
         print(f"{name:16} {error:9.1e}")
     for bound in plan.bounds:
-        print(f"what bounds it: {bound}")
+        print(f"limited by: {bound}")

@@ -1,4 +1,4 @@
-"""``msmpetsc render``: pictures, films and pages of a result, or of a scene before anything is run."""
+"""``msmpetsc render``: draw pictures, films and pages of a result, or of a scene at rest."""
 
 import argparse
 import re
@@ -26,9 +26,12 @@ from msmpetsc.view.mesh import cut_open, drawn
 from msmpetsc.view.page import write_page
 from msmpetsc.view.sheet import contact_sheet, draw_panels
 
-SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
-STILL = (760, 900)  # [px]: a panel of a scene
-ONLY = {  # options by the endings of what they are for
+# smallest and largest side of a picture [px]; Mesa cannot draw larger pictures
+SIZES = 64, 8192
+# default size of a panel of a scene [px]
+STILL = (760, 900)
+# formats that each option is for
+ONLY = {
     "count": PICTURE_NAMES,
     "size": (*PICTURE_NAMES, *MOVIE_NAMES),
     "speed": MOVIE_NAMES,
@@ -57,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def style_of(args: argparse.Namespace) -> Style:
-    """Return the style of a picture. Raises InputError."""
+    """Return the style that the options describe. Raises InputError."""
     eye = None if args.eye is None else _direction(args.eye)
     if args.speed is not None and not 0 < args.speed < np.inf:
         raise InputError(f"--speed must be above 0, not {args.speed:g}")
@@ -65,13 +68,14 @@ def style_of(args: argparse.Namespace) -> Style:
 
 
 def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
+    """Draw a result as a picture, a page or a film, by the ending of the path."""
     if path.suffix.lower() in PICTURE_NAMES:
         contact_sheet(args.subject, path, args.frames, args.count, style)
         return
     with plain_damage(args.subject), Result(args.subject) as run:
         subject = drawable_of_result(run)
-        everything: Frames = [slice(None)]
-        numbers = frames_of(subject.name, args.frames or everything, len(subject.times))
+        all_frames: Frames = [slice(None)]
+        numbers = frames_of(subject.name, args.frames or all_frames, len(subject.times))
         if path.suffix.lower() in PAGE_NAMES:
             write_page(subject, path, numbers, style)
         else:
@@ -80,10 +84,11 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
 
 
 def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
+    """Draw a scene at rest as a picture or a page, by the ending of the path."""
     refuse_other_format("render", args.subject, (*RESULT_NAMES, *SCENE_NAMES))
     for option in ("frames", "count", "speed"):
         if getattr(args, option) is not None:
-            raise InputError(f"--{option} is for results, and {args.subject} is none")
+            raise InputError(f"--{option} is for results, and {args.subject} is a scene")
     if path.suffix.lower() in MOVIE_NAMES:
         raise InputError(f"{args.subject} has no motion to film: *.html turns it around")
     subject, about = drawable_of_scene(args.subject, args.set)
@@ -100,10 +105,11 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
 
 
 def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
-    """Return what a scene shows, with size and cells in words. Raises InputError."""
+    """Return the drawable of a scene, with its size and cells as text. Raises InputError."""
+    # imported here, as drawing a result needs neither MPI nor compiled kernels
     from mpi4py import MPI
 
-    from msmpetsc.build import build_model  # compiled kernels, which drawing a result needs not
+    from msmpetsc.build import build_model
 
     scene = load_scene(path, changes)
     model = build_model(MPI.COMM_SELF, scene)
@@ -115,14 +121,15 @@ def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[s
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
-    """Return width and height of "960x720"; of films both must be even."""
+    """Return width and height of "960x720", both even, as films require. Raises InputError."""
     if text is None:
         return None
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text, re.ASCII)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not all(SIZES[0] <= side <= SIZES[1] and side % 2 == 0 for side in size):
+    low, high = SIZES
+    if not all(low <= side <= high and side % 2 == 0 for side in size):
         raise InputError(
-            f"--size takes two even numbers from {SIZES[0]} to {SIZES[1]}, like 960x720, not {text!r}"
+            f"--size takes two even numbers from {low} to {high}, like 960x720, not {text!r}"
         )
     return size
 

@@ -1,4 +1,4 @@
-"""``msmpetsc series``: energies, forces and places of probes of a result, a row a frame."""
+"""``msmpetsc series``: write energies, forces and probe positions of a result as CSV."""
 
 import argparse
 import csv
@@ -14,8 +14,8 @@ from msmpetsc.scene.schema import SceneFile, held_by
 from msmpetsc.view.drawable import read_scene
 
 SERIES = (
-    "kinetic", "elastic", "potential", "contact", "self_contact", "momentum", "load", "reaction", "torque", "push",
-    "contact_push", "probe",
+    "kinetic", "elastic", "potential", "contact", "self_contact", "momentum", "load", "reaction",
+    "torque", "push", "contact_push", "probe",
 )  # fmt: skip
 
 
@@ -35,9 +35,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
-    """Yield the columns of the series, the time first: a name with unit, and values (T,).
+    """Yield name with unit and values (T,) of each column, the time first.
 
-    Raises InputError where they are not those of the scene.
+    Raises InputError if the result does not fit its scene.
     """
     yield "time [s]", run.frames.time[:]
     names = {
@@ -49,22 +49,24 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
     }
     for name in filter(run.frames.__contains__, SERIES):
         array = run.frames[name]
-        of_rows = names.get(name, [""])
-        if array.ndim == 3 and array.shape[1] != len(of_rows):
+        row_names = names.get(name, [""])
+        if array.ndim == 3 and array.shape[1] != len(row_names):
             raise InputError(
-                f"{run.path} is damaged: {array.name} has {array.shape[1]} rows for {len(of_rows)} tables"
+                f"{run.path} is damaged: {array.name} has {array.shape[1]} rows for "
+                f"{len(row_names)} tables"
             )
         axes = ("x", "y", "z") if array.ndim > 1 else ("",)
-        values = array[:].reshape(len(array), len(of_rows), len(axes))
-        for row, whose in enumerate(of_rows):
+        values = array[:].reshape(len(array), len(row_names), len(axes))
+        for row, row_name in enumerate(row_names):
             for axis, letter in enumerate(axes):
-                words = " ".join(filter(None, [name, whose, letter]))
+                words = " ".join(filter(None, [name, row_name, letter]))
                 yield f"{words} [{array.unit}]", values[:, row, axis]
 
 
 def series_text(run: Result, scene: SceneFile) -> str:
-    """Return the series as CSV, with a header and one line for each frame. Raises InputError."""
-    columns, text = dict(columns_of(run, scene)), io.StringIO()
+    """Return the series as CSV, with a header and a line for each frame. Raises InputError."""
+    columns = dict(columns_of(run, scene))
+    text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))

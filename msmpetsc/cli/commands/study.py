@@ -1,4 +1,4 @@
-"""``msmpetsc study``: sweep methods over scenes, into one table and a report."""
+"""``msmpetsc study``: sweep methods over scenes, and write a table and a report."""
 
 import argparse
 from pathlib import Path
@@ -18,9 +18,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
         listed = list_study(args.study, folder, args.full)
-        for number, (case, done) in enumerate(
-            listed, 1
-        ):  # the I of --part I/N, where N is the number of cases
+        # the number is the I of --part I/N if N is the number of cases
+        for number, (case, done) in enumerate(listed, 1):
             state = "done" if done else "open"
             print(f"{number:4} {state}  {case.scene}: {case.label}  {shown_command(case)}")
         print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
@@ -28,21 +27,22 @@ def run(args: argparse.Namespace) -> int:
     rows = run_study(
         args.study, folder, full=args.full, jobs=args.jobs, restart=args.restart, part=part
     )
-    if lost := len(failed(swept(as_table(rows)))):  # in maps failing is an answer
+    # a failed case of a map is a result, not a loss
+    if lost := len(failed(swept(as_table(rows)))):
         log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
+    # the study that joins the parts writes the report
     if part:
-        print(part.folder(folder) / "table.csv")  # the study that joins the parts writes the report
+        print(part.folder(folder) / "table.csv")
         return 0
-    from msmpetsc.study.report import (
-        write_report,
-    )  # loads the charts: a second that refused files need not wait
+    # imported here, as loading the charts takes a second
+    from msmpetsc.study.report import write_report
 
     print(write_report(folder))
     return 0
 
 
 def part_of(text: str | None) -> StudyPart | None:
-    """Return the part that "3/16" names, the third of 16. Raises InputError."""
+    """Return the part that "3/16" names, the third of 16; None for None. Raises InputError."""
     if text is None:
         return None
     index, _, count = text.partition("/")

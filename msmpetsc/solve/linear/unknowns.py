@@ -91,7 +91,10 @@ class Unknowns:
         return self.memory.write(vector).reshape(3, self.size)
 
     def to_nodes(self, vector: PETSc.Vec, nodes: Array) -> None:
-        """Copy a vector of unknowns to the free rows of ``nodes`` (l, 3), ghosts too (collective)."""
+        """Copy a vector of unknowns to the free nodes, ghosts included (collective).
+
+        nodes : (l, 3) values; rows of pinned nodes are left alone
+        """
         if self.has_ghosts:
             with GHOSTS:
                 self.scatter.scatter(vector, self.ghost_values)

@@ -85,7 +85,7 @@ class Multigrid:
     def _create_levels(self, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         unknowns, comm = self.unknowns, self.unknowns.comm
         size, everywhere = unknowns.size, grid_indices(unknowns)
-        apart = self.bodies.apart(comm, everywhere)
+        apart = self.bodies.offsets(comm, everywhere)
         ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, max(asked - 1, 1) if asked else None)

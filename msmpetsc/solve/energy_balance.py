@@ -42,17 +42,13 @@ from msmpetsc.solve.integrators.integrator import EnergyBudget, Integrator, Stat
 from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 
-# spurious energy that fails a step, over the largest legitimate energy; explicit
-# substeps near their stability limit oscillate by nearly 2
+# spurious energy that fails a step, over all energy; Verlet may oscillate by nearly 2
 FAILING_GAIN = 3.0
-# spurious energy that is worth a warning, over the largest legitimate energy; visible
-# in a run
+# spurious energy that is worth a warning, over all energy; a viewer may notice more
 NOTABLE_GAIN = 0.01
-# energy that an oscillating step may regain, over the largest legitimate energy; BDF2
-# loses 0.06 in an impact
+# energy that an oscillation may regain, over all energy; BDF2 loses 0.06 in an impact
 CREDIT = 0.1
-# least legitimate energy, over the energy that crushes every spring; rounding may gain
-# less
+# least legitimate energy, over that of crushed springs; rounding may gain less
 FLOOR = 1e-10
 
 

@@ -45,8 +45,7 @@ EVENTS = {
     "cycle": [CYCLE.name],
     "fine": [FINE.name],
 }
-# relative error of a step that is worth a warning; the budget of iterations was far too
-# small
+# relative error of a step that is worth a warning; more iterations are needed
 FAR = 0.3
 
 

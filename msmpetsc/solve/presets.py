@@ -50,8 +50,7 @@ PLAIN = {
     "snes_max_it": "1000",
     **NO_STOP_BY_SIZE,
 }
-# SNES iterations of Newton's method; a hard step needs hundreds
-# (tests/solve/test_recovery.py)
+# most iterations of Newton's method; a hard step needs hundreds (test_recovery.py)
 MANY = "3000"
 # options of the cycle of -pc_type mg
 LATTICE_MULTIGRID = {
@@ -60,8 +59,7 @@ LATTICE_MULTIGRID = {
     "mg_coarse_ksp_type": "preonly",
     "mg_coarse_pc_type": "redundant",
     "mg_coarse_redundant_pc_type": "cholesky",
-    # PETSc's factor runs on the CPU, where the small factor is faster than with
-    # cuSPARSE.
+    # PETSc's factor runs on the CPU, which is faster than cuSPARSE for small matrices.
     "mg_coarse_redundant_pc_factor_mat_solver_type": "petsc",
     # Every PETSc has qmd, and it fills least of the common orderings.
     "mg_coarse_redundant_pc_factor_mat_ordering_type": "qmd",
@@ -157,12 +155,10 @@ PRESETS = {
 
 # type option -> option that fits the preset's type only; a user's type drops it
 BOUND_TO_TYPE = {"pc_type": "pc_factor_mat_solver_type", "ksp_type": "ksp_norm_type"}
-# SNES types that solve with the Jacobian themselves; they take no nonlinear
-# preconditioner
+# SNES types that solve with the Jacobian; they take no nonlinear preconditioner
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
 
-# number of solvers that use each preset option in PETSc's database; users' options are
-# not counted
+# preset option in PETSc's database -> number of solvers that use it
 in_use: Counter[str] = Counter()
 
 

@@ -36,8 +36,7 @@ USUAL = OFTEN_GIVEN.union(*(preset.options for preset in PRESETS.values()))
 
 NO_PART = "no part of this run uses this PETSc option"
 BY_ERROR = "a step ends when its error is below solver.error (--error), or by solver.max_iterations"
-# name and value of an option that PETSc accepts but ignores here, or crashes with ->
-# reason
+# option and value that PETSc ignores here or crashes with -> reason
 NO_USE = {
     r"snes_(rtol|atol|divergence_tolerance|max_funcs|convergence_test|norm_schedule"
     r"|force_iteration) .*": BY_ERROR,

@@ -49,8 +49,7 @@ INTEGRATORS: Integrators = {
     "verlet": Verlet,
     "static": Static,
 }
-# steps between checkpoints; caches of earlier steps are dropped there, so that a
-# resumed run agrees
+# steps between checkpoints; caches are dropped there, so that a resumed run agrees
 REMEMBERED = 20
 
 
@@ -251,8 +250,7 @@ class TimeLoop:
         work = self.monitors.work
         gained = self.state.budget.since_frame
         self.monitors.error(index, time)
-        # An extra last frame starts no new interval, because a longer run would not
-        # store it.
+        # An extra last frame starts no interval: a longer run would not store it.
         if index % self.every == 0:
             self.monitors.work = Work()
             self.state = replace(self.state, budget=replace(self.state.budget, since_frame=0.0))

@@ -42,8 +42,7 @@ from msmpetsc.solve.work import Work
 LOWEST, HIGHEST = -10, 6
 # number of step lengths whose integrators are kept; neighbouring lengths alternate
 KEPT = 4
-# end of a step before an event, over the time of the event; the event must not act in
-# the step yet
+# end of a step before an event, over the event's time; the event must not act yet
 JUST_BEFORE = 1 - 1e-10
 # averages over neighbours in a local error; they remove waves as short as a cell
 SWEEPS = 4
@@ -51,11 +50,9 @@ SWEEPS = 4
 SAVINGS_SHARE = 1 / 8
 # part of an equal share of all credit that any step may spend; the run must advance
 FAIR_SHARE = 0.25
-# largest accepted error, over the allowed error; a slight excess shortens the next step
-# only
+# largest accepted error, over the allowed error; an excess shortens the next step
 EXCESS = 2.0
-# consecutive steps that allow a longer step before the step grows; lengths must not
-# alternate
+# steps in a row that allow a longer step before the step grows; it must not alternate
 CALM = 2
 
 
@@ -387,8 +384,7 @@ class Adaptive(Integrator):
             mass @ (local**2).sum(axis=1),
             mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1),
         ]
-        # At rest, the size of the motion is the displacement expected until the next
-        # frame.
+        # At rest, the size of the motion is the displacement until the next frame.
         coming = t * v
         if not self.control.motion:
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)

@@ -42,11 +42,9 @@ from msmpetsc.solve.work import Work
 
 # most solves of a step for its contact faces; nodes may pass through a thin obstacle
 MOST_SOLVES = 10
-# most solves of a step with the pairs around contacts only; later solves search all
-# pairs
+# most solves with the pairs around contacts only; later solves search all pairs
 MOST_NARROW = 3
-# energy of surface pairs that may be left out, over the energy of the allowed error; it
-# moves x by a hundredth of the allowed error
+# energy of surface pairs left out, over that of the error; x moves by 0.01 of the error
 LEFT_OUT = 1e-4
 
 

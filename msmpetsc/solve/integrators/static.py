@@ -35,11 +35,9 @@ from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.work import Work
 
-# first tau, over the time of sound along the body; slender bodies oscillate ten times
-# as slowly
+# first tau, over the time of sound along the body; slender bodies are slower
 SLENDER = 10.0
-# lowest eigenvalue of M^(-1) tau^2 (Hessian of E) at rest that tau is chosen for; 1
-# with a margin
+# lowest eigenvalue of M^(-1) tau^2 (Hessian of E) that tau aims at; 1 with a margin
 LOWEST = 10.0
 # lowest eigenvalues that need no other tau; another tau needs a new solver
 ACCEPTED_LOWEST = 1.0, 1e3
@@ -49,8 +47,7 @@ HALVING_ITERATIONS = 200
 SMALLEST = 2.0**-10
 # most failed load steps of a state; they bound the cost of a hopeless load
 MOST_FAILURES = 50
-# largest load step that is accepted with inverted cells or many iterations, over the
-# whole load; smaller steps hardly avoid them
+# largest load step accepted in any case, over the whole load; smaller steps hardly help
 SMALL = 2.0**-4
 
 

@@ -42,21 +42,17 @@ from msmpetsc.solve.linear.unknowns import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
-# substep over the stability limit at the start of a step; the Hessian changes within
-# the step
+# substep over the stability limit; the Hessian changes within a step
 SAFETY = 0.8
 # most repetitions of a step; they bound the cost of an unstable step
 RETRIES = 4
-# spurious energy of a step that halves the substeps, over all energy; a fifth of
-# NOTABLE_GAIN
+# spurious energy that halves the substeps, over all energy; a fifth of NOTABLE_GAIN
 GAIN = 2e-3
 # energy that springs may regain after a loss, over all energy; as in the energy balance
 CREDIT = 0.1
-# spurious energy, over the limit of GAIN, that doubles the substeps again; doubled
-# substeps gain 4 to 16 times as much
+# gain that doubles substeps, over the limit; doubled substeps gain 4 to 16 times more
 EASED = 1 / 32
-# most halvings of the substeps because of spurious energy; 32 times the substeps bound
-# the cost
+# most halvings of the substeps; 32 times the substeps bound the cost
 HALVINGS = 5
 # most substeps of a step; more would take hours
 MOST_SUBSTEPS = 1e6
@@ -66,8 +62,7 @@ ROUNDING = 1e-14
 SETTLED = 1e-3
 # most power iterations; later steps continue from the mode
 MOST_ITERATIONS = 100
-# elastic energy of an unstable body, over the energy that crushes every spring; far
-# above any load
+# elastic energy of an unstable body, over that of crushed springs; no load reaches it
 UNSTABLE = 100.0
 
 

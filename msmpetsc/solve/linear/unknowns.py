@@ -23,8 +23,7 @@ from msmpetsc.solve.petsc.events import GHOSTS
 # largest integer of PETSc; its configuration decides between 32 and 64 bits
 LARGEST = int(np.iinfo(PETSc.IntType).max)
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
-# inertia of a static node in multigrid, over its mass; it regularises the block of a
-# flat cell
+# inertia of static nodes in multigrid, over mass; a flat cell has a singular block
 BALLAST = 1e-6
 # memory of ``numbers`` [bytes per node]; forecasts of memory need it
 BYTES_OF_NODE = 8

@@ -15,8 +15,7 @@ from msmpetsc.backend.arrays import Array, Rows
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 
-# most contact nonzeros kept in the coarsest matrix, over those of the present contact;
-# the factor must stay sparse
+# most contact nonzeros kept, over those in use; the factor must stay sparse
 SPARE = 2.0
 
 
@@ -152,8 +151,7 @@ class CoarseContact:
         for p in self.interpolations:
             begin, columns, values = p.getValuesCSR()
             whole = csr_array((values, columns, begin), shape=(len(begin) - 1, p.getSize()[1]))
-            # Unknowns are ordered by coordinate, and coarse nodes interleave their
-            # coordinates.
+            # Unknowns are ordered by coordinate, coarse rows by node.
             rows = slice(None, None, 3) if scalar else slice(self.unknowns.size)
             scalar.append(csr_array(csr_array(whole[rows])[:, ::3]))
         return scalar

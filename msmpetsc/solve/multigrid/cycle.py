@@ -37,19 +37,15 @@ from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.events import FINE
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
-# most nodes of the coarsest grid, whose matrix is factored; a coarser grid loses thin
-# limbs
+# most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
 COARSEST = 800
-# most surface points in contact that the finest smoother couples; its dense matrix must
-# stay small
+# most surface points that the finest smoother couples; its matrix is dense
 POINTS = 200
-# lower end of a smoother's range, over the largest eigenvalue of D^-1 H; the coarse
-# grid damps the modes below
+# lower end of a smoother's range, over its upper end; coarse grids damp the rest
 RANGE_START = 0.25
 # factor on an eigenvalue estimated by ten CG iterations; the estimate is too small
 SAFETY = 1.1
-# relative increase of coarse diagonals with and without free bodies; see
-# ``_raise_diagonal``
+# increase of coarse diagonals without and with free bodies; see ``_raise_diagonal``
 RAISED = 1e-8, 1e-5
 # first release of PETSc that restricts by the transpose of a square matrix
 TRANSPOSES_SQUARE = (3, 19)
@@ -132,8 +128,7 @@ class Multigrid:
         contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
         surface : Hessian of the surface's contact with itself
         """
-        # The stiffest points couple nodes; the remaining points add to the diagonal
-        # blocks.
+        # The stiffest points couple nodes, the remaining points add to diagonal blocks.
         joined, remaining = surface.split(self.fine.compliance, POINTS) if surface else (None, None)
         contact = contact + remaining.blocks if remaining else contact
         self.fine.update(q, contact, joined)
@@ -226,8 +221,7 @@ class Multigrid:
     def _product_options(self, matrix: PETSc.Mat) -> Iterator[tuple[str, str]]:
         """Yield our defaults for PETSc's options of the product P^T H P."""
         given = PETSc.Options().getAll()
-        # PETSc's default sums messages in their order of arrival, which is not
-        # reproducible.
+        # PETSc's default sums messages in the order of arrival, which varies.
         if matrix.comm.size > 1 and "matptap_via" not in given:
             yield "matptap_via", "allatonce"
         # The product of PETSc 3.26 on an H100 is wrong: it is 0.

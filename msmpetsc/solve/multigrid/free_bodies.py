@@ -43,8 +43,7 @@ class Bodies:
         ijk : (l, 3) grid indices of the local nodes
         """
         farthest = comm.allreduce(int(ijk.max(initial=0)), MPI.MAX)
-        # Twice the extent, a power of two, separates the bodies on coarser grids as
-        # well.
+        # A power of two above the extent separates bodies on coarser grids as well.
         room = 2 << farthest.bit_length()
         return np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
 

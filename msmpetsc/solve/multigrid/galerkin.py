@@ -29,11 +29,9 @@ from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
-# position code of a pinned node; a free node at (i, j, k) in its coarse cell has 9 i +
-# 3 j + k
+# code of a pinned node; a node at (i, j, k) in its coarse cell has 9 i + 3 j + k
 PINNED = 27
-# positions of the upper triangle in a 3 x 3 block, and of the diagonal in the upper
-# triangle
+# the upper triangle in a 3 x 3 block, and the diagonal in the upper triangle
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
 # pairs (36, 2) of corners: the upper triangle of a cell's matrix
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])
@@ -68,8 +66,7 @@ class Products(NamedTuple):
 
 
 WEIGHTS = _weights()
-# products of a spring, at 28 times the code of its first end plus the code of its
-# second end
+# products of a spring, at 28 times the code of an end plus that of the other end
 OF_SPRINGS = Products.of((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))
 # products of a node, at its code
 OF_NODES = Products.of(WEIGHTS)

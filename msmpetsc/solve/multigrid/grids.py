@@ -17,8 +17,7 @@ from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 
-# most nodes of a coarse grid, over the finer grid's; a larger grid costs more than it
-# helps
+# most nodes of a coarse grid, over the finer grid's; a larger grid does not pay
 SHRINK = 0.7
 
 
@@ -43,8 +42,7 @@ def grid_indices(unknowns: Unknowns) -> Indices:
     nodes, keys = to_host(lattice.nodes), lattice.table.keys
     if not len(nodes):
         return np.empty((0, 3), np.int64)
-    # The first owned node of each node's body is the origin. A ghost shares a body with
-    # an owned node, because a spring joins them.
+    # The origin is an owned node: a spring joins each ghost with an owned node.
     first = np.maximum(lattice.first_of_body[lattice.body] - lattice.table.first, 0)
     steps: Indices = np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
     return decode_morton(keys[first]) + steps

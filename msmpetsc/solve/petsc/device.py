@@ -57,8 +57,7 @@ def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
     # PETSc takes the same GPU out of several.
     cupy.cuda.Device(PETSc.COMM_WORLD.rank % cupy.cuda.runtime.getDeviceCount()).use()
     if GPU_AWARE_MPI not in PETSc.Options().getAll():
-        # If MPI is not GPU-aware, PETSc stops at the first use of the device. PETSc has
-        # read its options already, so that only the variable still counts.
+        # An MPI without GPU support stops PETSc. PETSc has read its options already.
         ctypes.c_bool.in_dll(petsc_library(), GPU_AWARE_MPI).value = False
     send: Callable[[Array], Array] = cupy.asarray
     return send
@@ -85,8 +84,7 @@ def missing_cuda() -> str | None:
         return f"{error.name or 'CuPy'} cannot be imported; pip install 'msmpetsc[cuda]' brings it"
     try:
         return None if cupy.cuda.runtime.getDeviceCount() else "no GPU is seen"
-    # A missing or old driver or library raises errors of CuPy, the CUDA runtime or the
-    # loader.
+    # A missing or old driver raises errors of CuPy, the CUDA runtime or the loader.
     except Exception as error:
         return f"no GPU is seen: {str(error).splitlines()[0]}"
 

@@ -11,12 +11,10 @@ from petsc4py import PETSc
 SETUP, STEPS, OUTPUT = (PETSc.Log.Stage(name) for name in ("set-up", "steps", "output"))
 # reference solves for true errors; the times of the run leave them out
 REFERENCE = PETSc.Log.Stage("reference")
-# -log_view shows a visible stage that never begins as Unknown. PCMPI is PETSc's own
-# stage of -mpi_linear_solver_server.
+# -log_view calls an unused visible stage Unknown; PCMPI is PETSc's own stage
 for unused in REFERENCE, PETSc.Log.Stage("PCMPI"):
     unused.visible = False
-# numbers of the stages of a run; 0 is PETSc's main stage, before set-up and after the
-# last frame
+# stages of a run; 0 is PETSc's main stage, before the set-up and after the last frame
 OF_THE_RUN = (0, SETUP.id, STEPS.id, OUTPUT.id)
 
 GRADIENT = PETSc.Log.Event("msmpetsc gradient")

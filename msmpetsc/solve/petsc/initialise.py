@@ -39,8 +39,7 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
     Raises InputError if an options file cannot be read or PETSc refuses a value at its start.
     """
-    # PETSc reads option files on rank 0 only; an error there would block the other
-    # ranks.
+    # Only rank 0 of PETSc reads option files: its error would block the other ranks.
     on_root(comm, lambda: _check_words(words))
     failed = None
     with _captured_stderr() as text:

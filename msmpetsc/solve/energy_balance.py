@@ -8,8 +8,7 @@ If the energy is convex, an exactly solved step of implicit Euler satisfies
 - T is the kinetic energy of the free nodes.
 - C is the contact energy. Both sides take the obstacles at their positions at the step's end.
 - q'_n is q_n with the anchored nodes at their prescribed positions at the step's end.
-- W bounds the work of friction of moving obstacles and adds the work of impacts: impulse times
-  obstacle velocity.
+- W bounds the work of moving obstacles: by friction, and by impacts as impulse times velocity.
 
 Spurious energy is the excess of the left side, less its later dissipation. Messages call it energy
 from nowhere. Energy of nodes that rebound after the solve enters the balance of the next step,
@@ -54,12 +53,10 @@ FLOOR = 1e-10
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies [J] of a body at one time.
+    """Energies [J] and momentum (3,) [kg m/s] of a body at a given time.
 
-    kinetic  : of all nodes
-    free     : kinetic energy of the nodes without prescribed displacement
-    momentum : (3,) [kg m/s]
-    touch    : contact of the surface with itself
+    free  : kinetic energy of the nodes without prescribed displacement
+    touch : contact of the surface with itself
     """
 
     kinetic: float
@@ -72,7 +69,7 @@ class Energies:
 
     @property
     def inner(self) -> float:
-        """Return the energy [J] without the kinetic energy of anchored nodes and without loads."""
+        """Return the kinetic energy of the free nodes plus elastic and contact energy [J]."""
         return self.free + self.elastic + self.contact + self.touch.energy
 
 
@@ -138,7 +135,7 @@ class EnergyBalance:
         FAILING_GAIN times the largest legitimate energy.
         """
         result, after = integrator.advance(before, time)
-        budget = self._examine(before, result, after, time, integrator.time_step)
+        budget = self._budget_after(before, result, after, time, integrator.time_step)
         if before.history is not None and self._history_gains(
             before, result, after, time, integrator.time_step
         ):
@@ -179,7 +176,7 @@ class EnergyBalance:
         gained = ended - start - work - struck
         return bool(gained > NOTABLE_GAIN * max(start + max(work, 0.0), self.floor))
 
-    def _examine(
+    def _budget_after(
         self, before: State, result: StepResult, after: State, time: float, time_step: float
     ) -> EnergyBudget:
         """Return the energy budget after a step (collective). Raises StepFailed."""
@@ -199,7 +196,7 @@ class EnergyBalance:
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
-        budget = self._entered(before.budget, solved, ended, sums, bounces)
+        budget = self._updated(before.budget, solved, ended, sums, bounces)
         if budget.gained > FAILING_GAIN * budget.put_in:
             fallback = ', or safety.on_failure = "fallback"'
             if self.environment.obstacles.exchanges:
@@ -214,7 +211,7 @@ class EnergyBalance:
         self.known = after.q, ended
         return budget
 
-    def _entered(
+    def _updated(
         self, budget: EnergyBudget, solved: Energies, ended: Energies, sums: Floats, bounces: bool
     ) -> EnergyBudget:
         """Return the budget after a step.

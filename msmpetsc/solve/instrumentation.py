@@ -50,12 +50,10 @@ FAR = 0.3
 
 
 class TrueErrors:
-    """Measure true errors of steps against steps solved to rounding.
-
-    The times of the run leave the reference solves out.
+    """Measure true errors of steps against steps solved to rounding, which are not timed.
 
     stepper   : solver of the run that the reference solver was made for
-    reference : solver of the reference steps; None until the first is needed
+    reference : solver of the reference steps
     """
 
     def __init__(self) -> None:
@@ -106,7 +104,7 @@ class TrueErrors:
 
 
 def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
-    """Return |x - x*|_M [m kg^(1/2)] and g(x) - g* (collective)."""
+    """Return |x - x*|_M and g(x) - g* (collective)."""
     functional, vector = reference.functional, reference.functional.vectors.take()
     reference.unknowns.from_nodes(x - exact, vector)
     distance = functional.norm(vector)
@@ -133,15 +131,13 @@ def times(comm: MPI.Comm, before: dict[str, float]) -> dict[str, float]:
 
 
 class Monitors:
-    """Watch the frames of a run and warn once of each kind of trouble.
+    """Watch the frames of a run and warn once of each kind of trouble, alike on all ranks.
 
-    All ranks warn alike; only rank 0 prints.
-
-    work        : work of the steps since the frame stored before
-    frames      : frames with inverted cells
-    now, most   : inverted cells in the last frame, and their maximum over the frames
-    far         : frames with a step far from its solution; ``worst_error`` is the largest error
-    gaining     : steps with spurious energy; ``worst_gain`` is its largest share of all energy
+    work      : work of the steps since the frame stored before
+    frames    : frames with inverted cells
+    now, most : inverted cells in the last frame, and their maximum over the frames
+    far       : frames with a step far from its solution; ``worst_error`` is the largest error
+    gaining   : steps with spurious energy; ``worst_gain`` is its largest share of all energy
     """
 
     state: ClassVar[dict[str, Range]] = {

@@ -33,13 +33,10 @@ TakeStep = Callable[[State, float], tuple[StepResult, State]]
 class Recovery:
     """Take the steps of a run, and repeat failed steps as ``safety.on_failure`` says.
 
-    make      : makes an integrator
-    balance   : checks each step of the spare integrators
-    take      : takes a step as the scene defines it
-    spare     : number of halvings -> integrator of that step length
-    recovered : number of recovered steps
-    level     : halvings that the next step starts with, because hard moments last
-    deepest   : most halvings of the step in progress
+    take    : takes a step as the scene defines it
+    spare   : number of halvings -> integrator of that step length
+    level   : halvings that the next step starts with, because failures persist
+    deepest : most halvings of the step in progress
     """
 
     state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
@@ -49,15 +46,10 @@ class Recovery:
         self.make, self.balance, self.take = make, balance, take
         self.on_failure, self.time_step = scene.safety.on_failure, scene.time.step
         self.spare: dict[int, Integrator] = {}
-        self.recovered = 0
-        self.level = 0
-        self.deepest = 0
+        self.recovered = self.level = self.deepest = 0
 
     def step(self, state: State, time: float) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time`` [s], if necessary by recovery (collective).
-
-        Raises StepFailed.
-        """
+        """Take or recover the step that ends at ``time`` [s] (collective). Raises StepFailed."""
         # A checkpoint of a scene with "substep" may resume with another ``on_failure``.
         if not self.level or self.on_failure != "substep":
             try:
@@ -88,7 +80,7 @@ class Recovery:
     def _in_pieces(self, state: State, time: float, level: int) -> tuple[StepResult, State]:
         """Take a step in 2^level pieces; halve the pieces that fail.
 
-        The next step starts at the deepest level of this step, or one level up without failures.
+        The next step starts at the deepest level of this step, or, if no piece failed, a level up.
         """
         self.deepest = level
         pieces = 2**level
@@ -134,8 +126,7 @@ class Recovery:
     def _new(self, short: float) -> Integrator:
         """Return a new integrator of steps of ``short`` [s].
 
-        The integrator is implicit Euler, unless the scene's is static or Verlet. A fallback has no
-        Verlet, because Verlet has no solver to replace.
+        Implicit Euler replaces BDF2, and in a fallback also Verlet.
         """
         is_fallback = self.on_failure == "fallback"
         kept = ("static",) if is_fallback else ("static", "verlet")

@@ -85,8 +85,7 @@ class TimeLoop:
     """Take the steps of a run; as a context manager, destroy its PETSc objects on leaving.
 
     state  : state after the last step
-    step   : number of steps taken
-    steps  : number of steps of the whole run
+    step   : number of steps taken, of ``steps``
     stored : number of frames of the whole run; ``stored_until(step)`` of its first steps
     saved  : checkpoint of the last ``REMEMBERED``-th step, from which the run may resume
     """
@@ -132,10 +131,7 @@ class TimeLoop:
         self.saved = Checkpoint()
 
     def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
-        """Return the integrator of a scene's tables (collective).
-
-        prefix : prefix of its PETSc options
-        """
+        """Return the integrator of a scene's tables, with its prefix of options (collective)."""
         return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, prefix)
 
     def frames(self) -> Iterator[Frame]:
@@ -241,10 +237,7 @@ class TimeLoop:
         refuse_unused(self.comm, not self.awaits_solve, prefixes)
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
-        """Return the frame of positions q (l, 3) [m] and the work since the frame before.
-
-        Collective.
-        """
+        """Return the frame at q (l, 3) [m] with the work since the frame before (collective)."""
         time = index * self.time_step
         energies = self.balance.energies
         work = self.monitors.work
@@ -405,11 +398,7 @@ class Forces:
         return held
 
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
-        """Return the contact forces [N] on this rank's nodes.
-
-        "push" has the forces of the obstacles (o, 3), "contact_push" the forces of the surface's
-        contact on each body (b, 3).
-        """
+        """Return the contact forces [N] of obstacles (o, 3) and on bodies (b, 3) of this rank."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
         push = np.zeros((len(self.keys), 3))
         for state in contact.states if contact else ():

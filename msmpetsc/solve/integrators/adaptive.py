@@ -120,11 +120,8 @@ class StepControl:
 
     A step of a level is 2^level times as long as the scene's step.
 
-    order           : order of the integrator
     asked           : error tolerance of the trajectory, relative to the size of the motion
     step, duration  : length of a step of level 0, and of the run [s]
-    lowest, highest : bounds of the level
-    level           : level of the next step
     calm            : consecutive steps that would have allowed a longer step
     motion          : size of the motion so far [m]
     passed          : mean of the motion's size over the duration [m], later steps counted as 0
@@ -237,12 +234,9 @@ class Adaptive(Integrator):
     A state has the velocity (q_n - q_(n-1)) / t with the scene's step t. Its time may lie beyond
     the scene's step, at the end of a longer step. Its history is the start of the last step.
 
-    make    : makes an integrator of a fixed step length
-    balance : checks the energy of each step
-    kept    : level -> integrator; the integrator used last comes last
-    tick    : time of the state (Ticks)
-    last    : level of the last step
-    mass    : [kg] of all nodes
+    kept : level -> integrator; the integrator used last comes last
+    tick : time of the state (Ticks)
+    last : level of the last step
     """
 
     looks_back = True
@@ -316,10 +310,7 @@ class Adaptive(Integrator):
         return replace(total, time_error=self.control.estimate), state
 
     def _within(self, total: StepResult, state: State, remaining: float, time: float) -> StepResult:
-        """Interpolate the result within the last step.
-
-        remaining : part of the step between ``time`` and its end
-        """
+        """Return the result at ``time``, the ``remaining`` part of the last step before its end."""
         q, v = state.q, state.velocity(self.time_step)
         if remaining > 0 and state.history:
             q, v = between(*state.history, q, v, self._length(self.last), 1 - remaining)
@@ -356,10 +347,7 @@ class Adaptive(Integrator):
                 return self._taken(replace(result, cost=cost), before, after, level)
 
     def _begun(self, state: State, level: int, restarts: bool) -> State:
-        """Return the state from which a step of a level starts.
-
-        restarts : whether an event at its start makes the history useless
-        """
+        """Return the state from which a step of a level starts; ``restarts`` drops the history."""
         v = state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:

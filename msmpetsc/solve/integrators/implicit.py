@@ -61,8 +61,6 @@ class ContactFaces:
     the step is solved again. This replaces a broad phase at each iterate.
 
     q, y       : (l, 3) [m] as in StepProblem
-    time       : end of the step [s]
-    time_step  : length of the step [s]
     before     : (o, l) faces at the start of the step; None: the nearest faces
     fixed      : (l,) bool, nodes that are not unknowns
     q_before   : (l, 3) [m] positions one step before q, for BDF2
@@ -123,11 +121,10 @@ class ContactFaces:
         return result
 
     def compare(self, x: Positions, left_out: float) -> None:
-        """Compare the contacts of the last solve with those at its solution, and update them.
+        """Update the contacts from the solution x (l, 3) [m] of the last solve.
 
         Raises StepFailed if the faces do not settle in MOST_SOLVES solves.
 
-        x        : (l, 3) [m] solution
         left_out : [J] energy of surface pairs at x that may be left out
         """
         crossed, pressing = self._crossed(x), self.environment.obstacles.pressing

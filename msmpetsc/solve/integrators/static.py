@@ -54,10 +54,8 @@ SMALL = 2.0**-4
 class LoadSteps:
     """Choose the shares of a load that are tried in turn.
 
-    reached  : share of the last equilibrium
-    size     : size of the next load step
-    count    : number of accepted load steps
-    failures : number of failed load steps
+    reached : share of the last equilibrium
+    count   : number of accepted load steps
     """
 
     def __init__(self) -> None:
@@ -80,10 +78,7 @@ class LoadSteps:
         self.count += 1
 
     def halve(self, failure: StepFailed) -> None:
-        """Halve the load step after a failure.
-
-        Raises StepFailed if the load step is too small, or after MOST_FAILURES failures.
-        """
+        """Halve the load step after a failure. Raises StepFailed if that cannot help."""
         self.size = 0.5 * (self.share - self.reached)
         self.failures += 1
         if self.size < SMALLEST or self.failures > MOST_FAILURES:
@@ -99,10 +94,8 @@ class LoadPath:
     base      : (l, 3) [m] positions of the state before
     target    : (l, 3) [m] prescribed positions at the whole load; None without anchors
     known     : shares and positions (l, 3) [m] of the last two equilibria
-    problem   : problem of the last share
     sides     : (o, l) contact faces of the last share
     displaced : whether the state before is an initial state other than the rest shape
-    inverted  : number of cells that were inverted before
     holding   : holding force r (owned, 3) [N]; None until a share needs the force
     """
 
@@ -127,8 +120,7 @@ class LoadPath:
     def try_share(self, steps: LoadSteps) -> StepResult:
         """Return the equilibrium of the share to try.
 
-        Raises StepFailed if there is no equilibrium, or if it has inverted cells that smaller load
-        steps may avoid.
+        Raises StepFailed if there is none, or if smaller load steps may avoid its inverted cells.
         """
         share = steps.share
         q = self.known[-1][1]
@@ -173,10 +165,7 @@ class LoadPath:
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:
-        """Return the first guess (l, 3) [m]: the better, by g, of two.
-
-        The candidates are the last equilibrium and the extrapolation of the last two equilibria.
-        """
+        """Return the last equilibrium or an extrapolation (l, 3) [m], whichever has the lower g."""
         (share_before, before), (reached, q) = self.known[0], self.known[-1]
         if reached == share_before:
             return q

@@ -70,14 +70,12 @@ class Verlet(Integrator):
     """Take steps by the velocity Verlet method; ``time.substep`` may only shorten its substeps.
 
     elastic      : (owned, 3) grad E [N] without contact
-    work         : [J] of a step, on this rank's nodes: work of frictionless obstacles, of varying
-        loads and of anchors
-    springs_work : [J] of a step that the springs of this rank's nodes absorb
+    work         : [J] of a step: work of obstacles, varying loads and anchors on this rank's nodes
+    springs_work : [J] of a step: work that the springs of this rank's nodes absorb
     gained       : [J] spurious energy of the springs so far, less its dissipation; negative: credit
     halvings     : halvings of the substeps because of spurious energy
     end          : end time of the step [s]
     known        : positions (l, 3) [m] that ``gradient`` and the highest frequency belong to
-    anchors      : number of acting anchors
     most         : elastic energy [J] of an unstable body
     """
 
@@ -335,10 +333,7 @@ class Verlet(Integrator):
             self.highest.hold(self.fixed)
 
     def _pushed(self, start: float, time: float) -> float:
-        """Return a bound on the obstacles' part of omega^2 [1/s^2] until ``time`` (collective).
-
-        The bound is Weyl's: the largest contact stiffness over the mass of a node.
-        """
+        """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
         fall = self.environment.forces.at(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
@@ -349,10 +344,7 @@ class Verlet(Integrator):
         return float(self.comm.allreduce(squared, MPI.MAX))
 
     def _count(self, squared: float) -> int:
-        """Return the least number of substeps below the limit 2 / omega. Raises StepFailed.
-
-        squared : omega^2 [1/s^2]
-        """
+        """Return the least number of substeps for omega^2 [1/s^2]. Raises StepFailed."""
         limit = SAFETY * 2 / np.sqrt(squared) if squared > 0 else np.inf
         if limit < self.substep < np.inf:
             log.warning(
@@ -391,10 +383,8 @@ class HighestMode:
         self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
 
     def hold(self, fixed: Mask) -> None:
-        """Set the ``fixed`` nodes (owned,) bool and restart from a mixture of modes (collective).
-
-        The mixture does not depend on the number of ranks.
-        """
+        """Set the ``fixed`` nodes (owned,) and start from a vector of all modes (collective)."""
+        # The vector must not depend on the number of ranks.
         self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
         self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))

@@ -38,7 +38,6 @@ class Unknowns:
     total   : number of free nodes on all ranks
     inertia : (owned,) [kg] mass in the residual; 0 for statics
     ballast : (owned,) [kg] mass in multigrid; small but positive for statics
-    static  : whether the steps are equilibria
     memory  : memory of PETSc's vectors, on the CPU or the GPU
 
     Raises InputError if there are more unknowns than PETSc can number.
@@ -90,10 +89,7 @@ class Unknowns:
         return self.memory.write(vector).reshape(3, self.size)
 
     def to_nodes(self, vector: PETSc.Vec, nodes: Array) -> None:
-        """Copy a vector of unknowns to the free nodes, ghosts included (collective).
-
-        nodes : (l, 3) values; rows of pinned nodes are left alone
-        """
+        """Copy a vector of unknowns to the free rows, with ghosts, of (l, 3) (collective)."""
         if self.has_ghosts:
             with GHOSTS:
                 self.scatter.scatter(vector, self.ghost_values)
@@ -195,10 +191,7 @@ def refuse_unknowns(nodes: int) -> None:
 
 
 def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
-    """Raise InputError if a rank has more nonzeros than PETSc can count (collective).
-
-    own : number of nonzeros of this rank
-    """
+    """Raise InputError if a rank has more nonzeros, ``own`` of this rank, than PETSc can count."""
     most = comm.allreduce(own, MPI.MAX)
     if most > LARGEST:
         raise InputError(

@@ -1,7 +1,4 @@
-"""Single-precision products with the matrices of coarse levels, on the CPU.
-
-PETSc's AIJ has double precision only.
-"""
+"""Single-precision products with the matrices of coarse levels on the CPU, which PETSc lacks."""
 
 from typing import NamedTuple
 
@@ -109,11 +106,7 @@ class CoarseOperator:
 
 @njit()
 def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
-    """Copy the values of the blocks from an AIJ.
-
-    length : (n,) nonzeros in a scalar row of each block row
-    given  : values of the AIJ
-    """
+    """Copy the blocks from the values of an AIJ with ``length`` (n,) nonzeros per scalar row."""
     for i in range(len(blocks.begin) - 1):
         for k in range(blocks.begin[i], blocks.begin[i + 1]):
             for r in range(3):

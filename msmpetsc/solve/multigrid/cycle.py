@@ -63,16 +63,15 @@ class Level:
 class Multigrid:
     """PCMG of a lattice and a time step, with its hierarchy. All methods are collective.
 
-    Raises InputError for options that do not fit the lattice.
-
     bodies : bodies of the lattice, each with its own coarse grids
     fine   : operator of the finest level
     pc     : the PCMG, with options of the ``prefix``
     levels : coarse levels, the finest first
     coarse : single-precision products of all coarse levels but the last; empty on a GPU
     bounds : largest eigenvalue of D^-1 H of each level but the coarsest, the finest level first
-    sizes  : nodes and nonzeros of all levels, the finest first; empty before ``update``. The finest
-        level is not assembled: its nonzeros are those of an assembled matrix
+    sizes  : nodes and nonzeros of all levels, the finest first, as if all were assembled
+
+    Raises InputError for options that do not fit the lattice.
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -331,9 +330,6 @@ class ProjectedHessian:
     H belongs to the positions of the last ``update`` and is positive definite.
 
     products   : number of products so far
-    elastic    : projected Hessian of E; None before ``update``
-    contact    : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
-    joined     : contact of the surface that couples nodes
     inverse    : (m, 9) D^-1 [1/kg]
     compliance : (owned,) [m/N] estimated compliance of a node at rest
     """
@@ -430,7 +426,7 @@ def apply_blocks(first: int, count: int, step: int, x: Rows, inverse: Array, y: 
 class FreeNodes(NamedTuple):
     """Terms of the diagonal blocks of H.
 
-    free    : (m,) free nodes
+    free    : (m,) numbers of the free nodes
     mass    : (owned,) [kg]
     contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
     t2      : t^2 [s^2]

@@ -37,10 +37,8 @@ class Bodies:
     def offsets(self, comm: MPI.Comm, ijk: Indices) -> Indices:
         """Return grid offsets (l,) along the first axis that separate the bodies (collective).
 
-        With the offsets, no two bodies share a coarse cell. Pinned nodes have offset 0. If the grid
-        indices have no room, all offsets are 0.
-
-        ijk : (l, 3) grid indices of the local nodes
+        Shifted bodies share no coarse cell. Pinned nodes have offset 0. If the grid indices (l, 3)
+        have no room, all offsets are 0.
         """
         farthest = comm.allreduce(int(ijk.max(initial=0)), MPI.MAX)
         # A power of two above the extent separates bodies on coarser grids as well.

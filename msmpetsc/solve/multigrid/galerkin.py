@@ -86,12 +86,7 @@ class ByCell(NamedTuple):
 
     @classmethod
     def of(cls, cells: Indices, keys: Indices, code: Indices, which: Indices) -> "ByCell":
-        """Return items sorted by their coarse cells.
-
-        cells : (n,) key of the coarse cell of each item
-        keys  : (c,) keys of all coarse cells, ascending
-        which : (n,) number of each item
-        """
+        """Return items (n,) sorted by their cells' keys (n,), given all keys (c,) ascending."""
         by_cell = np.argsort(cells, kind="stable")
         start = np.searchsorted(cells[by_cell], keys, side="left")
         start = np.append(start, len(cells)).astype(np.int32)
@@ -166,10 +161,7 @@ class GalerkinSum:
         self.matrix = self._create_matrix(grid, first, second, upper)
 
     def _pairs(self, grid: CoarseGrid, keys: Indices) -> tuple[Indices, Indices, Indices]:
-        """Return the pairs of coarse nodes that have a block, and the blocks of each cell.
-
-        The pairs are global numbers (b,), (b,). The blocks are (c, 36), -1 if there is none.
-        """
+        """Return the pairs of nodes (b,), (b,) with a block, and each cell's blocks (c, 36)."""
         number = grid.table.find(encode_morton(decode_morton(keys)[:, None, :] + CORNERS))
         first, second = number[:, PAIRS[:, 0]], number[:, PAIRS[:, 1]]
         exists = (first >= 0) & (second >= 0)
@@ -184,11 +176,7 @@ class GalerkinSum:
     def _create_matrix(
         self, grid: CoarseGrid, first: Indices, second: Indices, upper: Indices
     ) -> PETSc.Mat:
-        """Return the matrix with preallocated blocks (collective).
-
-        first, second : (b,) global numbers of the pairs of nodes
-        upper         : pairs of different nodes, whose transposed blocks are set as well
-        """
+        """Return the matrix with blocks of the pairs; ``upper`` adds transposes (collective)."""
         comm = self.unknowns.comm
         refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
         matrix = PETSc.Mat().create(comm=comm)

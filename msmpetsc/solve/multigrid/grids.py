@@ -23,10 +23,7 @@ SHRINK = 0.7
 
 @dataclass(frozen=True)
 class CoarseGrid:
-    """Nodes of a coarse level.
-
-    table : Morton keys of the nodes; their order numbers the nodes over all ranks
-    """
+    """Nodes of a coarse level, numbered over all ranks by their Morton keys ``table``."""
 
     table: SortedKeys
 

@@ -28,8 +28,7 @@ GPU_AWARE_MPI = "use_gpu_aware_mpi"
 def choose(comm: MPI.Comm, device: str | None) -> None:
     """Set the matrix type of runs from ``--device`` (collective).
 
-    Raises InputError if ``--device`` and ``-mat_type`` contradict each other, or if the device is
-    not available.
+    Raises InputError if ``-mat_type`` contradicts it, or if the device is not available.
     """
     mat_type = PETSc.Options().getAll().get(OPTION)
     if device and mat_type is not None and (mat_type in ON_GPU) != (device == "cuda"):
@@ -90,10 +89,7 @@ def missing_cuda() -> str | None:
 
 
 class Memory:
-    """Access to PETSc's vectors and matrices in CPU memory.
-
-    vec_type, mat_type : PETSc's types of objects in this memory
-    """
+    """Access to PETSc's vectors and matrices in CPU memory, with PETSc's names of their types."""
 
     vec_type, mat_type = PETSc.Vec.Type.STANDARD, PETSc.Mat.Type.AIJ
 
@@ -153,7 +149,7 @@ class CudaMemory(Memory):
 
 
 def view(pointer: int, size: int) -> Floats:
-    """Return foreign GPU memory as an array (size,), valid as long as the memory."""
+    """Return GPU memory owned by PETSc as an array (size,), valid as long as the memory."""
     import cupy
 
     numbers: Floats = cupy.empty(0)

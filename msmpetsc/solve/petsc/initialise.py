@@ -97,10 +97,7 @@ def _check_lines(where: str, lines: list[str]) -> None:
 
 @contextmanager
 def _captured_stderr() -> Iterator[list[str]]:
-    """Capture the standard error of the process, C code included, during the block.
-
-    The block's end fills the text into the list.
-    """
+    """Capture the standard error of the process, C code included; fill it in after the block."""
     text = [""]
     sys.stderr.flush()
     kept = os.dup(2)

@@ -34,10 +34,7 @@ def total_iterations(ksp: PETSc.KSP) -> int:
 
 
 def dense_pointer(matrix: PETSc.Mat) -> int:
-    """Return the address of this rank's part of a dense matrix (MatDenseGetArrayAndMemType).
-
-    The address may lie on a GPU.
-    """
+    """Return the address, on CPU or GPU, of a local dense matrix (MatDenseGetArrayAndMemType)."""
     library = petsc_library()
     handle, array, kind = ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
     library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))

@@ -43,11 +43,9 @@ def options_of(words: Sequence[str]) -> dict[str, str]:
 
 
 def words_of(options: str | Mapping[str, Any]) -> list[str]:
-    """Return options given in Python as a list of words.
+    """Return options given in Python as a list of words. Raises InputError for non-options.
 
     options : "-ksp_rtol 1e-3 -ksp_view" or {"ksp_rtol": 1e-3, "ksp_view": None}
-
-    Raises InputError for anything that is not an option.
     """
     try:
         words = shlex.split(options) if isinstance(options, str) else _words_of_mapping(options)

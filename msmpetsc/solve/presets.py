@@ -44,14 +44,14 @@ CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_
 JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
 # no stop by the length of the correction; the error alone ends a step or a line search
 NO_STOP_BY_SIZE = {"snes_stol": "0"}
-PLAIN = {
+LOCAL_GLOBAL = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "basic",
     "snes_max_it": "1000",
     **NO_STOP_BY_SIZE,
 }
 # most iterations of Newton's method; a hard step needs hundreds (test_recovery.py)
-MANY = "3000"
+NEWTON_ITERATIONS = "3000"
 # options of the cycle of -pc_type mg
 LATTICE_MULTIGRID = {
     "mg_levels_ksp_type": "chebyshev",
@@ -67,7 +67,7 @@ LATTICE_MULTIGRID = {
     "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",
 }
 NEWTON = {
-    "snes_max_it": MANY,
+    "snes_max_it": NEWTON_ITERATIONS,
     **JACOBI_CG,
     "ksp_rtol": "3e-2",
     **LATTICE_MULTIGRID,
@@ -133,13 +133,13 @@ PRESETS = {
     "fast-msm": Preset(
         "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a "
         "prefactored Cholesky",
-        {**PLAIN, **CHOLESKY},
+        {**LOCAL_GLOBAL, **CHOLESKY},
         iterations=10,
     ),
     "paper": Preset(
         "Zheng et al.: the same iterations with plain CG from x = b to a fixed tolerance",
         {
-            **PLAIN,
+            **LOCAL_GLOBAL,
             "ksp_type": "cg",
             "pc_type": "none",
             "ksp_norm_type": "unpreconditioned",

@@ -129,8 +129,8 @@ class Recovery:
         Implicit Euler replaces BDF2, and in a fallback also Verlet.
         """
         is_fallback = self.on_failure == "fallback"
-        kept = ("static",) if is_fallback else ("static", "verlet")
-        name = self.time.integrator if self.time.integrator in kept else "implicit-euler"
+        unchanged = ("static",) if is_fallback else ("static", "verlet")
+        name = self.time.integrator if self.time.integrator in unchanged else "implicit-euler"
         time = self.time.model_copy(update={"step": short, "integrator": name})
         if is_fallback:
             robust = Solver(preset=ROBUST, error=self.solver.error, max_iterations=None)

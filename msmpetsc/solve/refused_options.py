@@ -20,7 +20,7 @@ READ_AT_THE_END = re.compile(
     r"|malloc_\w+)$"
 )
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
-OF_STEPPERS = re.compile(r"^(reference_|fallback_)")
+SOLVER_PREFIX = re.compile(r"^(reference_|fallback_)")
 
 OFTEN_GIVEN = {
     "ksp_view",
@@ -32,7 +32,7 @@ OFTEN_GIVEN = {
     "mat_type",
 }
 # options that a misspelt name is compared with
-USUAL = OFTEN_GIVEN.union(*(preset.options for preset in PRESETS.values()))
+COMMON_OPTIONS = OFTEN_GIVEN.union(*(preset.options for preset in PRESETS.values()))
 
 NO_PART = "no part of this run uses this PETSc option"
 BY_ERROR = "a step ends when its error is below solver.error (--error), or by solver.max_iterations"
@@ -81,7 +81,7 @@ def refuse_early(comm: MPI.Comm) -> None:
     """Raise InputError for options that no scene can use (collective)."""
     lines = []
     for name, value in PETSc.Options().getAll().items():
-        given = f"{OF_STEPPERS.sub('', name)} {value or ''}"
+        given = f"{SOLVER_PREFIX.sub('', name)} {value or ''}"
         reasons = [reason for option, reason in NO_USE.items() if re.fullmatch(option, given)]
         reasons += _bounds_passed(name, value or "")
         lines += [f"-{name}: {reason}" for reason in reasons[:1]]
@@ -113,7 +113,7 @@ def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...]
     """
     unused = [
         name
-        for name in _left()
+        for name in _unread_options()
         if not in_use[name]
         and not READ_AT_THE_END.search(name)
         and (at_end or not READ_WHILE_SOLVING.search(name))
@@ -121,7 +121,7 @@ def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...]
     ]
     lines = []
     for name in unused:
-        guess = "" if name in USUAL else did_you_mean(name, USUAL)
+        guess = "" if name in COMMON_OPTIONS else did_you_mean(name, COMMON_OPTIONS)
         lines.append(f"-{name}: {NO_PART}{guess}")
     _refuse(comm, lines)
 
@@ -133,7 +133,7 @@ def _refuse(comm: MPI.Comm, lines: Iterable[str]) -> None:
         raise InputError(message)
 
 
-def _left() -> list[str]:
+def _unread_options() -> list[str]:
     """Return the names of the options that nothing has read (PetscOptionsLeftGet)."""
     library = petsc_library()
     strings = ctypes.POINTER(ctypes.c_char_p)
@@ -141,11 +141,11 @@ def _left() -> list[str]:
     library.PetscOptionsLeftGet(
         None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
     )
-    left = [names[i].decode() for i in range(count.value)]
+    unread = [names[i].decode() for i in range(count.value)]
     library.PetscOptionsLeftRestore(
         None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
     )
-    return left
+    return unread
 
 
 def silence_options_left() -> None:

@@ -339,10 +339,10 @@ class Forces:
         self.elasticity = elasticity
         self.keys = [obstacle.key for obstacle in model.obstacles]
         bodies = len(model.lattice.first_of_body) if model.collision else 0
-        held = len(model.holders.keys)
+        holders = len(model.holders.keys)
         rows = {
-            "reaction": held,
-            "torque": held,
+            "reaction": holders,
+            "torque": holders,
             "push": len(model.obstacles),
             "contact_push": bodies,
         }
@@ -364,7 +364,7 @@ class Forces:
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "reaction" in self.rows:
             fixed = environment.anchors.fixed_at(time)[:owned, None]
-            held = (self._held(q, contact, step) - load) * fixed
+            held = (self._holding_forces(q, contact, step) - load) * fixed
             sums["reaction"] = self.model.holders.totals(held)
             sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
         return {
@@ -380,7 +380,9 @@ class Forces:
             points[row] = anchor.path.center + anchor.path.value_at(time)[:3]
         return points
 
-    def _held(self, q: Positions, contact: Contact | None, step: StepResult | None) -> Rows:
+    def _holding_forces(
+        self, q: Positions, contact: Contact | None, step: StepResult | None
+    ) -> Rows:
         """Return the forces (owned, 3) [N] that hold the nodes in place, without the loads."""
         held, owned = np.zeros_like(q), self.model.lattice.owned
         self.elasticity.add_gradient(q, held)

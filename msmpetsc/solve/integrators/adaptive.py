@@ -234,9 +234,9 @@ class Adaptive(Integrator):
     A state has the velocity (q_n - q_(n-1)) / t with the scene's step t. Its time may lie beyond
     the scene's step, at the end of a longer step. Its history is the start of the last step.
 
-    kept : level -> integrator; the integrator used last comes last
-    tick : time of the state (Ticks)
-    last : level of the last step
+    integrators : level -> integrator; the integrator used last comes last
+    tick        : time of the state (Ticks)
+    last        : level of the last step
     """
 
     looks_back = True
@@ -257,7 +257,7 @@ class Adaptive(Integrator):
         )
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.mean = NeighbourMean(self.comm, self.lattice)
-        self.kept: dict[int, Integrator] = {}
+        self.integrators: dict[int, Integrator] = {}
         self.tick = self.last = 0
         self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
 
@@ -274,19 +274,19 @@ class Adaptive(Integrator):
 
     def _integrator(self, level: int) -> Integrator:
         """Return the integrator of a level, without data of steps before another level's."""
-        if level not in self.kept:
+        if level not in self.integrators:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
-            self.kept[level] = self.make(time, self.solver)
-            self.kept[level].set_up()
+            self.integrators[level] = self.make(time, self.solver)
+            self.integrators[level].set_up()
             if self.tick:
                 # A new integrator must not differ from a kept integrator.
-                self.kept[level].forget()
-        elif level != next(reversed(self.kept)):
-            self.kept[level] = self.kept.pop(level)
-            self.kept[level].forget()
-        while len(self.kept) > KEPT:
-            self.kept.pop(next(iter(self.kept))).destroy()
-        return self.kept[level]
+                self.integrators[level].forget()
+        elif level != next(reversed(self.integrators)):
+            self.integrators[level] = self.integrators.pop(level)
+            self.integrators[level].forget()
+        while len(self.integrators) > KEPT:
+            self.integrators.pop(next(iter(self.integrators))).destroy()
+        return self.integrators[level]
 
     def _length(self, level: int) -> float:
         """Return the length [s] of a step of a level."""
@@ -329,8 +329,8 @@ class Adaptive(Integrator):
             if state.history is not None:
                 longest = min(longest, self.last + 1)
             level = self.ticks.fitting(self.tick, longest)
-            before = self._begun(state, level, restarts)
-            end = self._reached(self.tick + self.ticks.length(level))
+            before = self._start_of(state, level, restarts)
+            end = self._end_time(self.tick + self.ticks.length(level))
             try:
                 result, after = self.balance.step(self._integrator(level), before, end)
                 measure = self._measure(before, result, after, level)
@@ -344,9 +344,9 @@ class Adaptive(Integrator):
             if is_accepted:
                 self.control.pay(level, measure)
                 cost = replace(cost, steps=1, step_error=result.cost.step_error)
-                return self._taken(replace(result, cost=cost), before, after, level)
+                return self._accepted(replace(result, cost=cost), before, after, level)
 
-    def _begun(self, state: State, level: int, restarts: bool) -> State:
+    def _start_of(self, state: State, level: int, restarts: bool) -> State:
         """Return the state from which a step of a level starts; ``restarts`` drops the history."""
         v = state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
@@ -355,7 +355,7 @@ class Adaptive(Integrator):
             history = between(*history, state.q, v, self._length(self.last), s)
         return replace(state, q_previous=state.q - self._length(level) * v, history=history)
 
-    def _reached(self, tick: int) -> float:
+    def _end_time(self, tick: int) -> float:
         """Return the end time [s] of a step that ends at a tick: just before an event there."""
         return self.ticks.time(tick) * (JUST_BEFORE if tick in self.ticks.events else 1.0)
 
@@ -364,7 +364,7 @@ class Adaptive(Integrator):
         owned, t = slice(self.lattice.owned), self._length(level)
         mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
-        end = self._reached(self.tick + self.ticks.length(level))
+        end = self._end_time(self.tick + self.ticks.length(level))
         free = mass * ~self.environment.anchors.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
         local = self.mean(local_error(self.order, q, v, x, w, t) * (free > 0)[:, None])
@@ -388,7 +388,7 @@ class Adaptive(Integrator):
             motion = max(motion, coming)
         return Measure(math.sqrt(error) + late, math.sqrt(motion))
 
-    def _taken(
+    def _accepted(
         self, result: StepResult, before: State, after: State, level: int
     ) -> tuple[StepResult, State]:
         """Return the result and the state after an accepted step, for the scene's step."""
@@ -407,16 +407,16 @@ class Adaptive(Integrator):
     def save(self, checkpoint: Checkpoint) -> None:
         for part in (self, self.control):
             checkpoint.keep_counts(part)
-        last_used = next(reversed(self.kept))
-        self.kept[last_used].save(checkpoint)
+        last_used = next(reversed(self.integrators))
+        self.integrators[last_used].save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         for part in (self, self.control):
             checkpoint.restore_counts(part)
-        self._integrator(self.last).restore(checkpoint, self._reached(self.tick))
+        self._integrator(self.last).restore(checkpoint, self._end_time(self.tick))
 
     def forget(self) -> None:
-        for integrator in self.kept.values():
+        for integrator in self.integrators.values():
             integrator.forget()
 
     def sum_up(self) -> None:
@@ -428,5 +428,5 @@ class Adaptive(Integrator):
         )
 
     def destroy(self) -> None:
-        for integrator in self.kept.values():
+        for integrator in self.integrators.values():
             integrator.destroy()

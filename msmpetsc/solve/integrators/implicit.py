@@ -255,13 +255,13 @@ class ImplicitEuler(Integrator):
         faces = ContactFaces(
             self.environment, state.q, y, time, time_step, state.sides, fixed, q_before
         )
-        begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
+        work_before, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         result = faces.solve(
             lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start)
         )
         self.environment.end_step(result.position, faces.contact)
         cost = replace(
-            self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error
+            self.stepper.work_so_far() - work_before, steps=1, step_error=result.cost.step_error
         )
         result = replace(result, cost=cost, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides
@@ -352,11 +352,11 @@ class Bdf2(ImplicitEuler):
         would add energy.
         """
         self._let_go(time)
-        q, v, begun = state.q, state.velocity(self.time_step), Work()
+        q, v, work_before = state.q, state.velocity(self.time_step), Work()
         self.environment.forces.begin_step(q, v, time - self.time_step)
         history = state.history
         if history is None:
-            history, begun = self._history(state, time)
+            history, work_before = self._history(state, time)
         q_0, v_0 = history
         y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
         result, sides = self._solve(state, y, time, self.time_step, q_0)
@@ -370,7 +370,7 @@ class Bdf2(ImplicitEuler):
             StepTaken(time, self.time_step, sides),
             self.stepper.lattice.pinned,
         )
-        cost = replace(begun + result.cost, step_error=result.cost.step_error, steps=1)
+        cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
         result = replace(result, previous=previous, cost=cost, work=work)
         if before is not previous:
             struck = (before != previous).any(axis=1)[:, None]

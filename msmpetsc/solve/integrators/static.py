@@ -153,10 +153,10 @@ class LoadPath:
                 stepper, lattice = self.stepper, self.stepper.lattice
                 functional = stepper.functional
                 functional.begin(replace(whole, y=self.base, prescribed=None))
-                held = functional.at(self.base)
+                iterate = functional.at(self.base)
                 self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
                 self.holding[stepper.unknowns.free] = (
-                    stepper.unknowns.columns(held.f).T / functional.t2
+                    stepper.unknowns.columns(iterate.f).T / functional.t2
                 )
             load = load + (1 - share) * self.holding
             prescribed = self.environment.anchors.prescribed(
@@ -226,11 +226,11 @@ class Static(ImplicitEuler):
             cost = Work(self.error, steps=1)
             return StepResult(state.q, state.q, cost, static=True, problem=self.problem), state
         stepper = self.stepper
-        begun = stepper.work_so_far()
+        work_before = stepper.work_so_far()
         path = LoadPath(stepper, self.environment, state, time, self.time_step)
         result, path = self._follow(path)
         q, self.problem, self.error = result.position, path.problem, result.cost.step_error
-        cost = replace(stepper.work_so_far() - begun, steps=1, step_error=self.error)
+        cost = replace(stepper.work_so_far() - work_before, steps=1, step_error=self.error)
         result = replace(result, previous=q, cost=cost, static=True, problem=self.problem)
         return result, State(q, q, sides=path.sides)
 
@@ -240,13 +240,13 @@ class Static(ImplicitEuler):
         Raises StepFailed.
         """
         steps, snes, rest = LoadSteps(), self.stepper.snes, self.stepper.lattice.nodes
-        most = snes.getTolerances()[3]
+        max_it = snes.getTolerances()[3]
         # The user's own number of iterations holds for all load steps.
         is_limited = not self.stepper.budget and self.stepper.options.is_default("snes_max_it")
         try:
             while steps.reached < 1.0:
                 if is_limited:
-                    limit = HALVING_ITERATIONS if steps.may_be_refused else most
+                    limit = HALVING_ITERATIONS if steps.may_be_refused else max_it
                     snes.setTolerances(max_it=limit)
                 try:
                     result = path.try_share(steps)
@@ -259,7 +259,7 @@ class Static(ImplicitEuler):
                     log.info("t = %.6g s: begun at the rest shape: it %s", path.time, reason)
                     path = replace(path, state=State(rest, rest))
         finally:
-            snes.setTolerances(max_it=most)
+            snes.setTolerances(max_it=max_it)
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", path.time, steps.count)
         return result, path

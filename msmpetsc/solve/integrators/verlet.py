@@ -56,7 +56,7 @@ EASED = 1 / 32
 HALVINGS = 5
 # most substeps of a step; more would take hours
 MOST_SUBSTEPS = 1e6
-# spurious energy that rounding may cause, over the largest elastic energy of ``most``
+# spurious energy that rounding may cause, over the energy of an unstable body
 ROUNDING = 1e-14
 # relative change of omega^2 that ends the power iteration; SAFETY covers its error
 SETTLED = 1e-3
@@ -76,7 +76,6 @@ class Verlet(Integrator):
     halvings     : halvings of the substeps because of spurious energy
     end          : end time of the step [s]
     known        : positions (l, 3) [m] that ``gradient`` and the highest frequency belong to
-    most         : elastic energy [J] of an unstable body
     """
 
     state: ClassVar[dict[str, Range]] = {
@@ -106,7 +105,7 @@ class Verlet(Integrator):
         self.anchors: int | None = None
         self.fixed = environment.anchors.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
-        self.most = UNSTABLE * comm.allreduce(crushing_energy(self.lattice))
+        self.unstable_energy = UNSTABLE * comm.allreduce(crushing_energy(self.lattice))
 
     def save(self, checkpoint: Checkpoint) -> None:
         checkpoint.keep_counts(self)
@@ -128,22 +127,26 @@ class Verlet(Integrator):
         start, self.end = time - self.time_step, time
         self.environment.forces.begin_step(state.q, state.velocity(self.time_step), start)
         self._begin(state, start)
-        pushed = self._pushed(start, time)
-        squared = pushed + (self.highest.squared or self.highest.squared_at(self.position.values))
+        contact_bound = self._contact_bound(start, time)
+        squared = contact_bound + (
+            self.highest.squared or self.highest.squared_at(self.position.values)
+        )
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
-            begun = self._squared_acceleration(start)
+            squared_start = self._squared_acceleration(start)
             # The energy below shows an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
-                self._take(count, start, time)
+                self._take_substeps(count, start, time)
             energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
             dt = self.time_step / count
             after = np.inf
-            if energy <= self.most:
-                after = pushed + self.highest.squared_at(self.position.values)
+            if energy <= self.unstable_energy:
+                after = contact_bound + self.highest.squared_at(self.position.values)
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
-                return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
+                return self._result(
+                    count, dt**2 / 8 * (self._squared_acceleration(time) - squared_start)
+                )
             if not is_stable:
                 squared = np.clip(after, 2 * squared, 16 * squared)
             self._begin(state, start)
@@ -166,10 +169,10 @@ class Verlet(Integrator):
             self.sides = self.environment.obstacles.contact_faces(
                 self.q, self.q, start, 0.0, before, self.fixed
             )
-            self._pull(start)
+            self._update_gradient(start)
             self.highest.squared = 0.0
 
-    def _take(self, count: int, start: float, time: float) -> None:
+    def _take_substeps(self, count: int, start: float, time: float) -> None:
         """Take ``count`` equal substeps from ``start`` to ``time`` [s] (collective)."""
         self.known = None
         times = np.linspace(start, time, 1 + count).tolist()
@@ -183,7 +186,7 @@ class Verlet(Integrator):
             self.work += self.environment.obstacles.energy_of_new_obstacles(
                 self.q, begin, end, self.sides
             )
-            self._pull(end)
+            self._update_gradient(end)
             self._count_work(moved, held)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
@@ -214,7 +217,7 @@ class Verlet(Integrator):
             np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))])
         )
         total = energy + kinetic
-        limit = GAIN * total + ROUNDING * self.most
+        limit = GAIN * total + ROUNDING * self.unstable_energy
         gained = max(self.gained + gain, -CREDIT * total)
         if (
             min(gain, gained) > limit
@@ -245,7 +248,7 @@ class Verlet(Integrator):
         result = StepResult(self.known, previous, cost, self.work, explicit=True, swing=swing)
         return result, State(self.known, previous, sides=self.sides)
 
-    def _pull(self, time: float) -> None:
+    def _update_gradient(self, time: float) -> None:
         """Compute the gradient of elastic and contact energy at the present positions."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
@@ -332,7 +335,7 @@ class Verlet(Integrator):
             self.free = np.flatnonzero(~self.fixed)
             self.highest.hold(self.fixed)
 
-    def _pushed(self, start: float, time: float) -> float:
+    def _contact_bound(self, start: float, time: float) -> float:
         """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
         fall = self.environment.forces.at(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))

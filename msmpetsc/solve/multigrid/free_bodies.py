@@ -56,9 +56,9 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
         (np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2
     )
     part = connected_components(graph, directed=False)[1]
-    name = _names(unknowns, part)
-    table = SortedKeys(comm, name[: lattice.owned][moves[: lattice.owned]])
-    number = np.where(moves, table.find(np.where(moves, name, -1)), -1)
+    label = _labels(unknowns, part)
+    table = SortedKeys(comm, label[: lattice.owned][moves[: lattice.owned]])
+    number = np.where(moves, table.find(np.where(moves, label, -1)), -1)
     held = np.zeros(table.total, bool)
     ends = springs[either & ~both]
     held[number[ends[moves[ends]]]] = True
@@ -66,7 +66,7 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
     return Bodies(number, ~held)
 
 
-def _names(unknowns: Unknowns, part: Indices) -> Indices:
+def _labels(unknowns: Unknowns, part: Indices) -> Indices:
     """Return the smallest global number (l,) of a node in the body of each node (collective).
 
     Ranks that share a body exchange their smallest numbers until no number changes.
@@ -76,17 +76,17 @@ def _names(unknowns: Unknowns, part: Indices) -> Indices:
     comm, lattice = unknowns.comm, unknowns.lattice
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
-    name, is_new = lattice.global_numbers, True
+    label, is_new = lattice.global_numbers, True
     while is_new:
         least = np.full(part.max(initial=-1) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(least, part, name)
+        np.minimum.at(least, part, label)
         smaller = least[part]
         smaller[lattice.owned :] = np.minimum(
             smaller[lattice.owned :], to_owner.answer(smaller[asked])
         )
-        is_new = comm.allreduce(bool((smaller < name).any()), MPI.LOR)
-        name = smaller
-    return name
+        is_new = comm.allreduce(bool((smaller < label).any()), MPI.LOR)
+        label = smaller
+    return label
 
 
 class Translations:

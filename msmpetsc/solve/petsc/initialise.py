@@ -100,15 +100,15 @@ def _captured_stderr() -> Iterator[list[str]]:
     """Capture the standard error of the process, C code included; fill it in after the block."""
     text = [""]
     sys.stderr.flush()
-    kept = os.dup(2)
+    saved_stderr = os.dup(2)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 2)
         try:
             yield text
         finally:
             ctypes.CDLL(None).fflush(None)
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(saved_stderr, 2)
+            os.close(saved_stderr)
             file.seek(0)
             text[0] = file.read().decode(errors="replace")
 

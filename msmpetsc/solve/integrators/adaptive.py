@@ -172,11 +172,13 @@ class StepControl:
     def pay(self, level: int, measure: Measure) -> None:
         """Enter an accepted step into the account, and choose the level of the next step."""
         allowed = self.allowed(level, measure)
-        longer, growth = self.level + 1, 2.0 ** ((self.order + 1) * (self.level + 1 - level))
+        longer = self.level + 1
+        growth = 2.0 ** ((self.order + 1) * (longer - level))
         is_calm = measure.error * growth <= self.allowed(longer, measure)
         self.motion = max(self.motion, measure.motion)
         self.passed += self.motion * self.step * 2.0**level / self.duration
-        self.spent, self.steps = self.spent + measure.error, self.steps + 1
+        self.spent += measure.error
+        self.steps += 1
         self.time += self.step * 2.0**level
         if measure.error > allowed:
             self.shorten(level)

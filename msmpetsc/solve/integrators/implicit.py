@@ -255,7 +255,8 @@ class ImplicitEuler(Integrator):
         faces = ContactFaces(
             self.environment, state.q, y, time, time_step, state.sides, fixed, q_before
         )
-        work_before, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
+        work_before = self.stepper.work_so_far()
+        rates = self._rates(state.q, y, q_before)
         result = faces.solve(
             lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start)
         )
@@ -375,7 +376,8 @@ class Bdf2(ImplicitEuler):
         if before is not previous:
             struck = (before != previous).any(axis=1)[:, None]
             v_after = (result.position - before - a) / self.time_step
-            q, v = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
+            q = np.where(struck, before + 0.5 * a, q)
+            v = np.where(struck, v_after, v)
         return result, State(result.position, before, (q, v), sides)
 
     def _history(self, state: State, time: float) -> tuple[tuple[Positions, Rows], Work]:

@@ -239,7 +239,8 @@ class Static(ImplicitEuler):
 
         Raises StepFailed.
         """
-        steps, snes, rest = LoadSteps(), self.stepper.snes, self.stepper.lattice.nodes
+        snes, rest = self.stepper.snes, self.stepper.lattice.nodes
+        steps = LoadSteps()
         max_it = snes.getTolerances()[3]
         # The user's own number of iterations holds for all load steps.
         is_limited = not self.stepper.budget and self.stepper.options.is_default("snes_max_it")

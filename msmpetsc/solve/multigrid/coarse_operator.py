@@ -67,10 +67,8 @@ class CoarseOperator:
         self.sums = np.empty((last - first, 9), np.float32)
         self.x, self.y = np.empty((2, last - first, 3), np.float32)
         self.ghosts = PETSc.Vec().createSeq(3 * len(ghosts))
-        whole, wanted = (
-            matrix.createVecRight(),
-            PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType)),
-        )
+        whole = matrix.createVecRight()
+        wanted = PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType))
         self.scatter = PETSc.Scatter().create(whole, wanted, self.ghosts, None)
         whole.destroy()
         wanted.destroy()

@@ -199,7 +199,8 @@ class GalerkinSum:
 
         contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
         """
-        symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
+        count = len(self.places)
+        symmetric = np.zeros((self.blocks, 6), like=q)
         solid, viscosity = self.elasticity.solid, self.elasticity.viscosity
         if self.elasticity.springs:
             of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
@@ -248,7 +249,8 @@ def _by_cell(
         np.where(pinned[nodes], PINNED, (ijk[nodes] - 2 * corner[:, None]) @ [9, 3, 1])
         for nodes, corner in zip(ends, low, strict=True)
     ]
-    every, which = np.unique(np.concatenate(keys)), (moving, free, np.arange(len(corners)))
+    every = np.unique(np.concatenate(keys))
+    which = moving, free, np.arange(len(corners))
     of_springs, of_nodes, of_cells = (
         ByCell.of(key, every, code, number).to_device_of(lattice.nodes)
         for key, code, number in zip(keys, codes, which, strict=True)

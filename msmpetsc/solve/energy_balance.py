@@ -1,20 +1,28 @@
-"""The energy of a body from step to step: what came in as work, and what came from nowhere.
+"""Energy balance of each step: legitimate work, and spurious energy that has no source.
 
-A step that is solved exactly, of a convex energy, ends with no more than it began with (implicit Euler):
+If the energy is convex, an exactly solved step of implicit Euler satisfies
 
-    T(v_(n+1)) + E(q_(n+1)) + C(q_(n+1))  <=  T(v_n) + E(q'_n) + C(q'_n) + f_ext . (q_(n+1) - q'_n) + W
+    T(v_(n+1)) + E(q_(n+1)) + C(q_(n+1))
+        <=  T(v_n) + E(q'_n) + C(q'_n) + f_ext . (q_(n+1) - q'_n) + W
 
-T of the free nodes; C the push of obstacles, both times as they stand at the end; q'_n is q_n with the nodes that
-anchors lead where they will be; W no less than the work of obstacles that drag, and that of those that strike, the
-impulse times their velocity. What the left side has more, and what later steps have not lost again, came from nowhere.
-What nodes gain when they bounce off a solved step counts to the next step, which mostly loses it before a frame shows
-it.
+- T is the kinetic energy of the free nodes.
+- C is the contact energy. Both sides take the obstacles at their positions at the step's end.
+- q'_n is q_n with the anchored nodes at their prescribed positions at the step's end.
+- W bounds the work of moving obstacles: by friction, and by impacts as impulse times velocity.
 
-Verlet counts in W the work of anchors and moving obstacles in its substeps, so that q'_n is q_n and C that of the
-start. It also counts the work of forces that change, beyond f_ext of the end. The energy of its steps and of BDF2's
-swings about what it should be: what they lose, up to a share, they may gain again.
-In a linear body Verlet's, of substeps dt, swings just as dt^2/8 |M^(-1) (f_ext - grad E)|_M^2 does (Hairer, Lubich and
-Wanner, Geometric Numerical Integration, IX): only what was gained with and without that is worth a word.
+Spurious energy is the excess of the left side, less its later dissipation. Messages call it energy
+from nowhere. Energy of nodes that rebound after the solve enters the balance of the next step,
+because the next step dissipates most of it.
+
+For Verlet, W holds the work of anchors and moving obstacles in the substeps. Therefore q'_n is q_n,
+and C is taken at the start of the step. W also holds the work of varying forces beyond f_ext at the
+end. The energy of Verlet and BDF2 oscillates, so a step may regain a limited share of earlier
+losses. In a linear body, the energy of Verlet with substeps dt oscillates by
+
+    dt^2/8 |M^(-1) (f_ext - grad E)|_M^2
+
+(Hairer, Lubich and Wanner, Geometric Numerical Integration, IX). A warning needs a gain both with
+and without this oscillation.
 """
 
 from dataclasses import dataclass, replace
@@ -33,61 +41,76 @@ from msmpetsc.solve.integrators.integrator import EnergyBudget, Integrator, Stat
 from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 
-MOST = 3.0  # times all that the body ever had: explicit substeps near their limit let energy swing by nearly two
-MUCH = 0.01  # of all energy, from nowhere: worth a word
-CREDIT = 0.1  # of it, that a swing may take and give back: BDF2's impacts took 6%
-FLOOR = 1e-10  # of the energy that presses every spring to a point: what rounding may gain
+# spurious energy that fails a step, over all energy; Verlet may oscillate by nearly 2
+FAILING_GAIN = 3.0
+# spurious energy that is worth a warning, over all energy; a viewer may notice more
+NOTABLE_GAIN = 0.01
+# energy that an oscillation may regain, over all energy; BDF2 loses 0.06 in an impact
+CREDIT = 0.1
+# least legitimate energy, over that of crushed springs; rounding may gain less
+FLOOR = 1e-10
 
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies at one time [J]."""
+    """Energies [J] and momentum (3,) [kg m/s] of a body at a given time.
 
-    kinetic: float  # of all nodes; ``free`` of those that nothing prescribes
+    free  : kinetic energy of the nodes without prescribed displacement
+    touch : contact of the surface with itself
+    """
+
+    kinetic: float
     free: float
     elastic: float
     contact: float
     potential: float
-    momentum: Floats  # (3,) [kg m/s]
-    touch: Touch  # contacts of the surface with itself
+    momentum: Floats
+    touch: Touch
 
     @property
     def inner(self) -> float:
-        """All but the potential of loads [J]."""
+        """Return the kinetic energy of the free nodes plus elastic and contact energy [J]."""
         return self.free + self.elastic + self.contact + self.touch.energy
 
 
 @dataclass(eq=False)
 class EnergyBalance:
-    """Examiner of a run's steps; states keep the energy budget.
+    """Check the energy of each step of a run; the states carry the energy budget.
 
-    energies : of the moment shown last
+    swings   : whether the energy of the integrator oscillates
+    energies : energies at the time that ``show`` was called for last
+    known    : end positions (l, 3) [m] of the last step, and the energies there
+    floor    : least energy [J] that counts as legitimate
     """
 
     environment: Environment
     elasticity: Elasticity
-    swings: bool  # whether the integrator's energy does
+    swings: bool
 
     def __post_init__(self) -> None:
         self.lattice = self.environment.lattice
         self.comm = self.lattice.table.comm
         self.credit = CREDIT * self.swings
         self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
-        self.known: tuple[Positions, Energies] | None = (
-            None  # positions that the last step ended at, energies there
-        )
+        self.known: tuple[Positions, Energies] | None = None
         self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
 
     def show(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> None:
-        """Let ``energies`` be those of a moment within a step, or at its end (collective)."""
+        """Set ``energies`` to the energies at a time within a step or at its end (collective)."""
         self.energies = self._energies(q, v, time, sides)
 
     def _energies(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> Energies:
-        """Energies of positions (l, 3) [m] and velocities (l, 3) [m/s] with obstacles as at ``time`` (collective)."""
+        """Return the energies at q (l, 3) [m] with velocities v (l, 3) [m/s] (collective).
+
+        time  : time [s] that forces and obstacles are taken at
+        sides : (o, l) contact faces of the nodes
+        """
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
-        at, contact, v = q[owned], environment.obstacles.push(time, sides), v[owned]
-        momenta, free = lattice.mass[:, None] * v, ~environment.anchors.fixed_at(time)[owned]
+        at, v = q[owned], v[owned]
+        contact = environment.obstacles.push(time, sides)
+        momenta = lattice.mass[:, None] * v
+        free = ~environment.anchors.fixed_at(time)[owned]
         sums = self._sums(
             0.5 * np.vdot(momenta, v),
             0.5 * np.vdot(momenta * free[:, None], v),
@@ -105,13 +128,14 @@ class EnergyBalance:
         )
 
     def step(self, integrator: Integrator, before: State, time: float) -> tuple[StepResult, State]:
-        """Take the step of an integrator that ends at ``time``, and enter it into the energy budget (collective).
+        """Take the integrator's step that ends at ``time`` and update the budget (collective).
 
-        The history of BDF2 may give back at once much of the energy that an impact took: such a step begins anew.
-        Raises StepFailed where a number is not finite, or far more came from nowhere than the body ever had.
+        If the history of BDF2 returns the energy that an impact took, repeat the step without it.
+        Raises StepFailed if a number is not finite, or if the spurious energy is above
+        FAILING_GAIN times the largest legitimate energy.
         """
         result, after = integrator.advance(before, time)
-        budget = self._examine(before, result, after, time, integrator.time_step)
+        budget = self._budget_after(before, result, after, time, integrator.time_step)
         if before.history is not None and self._history_gains(
             before, result, after, time, integrator.time_step
         ):
@@ -123,33 +147,39 @@ class EnergyBalance:
     def _history_gains(
         self, before: State, result: StepResult, after: State, time: float, time_step: float
     ) -> bool:
-        """Return whether a solved step gains more than MUCH of all energy (collective).
+        """Return whether a solved step gains more than NOTABLE_GAIN of all energy (collective).
 
-        Energy and work are those in a frame that goes with the obstacles that press, or with the body where none does:
-        so no motion of all matters.
+        Count energy and work in a frame that moves with the pressing obstacles. If no obstacle
+        presses, the frame moves with the body, so that rigid motion does not matter.
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
-        way = result.position[owned] - result.previous[owned]
-        pressing, led = self.environment.obstacles.way_of_pressing(
+        displacement = result.position[owned] - result.previous[owned]
+        pressing, dragged = self.environment.obstacles.way_of_pressing(
             (result.position[owned], after.sides), time, time_step
         )
         is_held = self.environment.anchors.fixed_at(time)[owned].any()
         sums = self._sums(
-            lattice.mass.sum(), pressing, is_held, *led, *(lattice.mass @ way / time_step)
+            lattice.mass.sum(),
+            pressing,
+            is_held,
+            *dragged,
+            *(lattice.mass @ displacement / time_step),
         )
-        mass, pressing, is_held, momentum = *sums[:3], sums[6:]
-        frame = (
-            sums[3:6] / (pressing * time_step)
-            if pressing > 0
-            else np.where(is_held, 0.0, momentum / mass)
-        )
+        mass, pressing, is_held = sums[:3]
+        momentum = sums[6:]
+        if pressing > 0:
+            frame = sums[3:6] / (pressing * time_step)
+        else:
+            frame = np.where(is_held, 0.0, momentum / mass)
         start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
-        return bool(ended - start - work - struck > MUCH * max(start + max(work, 0.0), self.floor))
+        gained = ended - start - work - struck
+        return bool(gained > NOTABLE_GAIN * max(start + max(work, 0.0), self.floor))
 
-    def _examine(
+    def _budget_after(
         self, before: State, result: StepResult, after: State, time: float, time_step: float
     ) -> EnergyBudget:
+        """Return the energy budget after a step (collective). Raises StepFailed."""
         v = (result.position - result.previous) / time_step
         self.show(result.position, v, time, after.sides)
         solved = ended = self.energies
@@ -157,45 +187,49 @@ class EnergyBalance:
             raise StepFailed(
                 f"left numbers that are not finite, {self._worst(result.position)}", "not finite"
             )
-        if result.static:  # which owes nothing to the state before
+        # An equilibrium does not depend on the energy before.
+        if result.static:
             return before.budget
-        own = after.q is not result.position or after.q_previous is not result.previous
-        bounces = self.environment.obstacles.strikes and self.comm.allreduce(
-            own, MPI.LOR
-        )  # once the step was solved
+        # Obstacles that reflect nodes change the state after the solve.
+        is_changed = after.q is not result.position or after.q_previous is not result.previous
+        bounces = self.environment.obstacles.strikes and self.comm.allreduce(is_changed, MPI.LOR)
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
-        budget = self._entered(before.budget, solved, ended, sums, bounces)
-        if budget.gained > MOST * budget.put_in:
+        budget = self._updated(before.budget, solved, ended, sums, bounces)
+        if budget.gained > FAILING_GAIN * budget.put_in:
+            fallback = ', or safety.on_failure = "fallback"'
+            if self.environment.obstacles.exchanges:
+                fallback = ""
             raise StepFailed(
-                f"gained {budget.gained:.2e} J from nowhere, of {budget.put_in:.2e} J that were there: "
-                f"{self._worst(v)}{describe_inverted(self.comm, self.lattice, result.position)}; "
-                f"try {self.remedy(result.explicit)}"
-                + (
-                    ""
-                    if self.environment.obstacles.exchanges
-                    else ', or safety.on_failure = "fallback"'
-                ),
+                f"gained {budget.gained:.2e} J from nowhere, of {budget.put_in:.2e} J that were "
+                f"there: {self._worst(v)}"
+                f"{describe_inverted(self.comm, self.lattice, result.position)}; "
+                f"try {self.remedy(result.explicit)}{fallback}",
                 "energy",
             )
         self.known = after.q, ended
         return budget
 
-    def _entered(
+    def _updated(
         self, budget: EnergyBudget, solved: Energies, ended: Energies, sums: Floats, bounces: bool
     ) -> EnergyBudget:
+        """Return the budget after a step.
+
+        solved : energies of the solution
+        ended  : energies after nodes have rebounded
+        sums   : (5,) [J], as ``_start`` returns them
+        """
         start, pushed, work, struck, swing = sums
-        gained = solved.inner - start - work + budget.bounced - (0.0 if bounces else struck)
-        bounced = (
-            ended.inner + ended.potential - solved.inner - solved.potential - struck
-            if bounces
-            else 0.0
-        )
-        by_right = (
-            start - max(budget.bounced, 0.0) - pushed - max(budget.gained, 0.0)
-        )  # an exchange puts nothing in
-        put_in = max(budget.put_in, by_right + max(work, 0.0), self.floor)
+        gained = solved.inner - start - work + budget.bounced
+        bounced = 0.0
+        if bounces:
+            bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck
+        else:
+            gained -= struck
+        # Energy that nodes gain by exchange with an obstacle is not legitimate.
+        legitimate = start - max(budget.bounced, 0.0) - pushed - max(budget.gained, 0.0)
+        put_in = max(budget.put_in, legitimate + max(work, 0.0), self.floor)
         put_in = max(put_in, solved.inner - max(budget.gained + gained, 0.0))
         least = -self.credit * put_in
         steady = max(least, budget.steady + gained - swing)
@@ -205,11 +239,16 @@ class EnergyBalance:
         )
 
     def remedy(self, explicit: bool) -> str:
-        """Return a remedy, in words, for energy that comes from nowhere."""
+        """Return a remedy, in words, for spurious energy."""
         if self.environment.obstacles.exchanges:
-            return 'response = "reflect" in place of "exchange", which moves nodes against their springs'
-        if explicit or self.credit:
-            return "a smaller time.substep" if explicit else "a smaller time.step"
+            return (
+                'response = "reflect" in place of "exchange", which moves nodes against their '
+                "springs"
+            )
+        if explicit:
+            return "a smaller time.substep"
+        if self.credit:
+            return "a smaller time.step"
         return "a smaller time.step or a smaller solver.error"
 
     def _start(
@@ -223,29 +262,33 @@ class EnergyBalance:
     ) -> Floats:
         """Return the terms (5,) [J] of the right side of the balance (collective).
 
-        They are the energies, the push in them, the work of loads and of obstacles that drag,
-        the work that the step counted itself, and its swing.
+        The first terms are the energy at the start and the contact energy in it. The next are the
+        work of loads and friction and the work in StepResult. The last is the known oscillation.
 
         frame : velocity (3,) [m/s] of the frame in which energies and work are counted
         """
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
-        prescribed = None if result.explicit else environment.anchors.prescribed(before.q, time)
-        q, v = before.q if prescribed is None else prescribed, before.velocity(time_step)[owned]
+        q, v = before.q, before.velocity(time_step)[owned]
+        if result.explicit:
+            when, sides = time - time_step, before.sides
+        else:
+            when, sides = time, after.sides
+            prescribed = environment.anchors.prescribed(q, time)
+            q = q if prescribed is None else prescribed
         free = ~environment.anchors.fixed_at(time)[owned]
-        when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
         contact = environment.obstacles.push(when, sides)
         known = self.known[1] if self.known and q is self.known[0] else None
         ended = result.position[owned], after.sides
         along = time_step * np.broadcast_to(frame, 3)
-        way, drift = like(lattice.nodes, along), like(lattice.nodes, along / time_step)
+        shift, drift = like(lattice.nodes, along), like(lattice.nodes, along / time_step)
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * (v - drift), v - drift),
             0.0 if known else self.elasticity.energy(q),
-            contact.energy(q[owned] + way) if contact else 0.0,
-            np.vdot(environment.forces.at(time), result.position[owned] - q[owned] - way)
+            contact.energy(q[owned] + shift) if contact else 0.0,
+            np.vdot(environment.forces.at(time), result.position[owned] - q[owned] - shift)
             + environment.obstacles.friction_work_bound(
                 (q[owned], sides), ended, time, time_step, along
             )

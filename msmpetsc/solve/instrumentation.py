@@ -1,7 +1,7 @@
-"""What is watched and measured of a run.
+"""Monitors of a run, true errors of its steps, and times of its events.
 
-Monitors warn once: of cells inside out, steps that ended far from their solution, energy that came from nowhere and
-nodes inside an obstacle that comes to be there. Besides: true errors of steps, and where the time went.
+Monitors warn of inverted cells, steps far from their solution, spurious energy, and nodes inside an
+obstacle that begins to act.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ from msmpetsc.contact.obstacles.moving_solid import describe_overlap
 from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.solve.energy_balance import MUCH
+from msmpetsc.solve.energy_balance import NOTABLE_GAIN
 from msmpetsc.solve.integrators.integrator import EnergyBudget
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -35,30 +35,42 @@ from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
 REFERENCE_PRESET, REFERENCE_ERROR = "newton-multigrid", 1e-10
-REFERENCE_PREFIX = "reference_"  # of its PETSc options
+# prefix of the PETSc options of the reference solver
+REFERENCE_PREFIX = "reference_"
 EVENTS = {
-    "factor": ["PCSetUp"], "local": [LOCAL.name], "ksp": ["KSPSolve"], "hierarchy": [GRIDS.name, HIERARCHY.name],
-    "cycle": [CYCLE.name], "fine": [FINE.name],
-}  # fmt: skip
-FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
+    "factor": ["PCSetUp"],
+    "local": [LOCAL.name],
+    "ksp": ["KSPSolve"],
+    "hierarchy": [GRIDS.name, HIERARCHY.name],
+    "cycle": [CYCLE.name],
+    "fine": [FINE.name],
+}
+# relative error of a step that is worth a warning; more iterations are needed
+FAR = 0.3
 
 
 class TrueErrors:
-    """True errors of a run's steps, against steps solved to rounding. What it takes is not timed with the run."""
+    """Measure true errors of steps against steps solved to rounding, which are not timed.
+
+    stepper   : solver of the run that the reference solver was made for
+    reference : solver of the reference steps
+    """
 
     def __init__(self) -> None:
-        self.stepper: Stepper | None = None  # whose steps the reference takes
+        self.stepper: Stepper | None = None
         self.reference: Stepper | None = None
 
     def errors(self, stepper: Stepper, problem: StepProblem, position: Positions) -> Floats:
-        """Return the errors (2,) of a solution (l, 3) [m] of a step, NaN if the reference fails (collective).
+        """Return the errors (2,) of a step's solution (l, 3) [m] (collective).
 
-        Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
+        They are the relative position error |x - x*|_M / |y - x*|_M and the relative energy error
+        (g(x) - g*) / (g(y) - g*). Both are NaN if the reference solve fails.
         """
         try:
             with begun(REFERENCE):
                 reference = self._reference(stepper)
-                reference.forget()  # what is measured does not depend on what was measured before
+                # An error must not depend on earlier measurements.
+                reference.forget()
                 exact = reference.step(problem, position).position
         except StepFailed as failure:
             log.warning("the true error of a step is not known: its reference %s", failure)
@@ -69,7 +81,9 @@ class TrueErrors:
         return errors
 
     def _reference(self, stepper: Stepper) -> Stepper:
-        if self.reference is None or self.stepper is not stepper:  # an anchor let go
+        """Return the reference solver for ``stepper`` (collective)."""
+        # The run makes a new solver when an anchor ends.
+        if self.reference is None or self.stepper is not stepper:
             self.destroy()
             self.stepper = stepper
             preset = find_preset(REFERENCE_PRESET)
@@ -84,13 +98,13 @@ class TrueErrors:
         return self.reference
 
     def destroy(self) -> None:
-        """Collective."""
+        """Destroy all PETSc objects (collective)."""
         if self.reference:
             self.reference.destroy()
 
 
 def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
-    """Return |x - x*|_M and g(x) - g*."""
+    """Return |x - x*|_M and g(x) - g* (collective)."""
     functional, vector = reference.functional, reference.functional.vectors.take()
     reference.unknowns.from_nodes(x - exact, vector)
     distance = functional.norm(vector)
@@ -99,21 +113,31 @@ def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
 
 
 def event_times() -> dict[str, float]:
-    """Return the seconds of this rank in events of all runs of the process so far, those of references left out."""
+    """Return the seconds that this rank has spent in each group of events.
+
+    All runs of the process count; their reference solves do not.
+    """
     return {name: sum(map(seconds, events)) for name, events in EVENTS.items()}
 
 
 def times(comm: MPI.Comm, before: dict[str, float]) -> dict[str, float]:
-    """Return the seconds in events since there were so many ``before``, the greatest of all ranks (collective)."""
+    """Return the seconds in events since ``before``, the maximum over the ranks (collective).
+
+    before : seconds of this rank, as ``event_times`` returned them
+    """
     return {
         name: comm.allreduce(now - before[name], MPI.MAX) for name, now in event_times().items()
     }
 
 
 class Monitors:
-    """Monitors of one run. All ranks warn alike, rank 0 is heard.
+    """Watch the frames of a run and warn once of each kind of trouble, alike on all ranks.
 
-    work : of the steps since the frame stored before
+    work      : work of the steps since the frame stored before
+    frames    : frames with inverted cells
+    now, most : inverted cells in the last frame, and their maximum over the frames
+    far       : frames with a step far from its solution; ``worst_error`` is the largest error
+    gaining   : steps with spurious energy; ``worst_gain`` is its largest share of all energy
     """
 
     state: ClassVar[dict[str, Range]] = {
@@ -132,7 +156,7 @@ class Monitors:
         log.warning("frame %d (t = %.6g s): %s", index, time, text)
 
     def inverted(self, index: int, time: float, q: Positions) -> int:
-        """Count the cells inside out at q (l, 3) [m] (collective)."""
+        """Return the number of inverted cells at q (l, 3) [m]; warn of the first (collective)."""
         self.now, worst = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
             remedy = "a smaller time.step or a smaller solver.error helps to keep them as they were"
@@ -145,21 +169,26 @@ class Monitors:
         return self.now
 
     def error(self, index: int, time: float) -> None:
-        """Take note of the estimated error of a frame's steps."""
+        """Warn if the estimated error of a frame's steps is above FAR."""
         error = self.work.step_error
         if not error <= FAR:
             if not self.far:
                 off = "with no minimum near"
                 if np.isfinite(error):
                     off = f"{error:.2g} off its solution, relative to what forces moved"
-                mends = "more solver.max_iterations, a solver.error in their place, or a smaller time.step mend that"
-                self._warn(index, time, f"its step ended {off}; {mends}")
+                remedies = (
+                    "more solver.max_iterations, a solver.error in their place, or a smaller "
+                    "time.step mend that"
+                )
+                self._warn(index, time, f"its step ended {off}; {remedies}")
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
     def overlaps(self, index: int, time: float, q: Positions) -> None:
-        """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3)
-        [m] before it (collective)."""
+        """Warn of nodes inside obstacles that begin to act in step ``index`` (collective).
+
+        q : (l, 3) [m] positions before the step
+        """
         for obstacle in self.environment.obstacles.all:
             if not obstacle.acts_at(time) or (index and obstacle.acts_at(time - self.time_step)):
                 continue
@@ -173,8 +202,8 @@ class Monitors:
                 )
 
     def gain(self, index: int, time: float, budget: EnergyBudget, remedy: str) -> None:
-        """Take note of what the body has from nowhere after a step, and of what mends that."""
-        if not budget.share <= MUCH:
+        """Warn if the spurious energy after a step is above NOTABLE_GAIN of all energy."""
+        if not budget.share <= NOTABLE_GAIN:
             if not self.gaining:
                 part = f"{budget.share * budget.put_in:.2g} J of {budget.put_in:.2g} J"
                 share = f"{100 * budget.share:.2g}% of all energy"
@@ -183,7 +212,7 @@ class Monitors:
             self.worst_gain = max(self.worst_gain, budget.share)
 
     def sum_up(self) -> None:
-        """Log at the end of a run how often each warning was due."""
+        """Log at the end of a run how often each kind of trouble occurred."""
         if self.frames:
             left = f"{self.now} still are" if self.now else "none is at the end"
             log.warning(

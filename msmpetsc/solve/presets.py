@@ -1,8 +1,8 @@
-"""Presets: a method is a set of PETSc options on the one SNES of solve.nonlinear.step.
+"""Presets: each method is a set of PETSc options for the SNES of solve.nonlinear.step.
 
-Each option is only a default: the user's own option of that name wins. With A constant, Newton's
-method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). The bare -ksp_ and -pc_
-options always mean the linear solve with A (or with the true Hessian, for ``newton``).
+A user's option overrides the preset's option of the same name. Newton's method with the constant
+matrix A is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). The options -ksp_ and
+-pc_ without a prefix control the linear solve with A, or with the true Hessian for ``newton``.
 """
 
 from collections import Counter
@@ -17,49 +17,57 @@ from msmpetsc.solve.petsc.words import options_of, words_of
 
 @dataclass(frozen=True)
 class Preset:
-    """A method as a set of PETSc options.
+    """Method given as a set of PETSc options.
 
-    about        : when to use it
-    options      : PETSc's, without the dash
-    projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
-    iterations   : a fixed number of them, from y on, is the method as published; None: to the error target, from the
-        best of several guesses, and ksp_rtol is only the tightest of a linear solve: less where the step needs less
-    chooses      : pc_type is only what it begins with, where multigrid of the Hessian is not worth its while
+    about        : when to use the method
+    options      : PETSc options without the dash
+    true_hessian : whether the Jacobian is the true Hessian of g instead of the constant A
+    projected    : iterations with the projected Hessian at the start of each minimisation
+    start_from_b : whether CG starts from x = b, as in the paper's Algorithm 1
+    iterations   : fixed number of iterations from y, as the method was published. None: iterate to
+        the error target from the best of several guesses; ksp_rtol is then the tightest tolerance
+    chooses      : whether the solver may replace pc_type by multigrid of the Hessian if that pays
     """
 
     about: str
     options: dict[str, str]
-    true_hessian: bool = False  # the Jacobian is the true Hessian of g, not the constant A
+    true_hessian: bool = False
     projected: int = 0
-    start_from_b: bool = False  # CG starts from x = b, as in the paper's Algorithm 1
+    start_from_b: bool = False
     iterations: int | None = None
     chooses: bool = False
 
 
-# Iterations of CG in a step, and the most of any option that counts; so each step ends.
+# largest number of CG iterations in a step and of any counting option; every step ends
 MOST_ITERATIONS = 100_000
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
-NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search
-PLAIN = {
+# no stop by the length of the correction; the error alone ends a step or a line search
+NO_STOP_BY_SIZE = {"snes_stol": "0"}
+LOCAL_GLOBAL = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "basic",
     "snes_max_it": "1000",
     **NO_STOP_BY_SIZE,
 }
-MANY = "3000"  # a hard step takes hundreds of newton's cheap iterations (tests/test_recovery.py), and gets there
-LATTICE_MULTIGRID = {  # the cycle of -pc_type mg
+# most iterations of Newton's method; a hard step needs hundreds (test_recovery.py)
+NEWTON_ITERATIONS = "3000"
+# options of the cycle of -pc_type mg
+LATTICE_MULTIGRID = {
     "mg_levels_ksp_type": "chebyshev",
     "mg_levels_ksp_max_it": "1",
     "mg_coarse_ksp_type": "preonly",
     "mg_coarse_pc_type": "redundant",
     "mg_coarse_redundant_pc_type": "cholesky",
-    "mg_coarse_redundant_pc_factor_mat_solver_type": "petsc",  # on the CPU: cuSPARSE's took most of a cycle
-    "mg_coarse_redundant_pc_factor_mat_ordering_type": "qmd",  # least fill of those that all PETSc have
-    "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",  # PETSc's is absolute, and a light body's pivots are small
+    # PETSc's factor runs on the CPU, which is faster than cuSPARSE for small matrices.
+    "mg_coarse_redundant_pc_factor_mat_solver_type": "petsc",
+    # Every PETSc has qmd, and it fills least of the common orderings.
+    "mg_coarse_redundant_pc_factor_mat_ordering_type": "qmd",
+    # PETSc's own bound is absolute, but a light body has small pivots.
+    "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",
 }
 NEWTON = {
-    "snes_max_it": MANY,
+    "snes_max_it": NEWTON_ITERATIONS,
     **JACOBI_CG,
     "ksp_rtol": "3e-2",
     **LATTICE_MULTIGRID,
@@ -67,23 +75,27 @@ NEWTON = {
 
 PRESETS = {
     "anderson": Preset(
-        "Anderson-accelerated local/global iterations with loose CG solves: easy steps to few digits, no Hessian",
+        "Anderson-accelerated local/global iterations with loose CG solves: easy steps to few "
+        "digits, no Hessian",
         {
             "snes_type": "anderson",
             "snes_anderson_m": "5",
             "snes_npc_side": "left",
             "snes_max_it": "300",
-            "npc_snes_type": "newtonls",  # a plain iteration, which preconditions the SNES
+            # A plain local/global iteration preconditions the SNES.
+            "npc_snes_type": "newtonls",
             "npc_snes_linesearch_type": "basic",
             "npc_snes_max_it": "1",
             "npc_snes_norm_schedule": "none",
-            "npc_snes_divergence_tolerance": "-1",  # an impact may begin with 1e4 |F(y)|
+            # An impact may raise |F| far above |F(y)|.
+            "npc_snes_divergence_tolerance": "-1",
             **JACOBI_CG,
             "ksp_rtol": "1e-1",
         },
     ),
     "lbfgs": Preset(
-        "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search: between anderson and newton",
+        "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search: between anderson "
+        "and newton",
         {
             "snes_type": "qn",
             "snes_qn_type": "lbfgs",
@@ -98,36 +110,41 @@ PRESETS = {
         },
     ),
     "newton": Preset(
-        "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error",
+        "Newton's method with the true Hessian and a line search: the default, fastest to nearly "
+        "any error",
         NEWTON,
         true_hessian=True,
         chooses=True,
     ),
     "newton-multigrid": Preset(
-        "The same with multigrid on the lattice, what newton itself takes for all others",
+        "Newton's method, always preconditioned by multigrid on the lattice: newton chooses it "
+        "for all but easy steps",
         {**NEWTON, "pc_type": "mg"},
         true_hessian=True,
     ),
     "newton-projected": Preset(
-        "Newton's method, for long without the Hessian's negative parts: slower, and what a hard step falls back on",
+        "Newton's method with the projected Hessian for its first iterations: slower, the "
+        "fallback of a hard step",
         NEWTON,
         true_hessian=True,
         projected=100,
         chooses=True,
     ),
     "fast-msm": Preset(
-        "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a prefactored Cholesky",
-        {**PLAIN, **CHOLESKY},
+        "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a "
+        "prefactored Cholesky",
+        {**LOCAL_GLOBAL, **CHOLESKY},
         iterations=10,
     ),
     "paper": Preset(
         "Zheng et al.: the same iterations with plain CG from x = b to a fixed tolerance",
         {
-            **PLAIN,
+            **LOCAL_GLOBAL,
             "ksp_type": "cg",
             "pc_type": "none",
             "ksp_norm_type": "unpreconditioned",
-            "ksp_rtol": "1e-10",  # of |b|, as Algorithm 1 has it: 1e-6 left the step 17% off on a swinging beam
+            # Relative to |b|, as in Algorithm 1; 1e-6 leaves a large step error.
+            "ksp_rtol": "1e-10",
             "ksp_converged_use_initial_residual_norm": "",
         },
         start_from_b=True,
@@ -136,47 +153,47 @@ PRESETS = {
 }
 
 
-# a user who chooses another type does not want what only goes with ours
+# type option -> option that fits the preset's type only; a user's type drops it
 BOUND_TO_TYPE = {"pc_type": "pc_factor_mat_solver_type", "ksp_type": "ksp_norm_type"}
-# these solve with A or the Hessian themselves, without a plain iteration as their preconditioner
+# SNES types that solve with the Jacobian; they take no nonlinear preconditioner
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
 
-
-in_use: Counter[str] = (
-    Counter()
-)  # by how many solvers: the options in PETSc's database that are not the user's
+# preset option in PETSc's database -> number of solvers that use it
+in_use: Counter[str] = Counter()
 
 
 def preset_names() -> list[str]:
-    """Return the names of all presets, those that were registered or installed last."""
+    """Return the names of all presets: built-in presets first, then registered or installed."""
     return [*PRESETS, *ADDED.names()]
 
 
 def find_preset(name: str) -> Preset:
-    """Return the preset of a name. Raises InputError with the nearest name for an unknown one."""
+    """Return the preset of a name. Raises InputError, with the nearest name, if it is unknown."""
     if name in PRESETS:
         return PRESETS[name]
     if name not in ADDED.names():
         raise InputError(
             f"solver.preset: unknown preset {name!r}{did_you_mean(name, preset_names())}"
         )
-    added = ADDED.find(name)  # {"options": ..., "based_on": ..., "about": ...}
+    # An added preset is {"options": ..., "based_on": ..., "about": ...}.
+    added = ADDED.find(name)
     try:
         base = PRESETS[added.get("based_on", "newton")]
         words = options_of(words_of(added["options"]))
         return replace(base, about=str(added.get("about", "")), options=base.options | words)
     except (KeyError, TypeError, AttributeError):
         raise InputError(
-            f'the preset {name!r} is no table of "options", "based_on" (one of {", ".join(PRESETS)}) and "about"'
+            f'the preset {name!r} is no table of "options", "based_on" '
+            f'(one of {", ".join(PRESETS)}) and "about"'
         ) from None
 
 
 def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
-    """Options that PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
+    """Return the options of solvers, the user's options included, as lines of an options file.
 
-    solvers : prefix of their options -> preset and budget of iterations
+    An adaptive tolerance stands in a comment, because a given tolerance would be fixed.
 
-    A tolerance that is held to what a step needs stands in a comment: given, it would be held to as it is.
+    solvers : prefix of the solver's options -> preset and budget of iterations
     """
     ours = [SolverOptions(preset, prefix, budget) for prefix, (preset, budget) in solvers.items()]
     adapting = {
@@ -189,7 +206,7 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
         quoted = f'"{value}"' if value and " " in value else value or ""
         line = f"-{name} {quoted}".rstrip()
         if name in adapting:
-            line = f"# {line}    the tightest that a step may need; given, it is the one"
+            line = f"# {line}    the tightest that a step may need; fixed if given"
         lines.append(line)
     for each in ours:
         each.withdraw()
@@ -197,12 +214,12 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
 
 
 class SolverOptions:
-    """A preset's options in PETSc's database while its solver lives, where the user has set none.
+    """Keep a preset's options in PETSc's database while its solver exists; users' options win.
 
-    SNES then does not give up before the ``budget`` of iterations is spent.
+    The options let SNES run until the ``budget`` of iterations is spent.
 
-    prefix : of the solver's options
-    names  : of those that are the preset's own, prefix included
+    prefix : prefix of the solver's options
+    names  : names, with the prefix, of the options that come from the preset
     """
 
     def __init__(self, preset: Preset, prefix: str, budget: int):
@@ -223,19 +240,19 @@ class SolverOptions:
         in_use.update(self.names)
 
     def is_default(self, name: str) -> bool:
-        """Whether an option is the preset's own, not the user's."""
+        """Return whether an option comes from the preset, not from the user."""
         return self.prefix + name in self.names
 
     def is_given(self, name: str) -> bool:
-        """Whether an option stands in the database, the user's or the preset's."""
+        """Return whether the user or the preset sets an option."""
         return self.prefix + name in PETSc.Options().getAll()
 
     def value(self, name: str) -> str:
-        """Value of an option, the user's or the preset's; "" where there is none."""
+        """Return the value of an option; "" if neither the user nor the preset sets it."""
         return str(PETSc.Options().getString(self.prefix + name, ""))
 
     def withdraw(self) -> None:
-        """Leave the database as the user has it, for other presets and -options_left."""
+        """Remove the preset's options from the database, for other presets and -options_left."""
         in_use.subtract(self.names)
         for name in self.names:
             if not in_use[name]:

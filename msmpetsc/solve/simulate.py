@@ -1,4 +1,4 @@
-"""The run: one step after another, those that are stored yielded as frames."""
+"""Time loop of a run: take its steps and yield the stored steps as frames."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -49,13 +49,14 @@ INTEGRATORS: Integrators = {
     "verlet": Verlet,
     "static": Static,
 }
-REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
+# steps between checkpoints; caches are dropped there, so that a resumed run agrees
+REMEMBERED = 20
 
 
 def solvers_of(scene: Scene, true_error: int | None = None) -> dict[str, tuple[Preset, int]]:
-    """The solvers of a run: prefix of their PETSc options -> preset and budget of iterations.
+    """Return the solvers of a run: prefix of the PETSc options -> preset, budget of iterations.
 
-    true_error : every so many steps the true error is measured; None for never
+    true_error : number of steps between measurements of the true error; None: no measurement
     """
     solvers = {}
     if scene.time.integrator != "verlet":
@@ -68,42 +69,39 @@ def solvers_of(scene: Scene, true_error: int | None = None) -> dict[str, tuple[P
 
 
 def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
-    """Raise InputError for a preset that is unknown or not for this scene, and for true errors that there are not."""
+    """Raise InputError if the scene cannot use the preset or the measurement of true errors."""
     solvers = solvers_of(scene, true_error)
     if scene.touching and not all(preset.true_hessian for preset, _ in solvers.values()):
-        raise InputError(f"contact of surfaces is for newton's presets, not {scene.solver.preset}")
+        raise InputError(
+            f"contact of surfaces needs one of newton's presets, not {scene.solver.preset}"
+        )
     if scene.time.error and true_error:
-        raise InputError("the true error is of a step as the scene has it: time.error has others")
+        raise InputError("true errors need steps of constant length: leave out time.error")
     if "" not in solvers and true_error:
-        raise InputError("the true error is of a step that is solved: verlet has none")
+        raise InputError("true errors need steps that are solved: verlet has none")
 
 
 class TimeLoop:
-    """The loop over the steps of a run, from its start. A context manager, which destroys its PETSc objects on leaving.
+    """Take the steps of a run; as a context manager, destroy its PETSc objects on leaving.
 
-    state         : that goes with the last frame, or the last step
-    step          : steps taken
-    steps         : steps of the whole run
-    stored        : number of frames of the whole run; ``stored_until(step)`` of a part
-    saved         : the last step that the run may go on from: every ``REMEMBERED``-th
+    state  : state after the last step
+    step   : number of steps taken, of ``steps``
+    stored : number of frames of the whole run; ``stored_until(step)`` of its first steps
+    saved  : checkpoint of the last ``REMEMBERED``-th step, from which the run may resume
     """
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, true_error: int | None = None):
         model = to_device(model, sender(comm))
         if model.collision and not on_host(model.lattice.nodes):
             raise InputError("contact of surfaces is computed on CPUs: --device cpu")
-        self.comm, self.model, self.true_error, self.time_step = (
-            comm,
-            model,
-            true_error,
-            scene.time.step,
-        )
-        self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
+        self.comm, self.model = comm, model
+        self.true_error, self.time_step = true_error, scene.time.step
+        self.steps, self.every = scene.time.steps, scene.output.every
+        self.step = 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
         points = probe_points(model.bodies, scene.output.probe)
-        self.probe = (
-            ProbePoints(comm, model.lattice, points) if points else None
-        )  # may refuse: no PETSc objects yet
+        # ProbePoints may raise: it comes before the first PETSc object.
+        self.probe = ProbePoints(comm, model.lattice, points) if points else None
         self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
         swings = scene.time.integrator != "implicit-euler"
         self.balance = EnergyBalance(self.environment, self.elasticity, swings)
@@ -112,7 +110,8 @@ class TimeLoop:
             self.adaptive = Adaptive(scene, self._make, self.balance)
         self.integrator = self.adaptive or self._make(scene.time, scene.solver)
         take: TakeStep = partial(self.balance.step, self.integrator)
-        if self.adaptive:  # which has each of its own steps examined
+        # Adaptive passes each of its own steps through the energy balance.
+        if self.adaptive:
             take = self.adaptive.advance
         self.recovery = Recovery(scene, self._make, self.balance, take)
         self.monitors, self.true_errors = Monitors(self.environment, self.time_step), TrueErrors()
@@ -127,22 +126,26 @@ class TimeLoop:
             q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0)
         )
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
-        self.awaits_solve = False  # a step that reads what options are left
+        # The first solve reads options that the set-up leaves unread.
+        self.awaits_solve = False
         self.saved = Checkpoint()
 
     def _make(self, time: Time, solver: Solver, prefix: str = "") -> Integrator:
-        """Make the integrator that a scene's tables ask for, its PETSc options of this prefix (collective)."""
+        """Return the integrator of a scene's tables, with its prefix of options (collective)."""
         return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, prefix)
 
     def frames(self) -> Iterator[Frame]:
-        """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
+        """Yield frame 0, then a frame of every ``every``-th step and of the last (collective).
 
-        Raises StepFailed on all ranks, naming the step.
+        Raises StepFailed, with the number of the step, on all ranks.
         """
         return (frame for frame in self.advance() if frame is not None)
 
     def advance(self) -> Iterator[Frame | None]:
-        """Yield the same, and None after the steps between: after each the run may stop, or be saved (collective)."""
+        """Yield the frame of each step, or None if the step is not stored (collective).
+
+        The run may be stopped or saved after each step.
+        """
         if self.step == 0:
             self.monitors.overlaps(0, 0.0, self.state.q)
             self.balance.show(
@@ -159,7 +162,7 @@ class TimeLoop:
             self.adaptive.sum_up()
 
     def _advance(self, index: int) -> Frame | None:
-        """Take the next step (collective); its frame if it is stored. Raises StepFailed, naming the step."""
+        """Take the next step; return its frame if it is stored (collective). Raises StepFailed."""
         time = index * self.time_step
         self.monitors.overlaps(index, time, self.state.q)
         begin = perf_counter()
@@ -172,7 +175,7 @@ class TimeLoop:
         self.monitors.work += result.cost + Work(wall_time=perf_counter() - begin)
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
         if self.true_error and index % self.true_error == 0 and result.problem and not is_recovered:
-            assert isinstance(self.integrator, ImplicitEuler)  # which solves them
+            assert isinstance(self.integrator, ImplicitEuler)
             true, energy = self.true_errors.errors(
                 self.integrator.stepper, result.problem, result.position
             )
@@ -191,7 +194,10 @@ class TimeLoop:
         return frame
 
     def _save(self) -> Checkpoint:
-        """Store the state, and forget what is no part of it: a resumed run would not have it."""
+        """Return a checkpoint; drop all caches that it does not hold (collective).
+
+        A resumed run starts without these caches, and must agree to the last bit.
+        """
         checkpoint = Checkpoint(self.step)
         self.state.save(
             checkpoint,
@@ -207,7 +213,7 @@ class TimeLoop:
         return checkpoint
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint, before any step is taken (collective)."""
+        """Resume from a checkpoint before the first step (collective). Raises InputError."""
         checkpoint.refuse_rows_unlike(self.comm, self.saved)
         self.step = checkpoint.step
         self.state = State.restored(self.comm, self.model.lattice, checkpoint)
@@ -218,9 +224,9 @@ class TimeLoop:
         self.saved = self._save()
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
-        """Raise InputError for PETSc options of the user that nothing has used (collective).
+        """Raise InputError for the user's PETSc options that nothing has used (collective).
 
-        Called before the first step, it does so once more after the first that solves anything.
+        A call before the first step repeats the check after the first step that solves.
         """
         self.awaits_solve = self.step == 0 and not at_end
         awaited = {
@@ -231,13 +237,14 @@ class TimeLoop:
         refuse_unused(self.comm, not self.awaits_solve, prefixes)
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
-        """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
+        """Return the frame at q (l, 3) [m] with the work since the frame before (collective)."""
         time = index * self.time_step
         energies = self.balance.energies
         work = self.monitors.work
         gained = self.state.budget.since_frame
         self.monitors.error(index, time)
-        if index % self.every == 0:  # the last frame may come between: of a longer run it is none
+        # An extra last frame starts no interval: a longer run would not store it.
+        if index % self.every == 0:
             self.monitors.work = Work()
             self.state = replace(self.state, budget=replace(self.state.budget, since_frame=0.0))
         position = to_host(q[: self.model.lattice.owned])
@@ -264,7 +271,7 @@ class TimeLoop:
 
     @property
     def rows(self) -> dict[str, int]:
-        """Numbers of this rank's rows of the fields that not all scenes ask for."""
+        """Return the number of this rank's rows of each optional field of a frame."""
         lattice, rows = self.model.lattice, dict(self.forces.rows)
         if self.probe:
             rows["probe"] = len(self.probe.corners)
@@ -290,33 +297,41 @@ class TimeLoop:
         self.destroy()
 
     def destroy(self) -> None:
+        """Destroy all PETSc objects (collective)."""
         self.true_errors.destroy()
         self.recovery.destroy()
         self.integrator.destroy()
 
 
 class SurfaceMotion:
-    """The surface of a frame, W @ positions: this rank's rows of W, and a way to the nodes that they need."""
+    """Compute the surface W @ positions of a frame.
+
+    weights  : this rank's rows of W
+    to_owner : exchange of the node positions that these rows need
+    asked    : this rank's nodes that other ranks need
+    """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
         columns, local = np.unique(embedding.indices, return_inverse=True)
         shape = embedding.shape[0], len(columns)
         self.weights = csr_array((embedding.data, local.ravel(), embedding.indptr), shape=shape)
         self.to_owner = Route(comm, lattice.table.owner_of_index(columns))
-        self.asked = self.to_owner.send(columns) - lattice.table.first  # own nodes that ranks need
+        self.asked = self.to_owner.send(columns) - lattice.table.first
 
     def __call__(self, position: Positions) -> Rows:
-        """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
+        """Return the surface points (v_local, 3) [m] of positions (owned, 3) [m] (collective)."""
         surface: Rows = self.weights @ self.to_owner.answer(position[self.asked])
         return surface
 
 
 class Forces:
-    """The forces on a body at a frame (fields.Frame), by the names of those that the scene has a use for: loads,
-    reactions of pins and anchors, pushes of obstacles and of the surface.
+    """Compute the force fields of a frame (fields.Frame) that the scene needs.
 
-    They are those of the step that ended last: its inertia, and friction as it had it. Where there is none, as at the
-    start and in explicit steps, nothing that is held accelerates, and obstacles push without friction.
+    The fields are loads, reactions of pins and anchors, and contact forces of obstacles and of the
+    surface. Inertia and friction are taken from the last implicit step. At the start and in
+    explicit steps, held nodes do not accelerate and obstacles have no friction.
+
+    rows : name of a field -> its number of rows
     """
 
     def __init__(self, model: Model, environment: Environment, elasticity: Elasticity):
@@ -324,10 +339,10 @@ class Forces:
         self.elasticity = elasticity
         self.keys = [obstacle.key for obstacle in model.obstacles]
         bodies = len(model.lattice.first_of_body) if model.collision else 0
-        held = len(model.holders.keys)
+        holders = len(model.holders.keys)
         rows = {
-            "reaction": held,
-            "torque": held,
+            "reaction": holders,
+            "torque": holders,
             "push": len(model.obstacles),
             "contact_push": bodies,
         }
@@ -336,16 +351,20 @@ class Forces:
     def __call__(
         self, q: Positions, time: float, sides: Indices | None, step: StepResult | None
     ) -> dict[str, Any]:
-        """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
+        """Return the force fields at q (l, 3) [m] (collective).
+
+        time  : end time [s] of the last step
+        sides : (o, l) contact faces of the nodes
+        step  : result of the last step; None at the start
+        """
         environment, owned = self.environment, self.model.lattice.owned
         problem = step.problem if step else None
         contact = problem.contact if problem else environment.obstacles.push(time, sides)
         load = environment.forces.at(time)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "reaction" in self.rows:
-            held = (self._held(q, contact, step) - load) * environment.anchors.fixed_at(time)[
-                :owned, None
-            ]
+            fixed = environment.anchors.fixed_at(time)[:owned, None]
+            held = (self._holding_forces(q, contact, step) - load) * fixed
             sums["reaction"] = self.model.holders.totals(held)
             sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
         return {
@@ -355,14 +374,16 @@ class Forces:
         }
 
     def _torque_points(self, time: float) -> Positions:
-        """Return the points (a, 3) [m] about which the torques of pins and anchors are counted, which these lead."""
+        """Return the reference points (a, 3) [m] of the torques of pins and anchors."""
         points, anchors = self.model.holders.centers.copy(), self.model.anchors
         for row, anchor in enumerate(anchors, len(points) - len(anchors)):
             points[row] = anchor.path.center + anchor.path.value_at(time)[:3]
         return points
 
-    def _held(self, q: Positions, contact: Contact | None, step: StepResult | None) -> Rows:
-        """Return what would hold this rank's nodes where they are, beside the loads (owned, 3) [N]."""
+    def _holding_forces(
+        self, q: Positions, contact: Contact | None, step: StepResult | None
+    ) -> Rows:
+        """Return the forces (owned, 3) [N] that hold the nodes in place, without the loads."""
         held, owned = np.zeros_like(q), self.model.lattice.owned
         self.elasticity.add_gradient(q, held)
         if contact:
@@ -379,7 +400,7 @@ class Forces:
         return held
 
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
-        """Return the pushes of obstacles (o, 3) and of contact on bodies (b, 3) on this rank's nodes with [N]."""
+        """Return the contact forces [N] of obstacles (o, 3) and on bodies (b, 3) of this rank."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
         push = np.zeros((len(self.keys), 3))
         for state in contact.states if contact else ():

@@ -1,4 +1,4 @@
-"""Work that steps took: what a clock would measure, where clocks do not agree."""
+"""Work of steps: counts that do not depend on the machine, wall time and errors."""
 
 from dataclasses import dataclass, replace
 
@@ -7,21 +7,32 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Work:
-    """Work of one step or of several, which adds up; of their errors the greatest counts."""
+    """Work and errors of some steps: counts add up, the largest error remains.
 
-    step_error: float = 0.0  # estimated, relative
-    iterations: int = 0  # of SNES; substeps of an explicit integrator
-    ksp_its: int = 0  # KSP iterations of all of them, and of what examines their results
-    products: int = 0  # with the Hessian, those at multigrid's finest level included
-    proof_products: int = (
-        0  # of these, for estimates of errors and in searches for a negative curvature
-    )
-    steps: int = 0  # that stand
-    substeps: int = 0  # shorter steps taken in place of one that failed
-    fallbacks: int = 0  # steps solved by the robust method
-    wall_time: float = 0.0  # [s]
-    true_error: float = np.nan  # measured against steps solved to rounding; NaN where none was
-    energy_error: float = np.nan  # the same of the energy
+    step_error     : estimated relative error of a step
+    iterations     : SNES iterations, or substeps of an explicit integrator
+    ksp_its        : KSP iterations of the solves and of the error estimates
+    products       : products with the Hessian, multigrid's finest level included
+    proof_products : of these, products of error estimates and searches for negative curvature
+    steps          : accepted steps
+    substeps       : shorter steps in place of a failed step
+    fallbacks      : steps solved by the robust method
+    wall_time      : [s]
+    true_error     : relative position error against a step solved to rounding, or NaN
+    energy_error   : relative energy error against a step solved to rounding, or NaN
+    """
+
+    step_error: float = 0.0
+    iterations: int = 0
+    ksp_its: int = 0
+    products: int = 0
+    proof_products: int = 0
+    steps: int = 0
+    substeps: int = 0
+    fallbacks: int = 0
+    wall_time: float = 0.0
+    true_error: float = np.nan
+    energy_error: float = np.nan
 
     def __add__(self, other: "Work") -> "Work":
         sums = {name: vars(self)[name] + vars(other)[name] for name in COUNTED}
@@ -29,9 +40,9 @@ class Work:
         return Work(**sums, **errors)
 
     def __sub__(self, before: "Work") -> "Work":
-        """Return the work since ``before``; errors are those of now."""
+        """Return the work since ``before``, with the present errors."""
         return replace(self, **{name: vars(self)[name] - vars(before)[name] for name in COUNTED})
 
 
 ERRORS = ("step_error", "true_error", "energy_error")
-COUNTED = [name for name in vars(Work()) if name not in ERRORS]  # what adds up
+COUNTED = [name for name in vars(Work()) if name not in ERRORS]

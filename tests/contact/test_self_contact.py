@@ -282,7 +282,7 @@ def test_what_would_move_the_surface_past_itself_is_refused(tmp_path, override: 
 
 def test_presets_of_a_are_refused(tmp_path):
     scene = load_scene(pinch_scene(tmp_path), ("solver.preset=anderson",))
-    with pytest.raises(InputError, match="is for newton's presets, not anderson"):
+    with pytest.raises(InputError, match="one of newton's presets, not anderson"):
         refuse_bad_options(scene)
 
 

@@ -1,14 +1,14 @@
-"""Steps as long as the motion allows: an integrator of steps of many lengths, powers of two apart.
+"""Adaptive time steps: choose step lengths, powers of two apart, for a trajectory error.
 
-What a step adds to the error of the trajectory is its local error: from positions q and velocities v at its two ends,
+The local error of a step follows from positions q and velocities v at its ends:
 
     implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
-Means of these over neighbours, and what the README counts besides, ``StepControl`` adds up.
+``StepControl`` sums local errors, averaged over neighbours, and the errors of contact (README).
 
-A run whose motion is of size U may end with its trajectory off by ``error`` U. Steps pay for that
-with their local errors, from a credit that grows as the motion does, and with time:
+If U is the size of the motion, the trajectory error of the run may reach ``error`` U. Each step
+spends its local error from a credit that grows with the motion and with time:
 
     credit(t) = error / 2 (U(t) + 1/T integral_0^t U)
 
@@ -38,40 +38,55 @@ from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
-LOWEST, HIGHEST = -10, 6  # levels
-KEPT = 4  # integrators of as many lengths, those used last
-JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it yet
+# levels of the shortest and the longest step; 1/1024 and 64 times the scene's step
+LOWEST, HIGHEST = -10, 6
+# number of step lengths whose integrators are kept; neighbouring lengths alternate
+KEPT = 4
+# end of a step before an event, over the event's time; the event must not act yet
+JUST_BEFORE = 1 - 1e-10
+# averages over neighbours in a local error; they remove waves as short as a cell
 SWEEPS = 4
-SHARE = 1 / 8  # of what was saved, that a step may spend
-FAIR = 0.25  # of an equal share of all credit among all steps: a step may spend that in any case
-EXCESS = 2.0  # times what a step may spend: it is taken all the same, the next one is shorter
-CALM = 2  # steps that would have let the next be twice as long, before it is
+# part of the saved credit that a step may spend; savings must last for an impact
+SAVINGS_SHARE = 1 / 8
+# part of an equal share of all credit that any step may spend; the run must advance
+FAIR_SHARE = 0.25
+# largest accepted error, over the allowed error; an excess shortens the next step
+EXCESS = 2.0
+# steps in a row that allow a longer step before the step grows; it must not alternate
+CALM = 2
 
 
+# integrator -> order of its error
 ORDERS = {"implicit-euler": 1, "bdf2": 2}
 
 
 def local_error(order: int, q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
-    """Local error (n, 3) [m] of a step of an order from q with velocity v to x with velocity w."""
+    """Return the local error (n, 3) [m] of a step.
+
+    order : order of the integrator, 1 or 2
+    q, v  : (n, 3) [m], [m/s] at the start of the step
+    x, w  : (n, 3) [m], [m/s] at its end
+    """
     if order == 1:
         return 0.5 * time_step * (w - v)
     return 1.6 * (x - q - 0.5 * time_step * (v + w))
 
 
 class NeighbourMean:
-    """Averages vectors over nodes and their neighbours by springs, ``SWEEPS`` times. Collective."""
+    """Average vectors over nodes and their spring neighbours, ``SWEEPS`` times (collective)."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.comm, self.lattice = comm, lattice
         ends, nodes = to_host(lattice.springs), np.arange(len(lattice.nodes))
         rows, columns = np.r_[ends[:, 0], ends[:, 1], nodes], np.r_[ends[:, 1], ends[:, 0], nodes]
-        own = rows < lattice.owned  # all springs at them are known here
+        # A rank knows all springs of its owned nodes.
+        own = rows < lattice.owned
         shape = lattice.owned, len(nodes)
         joined = csr_array((np.ones(own.sum()), (rows[own], columns[own])), shape=shape)
         self.weights = csr_array(joined.multiply(1 / joined.sum(axis=1)[:, None]))
 
     def __call__(self, vectors: Rows) -> Rows:
-        """Return the means of vectors (owned, 3)."""
+        """Return the averages (owned, 3) of vectors (owned, 3)."""
         means = to_host(vectors)
         for _ in range(SWEEPS):
             means = self.weights @ with_ghosts(self.comm, self.lattice, means)
@@ -81,36 +96,37 @@ class NeighbourMean:
 def between(
     q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float
 ) -> tuple[Positions, Rows]:
-    """Positions and velocities at a share s of a step, by Hermite's cubic between its ends; s may lie outside."""
+    """Return positions and velocities within a step by Hermite's cubic between its ends.
+
+    s : position within the step, 0 at its start and 1 at its end; other values extrapolate
+    """
     t, r = time_step, 1 - s
-    q = (
-        r * r * (1 + 2 * s) * q_0
-        + s * r * r * t * v_0
-        + s * s * (3 - 2 * s) * q_1
-        - s * s * r * t * v_1
-    )
+    q = r * r * (1 + 2 * s) * q_0 + s * r * r * t * v_0
+    q = q + s * s * (3 - 2 * s) * q_1 - s * s * r * t * v_1
     v = 6 * s * r / t * (q_1 - q_0) + r * (1 - 3 * s) * v_0 + s * (3 * s - 2) * v_1
     return q, v
 
 
 @dataclass(frozen=True)
 class Measure:
-    """What a step showed [m]: its local error, and the size of the motion so far, both root mean squares by mass."""
+    """Local error of a step and size of the motion so far [m], root mean squares by mass."""
 
     error: float
     motion: float
 
 
 class StepControl:
-    """Chooses levels, of steps 2^level times the scene's, and keeps the account of one run. Ranks choose alike.
+    """Choose the levels of steps and keep the error account of a run, alike on all ranks.
 
-    order           : of the integrator
-    error           : asked of the trajectory, relative to the size of the motion
-    step, duration  : a step of level 0, and the whole run [s]
-    lowest, highest : levels
-    level           : wanted next
+    A step of a level is 2^level times as long as the scene's step.
+
+    asked           : error tolerance of the trajectory, relative to the size of the motion
+    step, duration  : length of a step of level 0, and of the run [s]
+    calm            : consecutive steps that would have allowed a longer step
+    motion          : size of the motion so far [m]
+    passed          : mean of the motion's size over the duration [m], later steps counted as 0
     spent           : sum of local errors [m]
-    steps, time     : number of the steps that they are of, and their length [s]
+    steps, time     : number of accepted steps, and their total length [s]
     """
 
     def __init__(
@@ -119,23 +135,25 @@ class StepControl:
         self.order, self.asked, self.step, self.duration = order, error, step, duration
         self.lowest, self.highest = levels
         self.level, self.calm = min(0, self.highest), 0
-        self.motion = self.passed = self.spent = 0.0  # [m], [m] mean over the duration, [m]
+        self.motion = self.passed = self.spent = 0.0
         self.steps, self.time = 0, 0.0
 
     @property
     def estimate(self) -> float:
-        """Estimated error of the trajectory so far, relative to the size of the motion."""
+        """Return the estimated error of the trajectory, relative to the size of the motion."""
         return self.spent / self.motion if self.motion > 0 else 0.0
 
     def allowed(self, level: int, measure: Measure) -> float:
-        """What a step of a level may spend [m]."""
-        motion, part = max(self.motion, measure.motion), self.step * 2.0**level / self.duration
+        """Return the error [m] that a step of a level may have."""
+        motion = max(self.motion, measure.motion)
+        part = self.step * 2.0**level / self.duration
         saved = 0.5 * self.asked * (motion + self.passed) - self.spent
         fair = self.asked * motion * self.time / self.duration / max(self.steps, 1)
-        return max(0.5 * self.asked * motion * part + SHARE * max(saved, 0.0), FAIR * fair)
+        earned = 0.5 * self.asked * motion * part
+        return max(earned + SAVINGS_SHARE * max(saved, 0.0), FAIR_SHARE * fair)
 
     def accepts(self, level: int, measure: Measure) -> bool:
-        """Whether a step of a level stands as it is; else the level for another try is set."""
+        """Return whether a step of a level is accepted; if not, lower the level."""
         allowed = self.allowed(level, measure)
         if level == self.lowest or measure.error <= EXCESS * allowed:
             return True
@@ -147,18 +165,20 @@ class StepControl:
         return False
 
     def shorten(self, level: int, by: int = 1) -> bool:
-        """Want a level lower than this one, whose step failed; whether there is any."""
+        """Lower the level below that of a failed step; return whether a lower level exists."""
         self.level, self.calm = max(self.lowest, level - by), 0
         return level > self.lowest
 
     def pay(self, level: int, measure: Measure) -> None:
-        """Enter a step that stands, and choose the level that comes next."""
+        """Enter an accepted step into the account, and choose the level of the next step."""
         allowed = self.allowed(level, measure)
-        longer, growth = self.level + 1, 2.0 ** ((self.order + 1) * (self.level + 1 - level))
+        longer = self.level + 1
+        growth = 2.0 ** ((self.order + 1) * (longer - level))
         is_calm = measure.error * growth <= self.allowed(longer, measure)
         self.motion = max(self.motion, measure.motion)
         self.passed += self.motion * self.step * 2.0**level / self.duration
-        self.spent, self.steps = self.spent + measure.error, self.steps + 1
+        self.spent += measure.error
+        self.steps += 1
         self.time += self.step * 2.0**level
         if measure.error > allowed:
             self.shorten(level)
@@ -169,16 +189,19 @@ class StepControl:
 
     @property
     def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
+        """Return the attributes that a checkpoint holds, with their ranges."""
         lengths = dict.fromkeys(("time", "motion", "passed", "spent"), LENGTH)
         return {"level": (self.lowest, self.highest), "calm": (0, CALM), "steps": COUNT, **lengths}
 
 
 class Ticks:
-    """Times of steps, counted in ticks: the shortest step. A step of a level starts at a multiple of its own length,
-    so that frames lie at ends of steps or within one; none goes beyond a known event, nor the end of the run.
+    """Count time in ticks, the length of the shortest step.
 
-    events : ticks at which something begins, ends or turns, of times [s] as near as ``NEAREST`` levels below a step
+    A step of a level starts at a multiple of its own length, so that no frame lies in two steps. No
+    step crosses an event or the end of the run.
+
+    events : ticks of the events, rounded to a step ``NEAREST`` levels below the scene's step
+    ticks  : number of ticks of the run
     """
 
     NEAREST = 4
@@ -190,15 +213,15 @@ class Ticks:
         self.events = sorted(tick for tick in ends if 0 < tick < self.ticks)
 
     def length(self, level: int) -> int:
-        """Ticks of a step."""
+        """Return the length of a step of a level in ticks."""
         return 1 << (level - self.lowest)
 
     def time(self, tick: int) -> float:
-        """Time of a tick [s]."""
+        """Return the time [s] of a tick."""
         return tick / 2.0**-self.lowest * self.step
 
     def fitting(self, tick: int, level: int) -> int:
-        """The highest level, not above the one wanted, of a step that may start at a tick."""
+        """Return the highest level, at most ``level``, of a step that may start at a tick."""
         limit = next((event for event in self.events if event > tick), self.ticks)
         while level > self.lowest and (
             tick % self.length(level) or tick + self.length(level) > limit
@@ -208,15 +231,14 @@ class Ticks:
 
 
 class Adaptive(Integrator):
-    """Takes the scene's steps in steps of its own, shorter or longer ones.
+    """Take the scene's steps as adaptive steps, which may be shorter or longer.
 
-    States are of the scene's step, (q_n - q_(n-1)) / t the velocity, but may be of a later time:
-    the end of a step longer than the scene's. Their history is where the last step began.
+    A state has the velocity (q_n - q_(n-1)) / t with the scene's step t. Its time may lie beyond
+    the scene's step, at the end of a longer step. Its history is the start of the last step.
 
-    make    : makes an integrator of steps of one length
-    balance : examines the steps that stand
-    tick    : of the state's time (Ticks)
-    last    : level of the step taken last
+    integrators : level -> integrator; the integrator used last comes last
+    tick        : time of the state (Ticks)
+    last        : level of the last step
     """
 
     looks_back = True
@@ -227,26 +249,22 @@ class Adaptive(Integrator):
         assert scene.time.error is not None
         self.balance, self.comm = balance, balance.comm
         self.lattice, self.environment = balance.lattice, balance.environment
-        self.make, self.time, self.solver, self.time_step = (
-            make,
-            scene.time,
-            scene.solver,
-            scene.time.step,
-        )
+        self.make, self.solver = make, scene.solver
+        self.time, self.time_step = scene.time, scene.time.step
         self.order = ORDERS[scene.time.integrator]
         steps = scene.time.steps
-        self.levels = LOWEST, HIGHEST  # of its steps
+        self.levels = LOWEST, HIGHEST
         self.control = StepControl(
             self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels
         )
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.mean = NeighbourMean(self.comm, self.lattice)
-        self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
+        self.integrators: dict[int, Integrator] = {}
         self.tick = self.last = 0
         self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
 
     def set_up(self) -> None:
-        """Make ready the integrator of the first step, and say what is to come."""
+        """Prepare the integrator of the first step, and log the range of step lengths."""
         self._integrator(self.control.level)
         shortest, longest = (self.time_step * 2.0**level for level in self.levels)
         log.info(
@@ -257,96 +275,98 @@ class Adaptive(Integrator):
         )
 
     def _integrator(self, level: int) -> Integrator:
-        """Return a level's integrator, which forgets earlier steps if another was used last."""
-        if level not in self.kept:
+        """Return the integrator of a level, without data of steps before another level's."""
+        if level not in self.integrators:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
-            self.kept[level] = self.make(time, self.solver)
-            self.kept[level].set_up()
+            self.integrators[level] = self.make(time, self.solver)
+            self.integrators[level].set_up()
             if self.tick:
-                self.kept[level].forget()  # as one that was kept and not used last
-        elif level != next(reversed(self.kept)):
-            self.kept[level] = self.kept.pop(level)
-            self.kept[level].forget()
-        while len(self.kept) > KEPT:
-            self.kept.pop(next(iter(self.kept))).destroy()
-        return self.kept[level]
+                # A new integrator must not differ from a kept integrator.
+                self.integrators[level].forget()
+        elif level != next(reversed(self.integrators)):
+            self.integrators[level] = self.integrators.pop(level)
+            self.integrators[level].forget()
+        while len(self.integrators) > KEPT:
+            self.integrators.pop(next(iter(self.integrators))).destroy()
+        return self.integrators[level]
 
     def _length(self, level: int) -> float:
-        """Length of a step [s]."""
+        """Return the length [s] of a step of a level."""
         return self.time_step * 2.0**level
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """Take the steps up to ``time``; what a frame shows then. Raises StepFailed."""
-        frame = round(time / self.time_step)
-        wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, Work())
-        self.tick = max(self.tick, wanted - self.ticks.length(0))  # after a recovered step
+        """Take the steps up to ``time`` [s]; return the result at that time and the last state.
+
+        Raises StepFailed.
+        """
+        wanted = round(time / self.time_step) * self.ticks.length(0)
+        total = StepResult(state.q, state.q_previous, Work())
+        # A recovered step advances the state, but not the ticks.
+        self.tick = max(self.tick, wanted - self.ticks.length(0))
         while self.tick < wanted:
             result, state = self._step(state)
             total = replace(result, cost=total.cost + result.cost)
         if self.tick > wanted or not total.cost.steps:
-            total = self._within(
-                total, state, (self.tick - wanted) / self.ticks.length(self.last), time
-            )
+            remaining = (self.tick - wanted) / self.ticks.length(self.last)
+            total = self._within(total, state, remaining, time)
         return replace(total, time_error=self.control.estimate), state
 
-    def _within(self, total: StepResult, state: State, share: float, time: float) -> StepResult:
-        """Interpolate the result at a share of the last step before its end."""
+    def _within(self, total: StepResult, state: State, remaining: float, time: float) -> StepResult:
+        """Return the result at ``time``, the ``remaining`` part of the last step before its end."""
         q, v = state.q, state.velocity(self.time_step)
-        if share > 0 and state.history:
-            q, v = between(*state.history, q, v, self._length(self.last), 1 - share)
-            led = self.environment.anchors.prescribed(q, time)
-            q = q if led is None else led
+        if remaining > 0 and state.history:
+            q, v = between(*state.history, q, v, self._length(self.last), 1 - remaining)
+            prescribed = self.environment.anchors.prescribed(q, time)
+            q = q if prescribed is None else prescribed
         self.balance.show(q, v, time, state.sides)
         return replace(total, position=q, previous=q - self.time_step * v)
 
     def _step(self, state: State) -> tuple[StepResult, State]:
-        """Take the next step, again and shorter if its error is too large. Raises StepFailed."""
+        """Take the next step; repeat it shorter if its error is too large. Raises StepFailed."""
         restarts = self.tick in self.ticks.events
         cost = Work()
         while True:
             longest = self.control.level
-            if state.history is not None:  # the step needs it: no more than twice as long
+            # The history supports steps at most twice as long.
+            if state.history is not None:
                 longest = min(longest, self.last + 1)
             level = self.ticks.fitting(self.tick, longest)
-            before, end = (
-                self._begun(state, level, restarts),
-                self._reached(self.tick + self.ticks.length(level)),
-            )
+            before = self._start_of(state, level, restarts)
+            end = self._end_time(self.tick + self.ticks.length(level))
             try:
                 result, after = self.balance.step(self._integrator(level), before, end)
                 measure = self._measure(before, result, after, level)
-                stands = self.control.accepts(level, measure)
+                is_accepted = self.control.accepts(level, measure)
             except StepFailed:
-                stands = False
+                is_accepted = False
                 if not self.control.shorten(level):
                     raise
             else:
                 cost += result.cost
-            if stands:
+            if is_accepted:
                 self.control.pay(level, measure)
-                result = replace(
-                    result, cost=replace(cost, steps=1, step_error=result.cost.step_error)
-                )
-                return self._taken(result, before, after, level)
+                cost = replace(cost, steps=1, step_error=result.cost.step_error)
+                return self._accepted(replace(result, cost=cost), before, after, level)
 
-    def _begun(self, state: State, level: int, restarts: bool) -> State:
+    def _start_of(self, state: State, level: int, restarts: bool) -> State:
+        """Return the state from which a step of a level starts; ``restarts`` drops the history."""
         v = state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
-            history = between(
-                *history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last)
-            )
+            s = 1 - 2.0 ** (level - self.last)
+            history = between(*history, state.q, v, self._length(self.last), s)
         return replace(state, q_previous=state.q - self._length(level) * v, history=history)
 
-    def _reached(self, tick: int) -> float:
-        """Time of a step that ends at a tick [s]: just before what begins or ends there."""
+    def _end_time(self, tick: int) -> float:
+        """Return the end time [s] of a step that ends at a tick: just before an event there."""
         return self.ticks.time(tick) * (JUST_BEFORE if tick in self.ticks.events else 1.0)
 
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
+        """Return the local error of a step and the size of the motion."""
         owned, t = slice(self.lattice.owned), self._length(level)
         mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
-        end = self._reached(self.tick + self.ticks.length(level))
+        end = self._end_time(self.tick + self.ticks.length(level))
         free = mass * ~self.environment.anchors.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
         local = self.mean(local_error(self.order, q, v, x, w, t) * (free > 0)[:, None])
@@ -354,26 +374,26 @@ class Adaptive(Integrator):
             mass @ (local**2).sum(axis=1),
             mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1),
         ]
+        # At rest, the size of the motion is the displacement until the next frame.
         coming = t * v
-        if (
-            not self.control.motion
-        ):  # of a run that begins from rest: what will move until the next frame
+        if not self.control.motion:
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
+        # An impact or a change of contact force may come anywhere within the step.
         late = t * (free @ np.sqrt((struck**2).sum(axis=1)))
         if self.environment.obstacles.penalties:
             ends = (before.q[owned], before.sides), (x, after.sides)
             late += t**2 * ((free > 0) @ self.environment.obstacles.change_of_push(*ends, end, t))
         sums += [mass @ (coming**2).sum(axis=1), late]
-        error, motion, coming, late = (
-            self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
-        )
-        return Measure(
-            math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming))
-        )
+        means = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
+        error, motion, coming, late = means
+        if not self.control.motion:
+            motion = max(motion, coming)
+        return Measure(math.sqrt(error) + late, math.sqrt(motion))
 
-    def _taken(
+    def _accepted(
         self, result: StepResult, before: State, after: State, level: int
     ) -> tuple[StepResult, State]:
+        """Return the result and the state after an accepted step, for the scene's step."""
         t, T = self._length(level), self.time_step
         self.tick += self.ticks.length(level)
         self.last = level
@@ -389,19 +409,20 @@ class Adaptive(Integrator):
     def save(self, checkpoint: Checkpoint) -> None:
         for part in (self, self.control):
             checkpoint.keep_counts(part)
-        self.kept[next(reversed(self.kept))].save(checkpoint)  # that used last
+        last_used = next(reversed(self.integrators))
+        self.integrators[last_used].save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         for part in (self, self.control):
             checkpoint.restore_counts(part)
-        self._integrator(self.last).restore(checkpoint, self._reached(self.tick))
+        self._integrator(self.last).restore(checkpoint, self._end_time(self.tick))
 
     def forget(self) -> None:
-        for integrator in self.kept.values():
+        for integrator in self.integrators.values():
             integrator.forget()
 
     def sum_up(self) -> None:
-        """Say at the end of a run how far off the motion may be."""
+        """Log the estimated error of the motion at the end of a run."""
         log.info(
             "the motion is some %.2g of its size off (time.error = %g)",
             self.control.estimate,
@@ -409,5 +430,5 @@ class Adaptive(Integrator):
         )
 
     def destroy(self) -> None:
-        for integrator in self.kept.values():
+        for integrator in self.integrators.values():
             integrator.destroy()

@@ -1,18 +1,21 @@
-"""Implicit steps: a step of the scene is one minimisation, solved by a solver that knows which nodes are free.
+"""Implicit integrators: implicit Euler and BDF2 take each step as a minimisation.
 
-Implicit Euler and BDF2 both look for the x where  M (x - y) + tau^2 (grad E(x) - f_ext) = 0;  they differ in y, what
-x were without forces, and in tau, a share of the time step t.
+Both integrators solve  M (x - y) + tau^2 (grad E(x) - f_ext) = 0  for x. They differ in y, the
+positions without forces, and in tau, which is a fixed part of the time step t.
 
-Damping by the mass adds -alpha M v to the forces. With v = (x - c) / tau, the velocity that belongs
-to x, and y = c + tau w
+Mass-proportional damping adds -alpha M v to the forces. With v = (x - c) / tau and y = c + tau w,
 
-    M (x - c - tau w) + tau alpha M (x - c) + tau^2 (grad E(x) - f_ext) = 0,
+    M (x - c - tau w) + tau alpha M (x - c) + tau^2 (grad E(x) - f_ext) = 0.
 
-which is the same problem after division by 1 + alpha tau: of y = c + tau w / (1 + alpha tau), and with
-tau^2 / (1 + alpha tau) for tau^2. So a step costs as much, and what nothing else moves slows down by 1 + alpha tau.
+Division by 1 + alpha tau gives an undamped problem with
 
-A viscous solid has its dissipation over the step beside E (elasticity.viscosity), with x^ = c, so that v is that of x.
-Euler's difference of two positions is that of the turn half way between; BDF2's is of the step's end.
+    y = c + tau w / (1 + alpha tau)    and    tau^2 / (1 + alpha tau) for tau^2.
+
+Damping therefore costs nothing. Without forces, a step divides the velocity by 1 + alpha tau.
+
+For a viscous solid, E contains the dissipation over the step (elasticity.viscosity), with x^ = c.
+The rates of implicit Euler belong to the mid-step rotation, and the rates of BDF2 to the step's
+end.
 """
 
 from collections.abc import Callable
@@ -37,51 +40,58 @@ from msmpetsc.solve.petsc.events import CONTACT
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
-MOST_SOLVES = 10  # of a step, for nodes that pass through a box
-MOST_NARROW = 3  # solves of a step that are asked for the pairs around contacts alone
-LEFT_OUT = 1e-4  # of the energy that the error allowed is worth: what stores less moves x by a hundredth of that
+# most solves of a step for its contact faces; nodes may pass through a thin obstacle
+MOST_SOLVES = 10
+# most solves with the pairs around contacts only; later solves search all pairs
+MOST_NARROW = 3
+# energy of surface pairs left out, over that of the error; x moves by 0.01 of the error
+LEFT_OUT = 1e-4
 
 
 @dataclass
 class ContactFaces:
-    """Search for the faces by which nodes are pushed out of obstacles in one step. All methods are collective.
+    """Find the obstacle faces at which nodes are in contact in a step. All methods are collective.
 
-    They are settled before the step is solved, by the way to y. Where the way to x shows others,
-    the step is solved again; from then on a node that has a face keeps it, so that this ends.
+    The first solve takes the faces that nodes cross on the path from q to y. If the path to the
+    solution x crosses other faces, the step is solved again. From then on a node keeps its face, so
+    that the search ends.
 
-    The surface is asked about around its contacts alone where the step begins, if these are few; where there are none,
-    not at all. Where the way to x or x shows others, the step is solved again: so all of it is looked at once, and not
-    for each iterate.
+    If the surface has few contacts at the start, the first solves take only candidate pairs around
+    these contacts. If there are no contacts, they take none. If the solution shows other contacts,
+    the step is solved again. This replaces a broad phase at each iterate.
 
-    q, y       : (l, 3) [m], as a StepProblem has them
-    q_before   : (l, 3) [m] one step before q, of a step that looks so far back
-    sides      : (o, l) faces of the problem to solve; once settled, those of the step
-    is_settled : the problem solved last was the right one
+    q, y       : (l, 3) [m] as in StepProblem
+    before     : (o, l) faces at the start of the step; None: the nearest faces
+    fixed      : (l,) bool, nodes that are not unknowns
+    q_before   : (l, 3) [m] positions one step before q, for BDF2
+    sides      : (o, l) faces of the next solve; in the end, the faces of the step
+    is_settled : whether the last solve had the right contacts
+    contact    : contact of the last solve
+    start      : (l, 3) [m] solution that the next solve may start from
+    end        : (l, 3) [m] solution whose normal forces set friction, if they changed much
     """
 
     environment: Environment
     q: Positions
     y: Positions
-    time: float  # of the step's end [s]
+    time: float
     time_step: float
-    before: Indices | None  # (o, l) faces when it began (environment); None: the nearest
-    fixed: Mask  # (l,) bool, nodes that are no unknowns
+    before: Indices | None
+    fixed: Mask
     q_before: Positions | None = None
 
     def __post_init__(self) -> None:
         self.solves = 0
         self.is_settled = False
-        self.contact: Contact | None = None  # of the problem solved last
-        self.start: Positions | None = None  # of an earlier solve, that the next one may begin with
-        self.end: Positions | None = (
-            None  # of a solve whose friction went by a push far from the one there
-        )
+        self.contact: Contact | None = None
+        self.start: Positions | None = None
+        self.end: Positions | None = None
         self.sides = self._crossed(self.y)
         with CONTACT:
             self.environment.begin_contacts(self.q, self.time, self.time_step)
 
     def _crossed(self, end: Positions) -> Indices:
-        """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
+        """Return the sides (o, l) of nodes that move straight from q to ``end`` (l, 3) [m]."""
         with CONTACT:
             obstacles, held = self.environment.obstacles, self.fixed
             return obstacles.contact_faces(
@@ -89,15 +99,15 @@ class ContactFaces:
             )
 
     def problem(self) -> StepProblem:
-        """Return the problem of the step with the faces as they are known now."""
+        """Return the problem of the step with the present contact faces."""
         environment, time = self.environment, self.time
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
-        led = environment.anchors.prescribed(self.q, time)
-        return StepProblem(self.q, self.y, environment.forces.at(time), self.contact, led)
+        prescribed = environment.anchors.prescribed(self.q, time)
+        return StepProblem(self.q, self.y, environment.forces.at(time), self.contact, prescribed)
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
-        """Return the solution by ``step`` of the problem with the right faces. Raises StepFailed."""
+        """Return the result of ``step`` with settled contacts. Raises StepFailed."""
         contacts = self.environment.contacts
         while not self.is_settled:
             try:
@@ -111,8 +121,12 @@ class ContactFaces:
         return result
 
     def compare(self, x: Positions, left_out: float) -> None:
-        """Update the faces from the solution x (l, 3) [m], at which pairs of the surface may be left out that store no
-        more than ``left_out`` [J]. Raises StepFailed where none settle."""
+        """Update the contacts from the solution x (l, 3) [m] of the last solve.
+
+        Raises StepFailed if the faces do not settle in MOST_SOLVES solves.
+
+        left_out : [J] energy of surface pairs at x that may be left out
+        """
         crossed, pressing = self._crossed(x), self.environment.obstacles.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1
@@ -125,17 +139,18 @@ class ContactFaces:
             self.sides = sides
             if self.solves == MOST_SOLVES:
                 raise StepFailed(
-                    f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came "
-                    'in by; try a smaller time.step, or safety.on_failure = "substep"',
+                    f"has nodes that pass through an obstacle after {MOST_SOLVES} solves, each "
+                    "with the faces that they entered by; try a smaller time.step, or "
+                    'safety.on_failure = "substep"',
                     "contact",
                 )
             return
         narrow = contacts if contacts and contacts.is_narrow else None
         if narrow:
             with CONTACT:
-                free, self.is_settled = narrow.after_way(self.q, x, left_out)
+                is_free, self.is_settled = narrow.after_way(self.q, x, left_out)
             if not self.is_settled:
-                self.start = x if free else None
+                self.start = x if is_free else None
                 if self.solves >= MOST_NARROW:
                     narrow.widen()
                 return
@@ -145,21 +160,26 @@ class ContactFaces:
             if narrow:
                 narrow.narrow(x, self.time)
             return
-        if obstacles.penalties:  # what reflects goes by the way to x alone
+        # Reflecting obstacles use the faces crossed on the path to x.
+        if obstacles.penalties:
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
         self.sides = crossed
 
 
 class ImplicitEuler(Integrator):
-    """Implicit Euler's method; another solver takes over where an anchor lets go.
+    """Take steps by implicit Euler,
 
-        v_(n+1) = v_n + t M^(-1) (f_ext - grad E(q_(n+1))),    q_(n+1) = q_n + t v_(n+1)
+        v_(n+1) = v_n + t M^(-1) (f_ext - grad E(q_(n+1))),    q_(n+1) = q_n + t v_(n+1),
 
-    so that y = q_n + t v_n = 2 q_n - q_(n-1) and tau = t (Eq. 10-12).
+    with y = q_n + t v_n = 2 q_n - q_(n-1) and tau = t (Eq. 10-12). If an anchor ends, a new solver
+    is made, because its nodes become unknowns.
+
+    TAU_PER_STEP : tau / t
+    STATIC       : whether F has no inertia
     """
 
-    SHARE = 1.0  # tau / t
-    STATIC = False  # M is no part of F
+    TAU_PER_STEP = 1.0
+    STATIC = False
     state: ClassVar[dict[str, Range]] = {}
 
     def __init__(
@@ -173,27 +193,33 @@ class ImplicitEuler(Integrator):
         self.stepper = self._new_stepper(self.time_step)
 
     def _first_tau(self) -> float:
-        return self.SHARE * self.time_step
+        """Return tau [s] of the undamped problem."""
+        return self.TAU_PER_STEP * self.time_step
 
     @property
     def damped_tau(self) -> float:
-        """Tau of the damped problem [s]; that without damping where there is none."""
+        """Return tau [s] of the damped problem."""
         return self.tau / float(np.sqrt(1 + self.damping * self.tau))
 
     def _rates(
         self, q: Positions, y: Positions, q_before: Positions | None
     ) -> tuple[Positions, Positions] | None:
-        """Return what a viscous solid's rates are of: x^, and positions that have turned as the rates have."""
+        """Return x^ of a viscous solid and the positions (l, 3) [m] whose rotation its rates have.
+
+        Return None if the solid is not viscous.
+        """
         if not self.retardation:
             return None
-        return (q, 0.5 * (q + y)) if q_before is None else ((4 * q - q_before) / 3, y)
+        if q_before is None:
+            return q, 0.5 * (q + y)
+        return (4 * q - q_before) / 3, y
 
     def _carried(self, duration: float) -> float:
-        """Return how far a velocity carries in a time step [s] under damping."""
+        """Return the time [s] for which a velocity acts within a damped ``duration`` [s]."""
         return duration / (1 + self.damping * duration)
 
     def set_up(self) -> None:
-        """Build the preconditioner (collective). Raises InputError for one that is missing."""
+        """Build the preconditioner (collective). Raises InputError if PETSc lacks it."""
         self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
@@ -220,27 +246,29 @@ class ImplicitEuler(Integrator):
         time_step: float,
         q_before: Positions | None = None,
     ) -> tuple[StepResult, Indices]:
-        """Solve for the x that belongs to y at ``time``, and for its contact faces.
+        """Return the solution of the step to ``time`` [s] and its contact faces (o, l).
 
-        q_before : (l, 3) [m] one step before the state, of a step that looks so far back
+        y        : (l, 3) [m] positions without forces
+        q_before : (l, 3) [m] positions one step before the state, for BDF2
         """
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(
             self.environment, state.q, y, time, time_step, state.sides, fixed, q_before
         )
-        begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
+        work_before = self.stepper.work_so_far()
+        rates = self._rates(state.q, y, q_before)
         result = faces.solve(
             lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start)
         )
         self.environment.end_step(result.position, faces.contact)
         cost = replace(
-            self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error
+            self.stepper.work_so_far() - work_before, steps=1, step_error=result.cost.step_error
         )
         result = replace(result, cost=cost, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides
 
     def _with_viscosity(self, result: StepResult) -> StepResult:
-        """Return a step's result with the forces of viscosity, and what these took in where anchors led on."""
+        """Return a step's result with the viscous forces [N] and their work [J] at anchors."""
         viscosity, problem = self.stepper.functional.elasticity.viscosity, result.problem
         if viscosity is None or problem is None:
             return result
@@ -250,11 +278,9 @@ class ImplicitEuler(Integrator):
         return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
 
     def _new_stepper(self, time: float) -> Stepper:
-        """Make the solver for the nodes that are free at a time [s]."""
-        solver, lattice = (
-            self.solver,
-            self.environment.lattice.pin(self.environment.anchors.fixed_at(time)),
-        )
+        """Return a new solver for the nodes that are free at a time [s] (collective)."""
+        solver = self.solver
+        lattice = self.environment.lattice.pin(self.environment.anchors.fixed_at(time))
         if self.retardation:
             factor = self.retardation / self.tau
             lattice = replace(lattice, stiffness=(1 + factor) * lattice.stiffness, viscous=factor)
@@ -271,17 +297,19 @@ class ImplicitEuler(Integrator):
         )
 
     def _let_go(self, time: float) -> None:
-        """Make another solver where an anchor's time has come (collective)."""
+        """Make a new solver if an anchor has ended before ``time`` [s] (collective)."""
         anchors = self.environment.anchors.acting(time)
         if len(anchors) < len(self.anchors):
             self.anchors = anchors
             self.destroy()
-            self.tau = self._first_tau()  # whatever came before: a resumed run has not seen it
+            # A resumed run has not seen the tau before.
+            self.tau = self._first_tau()
             self.stepper = self._new_stepper(time)
             self.set_up()
 
     def save(self, checkpoint: Checkpoint) -> None:
-        if checkpoint.step:  # before the first there is nothing to forget
+        # Before the first step there is nothing to forget.
+        if checkpoint.step:
             self.stepper.forget(modes=False)
         checkpoint.keep_counts(self)
         checkpoint.keep_counts(self.stepper.control.estimate)
@@ -302,51 +330,62 @@ class ImplicitEuler(Integrator):
 
 
 class Bdf2(ImplicitEuler):
-    """The backward differentiation formula of second order, of q and of v:
+    """Take steps by the backward differentiation formula of second order for q and v,
 
-        q_(n+1) = (4 q_n - q_(n-1)) / 3 + tau v_(n+1),    v_(n+1) = (4 v_n - v_(n-1)) / 3 + tau a_(n+1),    tau = 2/3 t
+        q_(n+1) = (4 q_n - q_(n-1)) / 3 + tau v_(n+1)
+        v_(n+1) = (4 v_n - v_(n-1)) / 3 + tau a_(n+1),    tau = 2/3 t
 
-    (Hairer and Wanner, Solving Ordinary Differential Equations II, III.1), so that y = (4 q_n -
-    q_(n-1)) / 3 + tau (4 v_n - v_(n-1)) / 3. Friction, too, is of what the last two states lead to.
+    (Hairer and Wanner, Solving Ordinary Differential Equations II, III.1), with
+
+        y = (4 q_n - q_(n-1)) / 3 + tau (4 v_n - v_(n-1)) / 3.
+
+    Friction extrapolates the normal forces of the last two states.
     """
 
-    SHARE = 2 / 3
+    TAU_PER_STEP = 2 / 3
     looks_back = True
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """Take a step as implicit Euler does, but a node that bounces off stays where it is, and its history becomes
-        what leads there with its new velocity and the acceleration that it has: without that, which its neighbours feel
-        the other end of, a ball gained a fifth of its energy.
+        """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.
+
+        A node that rebounds keeps its position. Its new history leads there with the new velocity
+        and the present acceleration, which its neighbours feel. Without the acceleration, an impact
+        would add energy.
         """
         self._let_go(time)
-        q, v, begun = state.q, state.velocity(self.time_step), Work()
+        q, v, work_before = state.q, state.velocity(self.time_step), Work()
         self.environment.forces.begin_step(q, v, time - self.time_step)
         history = state.history
         if history is None:
-            history, begun = self._history(state, time)
+            history, work_before = self._history(state, time)
         q_0, v_0 = history
         y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
         result, sides = self._solve(state, y, time, self.time_step, q_0)
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
-        a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
+        # acceleration times t^2
+        a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step
         _, before, work = self.environment.obstacles.strike(
             result.position,
             previous,
             StepTaken(time, self.time_step, sides),
             self.stepper.lattice.pinned,
         )
-        cost = replace(begun + result.cost, step_error=result.cost.step_error, steps=1)
+        cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
         result = replace(result, previous=previous, cost=cost, work=work)
         if before is not previous:
             struck = (before != previous).any(axis=1)[:, None]
             v_after = (result.position - before - a) / self.time_step
-            q, v = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
+            q = np.where(struck, before + 0.5 * a, q)
+            v = np.where(struck, v_after, v)
         return result, State(result.position, before, (q, v), sides)
 
     def _history(self, state: State, time: float) -> tuple[tuple[Positions, Rows], Work]:
-        """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
-        which is the true one but for a part of first order; the work that this takes."""
+        """Return a history for a state without history, and the work of finding the history.
+
+        The history leads to q and v with the acceleration of an implicit Euler step of length tau.
+        The error of this acceleration is of first order.
+        """
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
         result, _ = self._solve(state, q + self._carried(tau) * v, time - t + tau, tau)
         a = ((result.position - q) / tau - v) / tau

@@ -1,4 +1,4 @@
-"""The interface of all integrators, and the state that a step starts from."""
+"""Interface of the integrators, and the state from which a step starts."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -17,49 +17,60 @@ HISTORY, SIDES = ("history_q", "history_v"), "sides"
 
 @dataclass(frozen=True)
 class EnergyBudget:
-    """Energies that a run keeps account of [J]."""
+    """Account of a run's energies [J], as solve.energy_balance defines them.
 
-    put_in: float = 0.0  # the most that the body had by right
-    gained: float = 0.0  # from nowhere, and not lost since; negative where a swing may give back
-    steady: float = 0.0  # the same without a known swing
-    since_frame: float = 0.0  # gained since the frame stored before
-    bounced: float = 0.0  # what nodes gained that bounced off its end
+    put_in      : largest legitimate energy of the body so far
+    gained      : spurious energy that was not dissipated since; negative as a credit
+    steady      : spurious energy without the known oscillation
+    since_frame : spurious energy gained since the frame stored before
+    bounced     : energy that nodes gained by rebounding after the last solve
+    """
+
+    put_in: float = 0.0
+    gained: float = 0.0
+    steady: float = 0.0
+    since_frame: float = 0.0
+    bounced: float = 0.0
 
     @property
     def share(self) -> float:
-        """Share of all energy that came from nowhere."""
+        """Return the spurious energy as a share of the largest legitimate energy."""
         return min(self.gained, self.steady) / self.put_in if self.put_in else 0.0
 
 
 @dataclass(frozen=True)
 class State:
-    """q_n and q_(n-1), (l, 3) [m], ghosts included; the velocity is (q_n - q_(n-1)) / t. After
-    contact a step's are not what the frame shows, which is the step as it was solved.
+    """State from which a step starts: q_n and q_(n-1), (l, 3) [m], ghosts included.
 
-    history : q and the velocity [m/s] of one step before, of integrators that look so far back; None: start anew
-    sides   : (o, l) by which faces of the obstacles nodes are in contact (environment); None: the nearest
+    The velocity is (q_n - q_(n-1)) / t. If nodes rebound after the solve, the state differs from
+    the frame, which shows the solution.
+
+    history : q and velocity [m/s] one step earlier, for multistep methods; None: no history
+    sides   : (o, l) obstacle faces at which the nodes are in contact; None: the nearest faces
+    budget  : energy budget after the steps so far
     """
 
     q: Positions
     q_previous: Positions
     history: tuple[Positions, Rows] | None = None
     sides: Indices | None = None
-    budget: EnergyBudget = EnergyBudget()  # of energy, as the steps so far have filled it
+    budget: EnergyBudget = EnergyBudget()
 
     def velocity(self, time_step: float) -> Rows:
-        """Velocities (l, 3) [m/s]."""
+        """Return the velocities (l, 3) [m/s]."""
         return (self.q - self.q_previous) / time_step
 
     def over(self, time_step: float, shorter: float) -> "State":
-        """Return the same state for steps of another length, without history."""
+        """Return the state for steps of length ``shorter`` [s], without history."""
         return replace(
             self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None
         )
 
     def save(self, checkpoint: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
-        """Store the state.
+        """Store the state in a checkpoint.
 
-        looks_back, has_sides : whether the integrator has a use for the history, and contact for the sides
+        looks_back : whether the integrator reads the history
+        has_sides  : whether contact reads the sides
         """
         rows = {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
         if looks_back:
@@ -72,12 +83,10 @@ class State:
 
     @staticmethod
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
-        """Return the state that a checkpoint holds (collective)."""
-        names = (
-            ("q", "q_previous", *HISTORY)
-            if checkpoint.number("history", 0, 0, 1)
-            else ("q", "q_previous")
-        )
+        """Return the state that a checkpoint holds (collective). Raises InputError."""
+        names = ["q", "q_previous"]
+        if checkpoint.number("history", 0, 0, 1):
+            names += HISTORY
         rows = [with_ghosts(comm, lattice, checkpoint.row(name)) for name in names]
         q, q_previous, *last = (like(lattice.nodes, each) for each in rows)
         history = (last[0], last[1]) if last else None
@@ -90,30 +99,33 @@ class State:
 
 
 class Integrator(Protocol):
-    """Takes steps of one length. All methods are collective.
+    """Method that takes steps of a fixed length. All methods are collective.
 
     time_step  : [s]
-    looks_back : it has a use for State.history
+    looks_back : whether the method reads State.history
     """
 
     time_step: float
     looks_back: bool = False
 
     def set_up(self) -> None:
-        """Make ready for the first step. Raises InputError for options that cannot be."""
+        """Prepare the first step. Raises InputError for options that cannot be used."""
         return
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time`` [s]: its result, and what the next one starts from. Raises StepFailed."""
+        """Take the step that ends at ``time`` [s]; return its result and the state after it.
+
+        Raises StepFailed.
+        """
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on beside its state, and forget all else."""
+        """Store the integrator's own data in a checkpoint, and drop all other caches."""
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
-        """Go on after a step that ended at ``time`` [s]."""
+        """Resume after the step that ended at ``time`` [s]."""
 
     def forget(self) -> None:
-        """Forget what earlier steps showed, so that the next step does not depend on it."""
+        """Drop all data of earlier steps, so that the next step does not depend on it."""
 
     def destroy(self) -> None:
         """Destroy all PETSc objects."""

@@ -1,16 +1,17 @@
-"""Statics: each step of the scene is an equilibrium under what acts at its end, without inertia.
+"""Statics: each step of the scene is an equilibrium under the loads at its end, without inertia.
 
-It is a minimum of  E(x) - x^T f_ext  and of what obstacles add, as an implicit step is without M: so the solver is
-that of a step, its F
+An equilibrium minimises E(x) - x^T f_ext plus the contact energy. This is the problem of an
+implicit step without M, so that the same solver applies, with the residual
 
     F(x) = tau^2 (grad E(x) - f_ext).
 
-M only weighs errors. tau scales F, so that M^(-1) tau^2 (Hessian of E) has no eigenvalue below about 1 where the body
-is at rest: as a step's Hessian has none for its M, from which bounds on errors follow.
+M is used only to weight errors. tau scales F so that M^(-1) tau^2 (Hessian of E) of the body at
+rest has no eigenvalue far below 1. Error bounds of implicit steps rely on the same property.
 
-Where the whole load cannot be brought on at once it comes on in load steps. A share s of it, 0 to 1, is the
-equilibrium under  f_ext + (1 - s) r,  r = grad E(x_0) - f_ext  what keeps the state before, x_0, where it is.
-A start is no equilibrium: where the whole load fails from there, or leaves folds, x_0 is the rest shape.
+If the solver fails with the whole load, the load is applied in load steps. The load of share s,
+from 0 to 1, is f_ext + (1 - s) r. The holding force r = grad E(x_0) - f_ext keeps the state before,
+x_0, in place. An initial state is no equilibrium. If the whole load fails from it or leaves folds,
+x_0 is the rest shape.
 """
 
 from dataclasses import dataclass, replace
@@ -34,20 +35,27 @@ from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.work import Work
 
-SLENDER = 10.0  # times as slow as sound passes the body: where tau is looked for first
-LOWEST = 10.0  # eigenvalue of M^(-1) tau^2 (Hessian of E) at rest
-WILL_DO = 1.0, 1e3  # eigenvalues for which no other tau is taken, for that takes another solver
-SOON = 200  # iterations of a load step that may still be halved
-SMALLEST = 2.0**-10  # of the load: the smallest load step
-MOST_FAILURES = 50  # of the load steps of one state
-SMALL = 2.0**-4  # of the load: a step no larger is not refused for what a smaller one may avoid
+# first tau, over the time of sound along the body; slender bodies are slower
+SLENDER = 10.0
+# lowest eigenvalue of M^(-1) tau^2 (Hessian of E) that tau aims at; 1 with a margin
+LOWEST = 10.0
+# lowest eigenvalues that need no other tau; another tau needs a new solver
+ACCEPTED_LOWEST = 1.0, 1e3
+# most iterations of a load step that may be halved; a smaller load step is then cheaper
+HALVING_ITERATIONS = 200
+# smallest load step, over the whole load; it bounds the cost of a hopeless load
+SMALLEST = 2.0**-10
+# most failed load steps of a state; they bound the cost of a hopeless load
+MOST_FAILURES = 50
+# largest load step accepted in any case, over the whole load; smaller steps hardly help
+SMALL = 2.0**-4
 
 
 class LoadSteps:
-    """Shares of a load that are tried one after another.
+    """Choose the shares of a load that are tried in turn.
 
-    reached : share of the equilibrium found last
-    count   : load steps that were taken
+    reached : share of the last equilibrium
+    count   : number of accepted load steps
     """
 
     def __init__(self) -> None:
@@ -55,21 +63,24 @@ class LoadSteps:
 
     @property
     def share(self) -> float:
-        """The share to try next."""
+        """Return the share to try next."""
         return min(self.reached + self.size, 1.0)
 
     @property
     def may_be_refused(self) -> bool:
-        """Whether the next step is so large that smaller ones may well end better."""
+        """Return whether a smaller load step may end better than the next load step."""
         return self.size > SMALL
 
     def take(self) -> None:
-        """Accept the share, which has its equilibrium: the next step is twice as large."""
-        self.reached, self.size, self.count = self.share, 2 * self.size, self.count + 1
+        """Accept the share, and double the load step."""
+        self.reached = self.share
+        self.size *= 2
+        self.count += 1
 
     def halve(self, failure: StepFailed) -> None:
-        """Shorten the next step after a failure. Raises StepFailed after one of the smallest, or very many."""
-        self.size, self.failures = 0.5 * (self.share - self.reached), self.failures + 1
+        """Halve the load step after a failure. Raises StepFailed if that cannot help."""
+        self.size = 0.5 * (self.share - self.reached)
+        self.failures += 1
         if self.size < SMALLEST or self.failures > MOST_FAILURES:
             raise StepFailed(
                 f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind
@@ -78,11 +89,14 @@ class LoadSteps:
 
 @dataclass
 class LoadPath:
-    """Equilibria between a state and the next one. All methods are collective.
+    """Equilibria on the path from a state to the next state. All methods are collective.
 
-    problem    : of the share taken last
-    sides      : (o, l) contact faces that it has
-    displaced  : whether the state before is a start, and not the rest shape
+    base      : (l, 3) [m] positions of the state before
+    target    : (l, 3) [m] prescribed positions at the whole load; None without anchors
+    known     : shares and positions (l, 3) [m] of the last two equilibria
+    sides     : (o, l) contact faces of the last share
+    displaced : whether the state before is an initial state other than the rest shape
+    holding   : holding force r (owned, 3) [N]; None until a share needs the force
     """
 
     stepper: Stepper
@@ -94,25 +108,24 @@ class LoadPath:
     def __post_init__(self) -> None:
         self.base = self.state.q
         self.target = self.environment.anchors.prescribed(self.base, self.time)
-        self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
+        self.known = [(0.0, self.base)]
         self.sides = self.state.sides
         first, lattice = self.time < 1.5 * self.time_step, self.stepper.lattice
         at_rest = self.stepper.comm.allreduce(bool((self.base == lattice.nodes).all()), MPI.LAND)
         self.displaced = first and not at_rest
         self.inverted = 0 if first else worst_inverted(self.stepper.comm, lattice, self.base)[0]
-        self.holding: Rows | None = (
-            None  # r (owned, 3) [N], which keeps free nodes where they are; once asked for
-        )
+        self.holding: Rows | None = None
         self.problem: StepProblem | None = None
 
     def try_share(self, steps: LoadSteps) -> StepResult:
-        """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one
-        with cells turned inside out, which smaller steps may avoid."""
+        """Return the equilibrium of the share to try.
+
+        Raises StepFailed if there is none, or if smaller load steps may avoid its inverted cells.
+        """
         share = steps.share
         q = self.known[-1][1]
-        time_step = (
-            0.0 if len(self.known) > 1 else self.time_step
-        )  # obstacles move in the first load step alone
+        # Obstacles move in the first load step only.
+        time_step = 0.0 if len(self.known) > 1 else self.time_step
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(self.environment, q, q, self.time, time_step, self.sides, fixed)
         result = faces.solve(lambda whole: self._step(self._problem(whole, share), share))
@@ -129,22 +142,21 @@ class LoadPath:
         return result
 
     def _step(self, problem: StepProblem, share: float) -> StepResult:
+        """Return the solution of the problem of a share. Raises StepFailed."""
         return self.stepper.step(problem, self._guess(problem, share))
 
     def _problem(self, whole: StepProblem, share: float) -> StepProblem:
+        """Return the problem of a share of the load; ``whole`` is that of the whole load."""
         load, prescribed = whole.load, self.target
         if share < 1:
             if self.holding is None:
-                stepper, functional, lattice = (
-                    self.stepper,
-                    self.stepper.functional,
-                    self.stepper.lattice,
-                )
+                stepper, lattice = self.stepper, self.stepper.lattice
+                functional = stepper.functional
                 functional.begin(replace(whole, y=self.base, prescribed=None))
-                held = functional.at(self.base)
+                iterate = functional.at(self.base)
                 self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
                 self.holding[stepper.unknowns.free] = (
-                    stepper.unknowns.columns(held.f).T / functional.t2
+                    stepper.unknowns.columns(iterate.f).T / functional.t2
                 )
             load = load + (1 - share) * self.holding
             prescribed = self.environment.anchors.prescribed(
@@ -153,7 +165,7 @@ class LoadPath:
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:
-        """Positions (l, 3) [m] to start from: the last ones, or the line through the last two gone on, by their g."""
+        """Return the last equilibrium or an extrapolation (l, 3) [m], whichever has the lower g."""
         (share_before, before), (reached, q) = self.known[0], self.known[-1]
         if reached == share_before:
             return q
@@ -166,20 +178,21 @@ class LoadPath:
 
 
 class Static(ImplicitEuler):
-    """States of equilibrium at the times of steps: that at ``time``, from the one a step before.
+    """Find the equilibrium at the end of each step, starting from the equilibrium before.
 
-    Forces, anchors and obstacles are taken as they are then.
+    Forces, anchors and obstacles are taken at the end of the step.
 
-    error : of the last state
+    error   : estimated relative error of the last equilibrium
+    problem : problem of the last equilibrium
     """
 
     STATIC = True
     state: ClassVar[dict[str, Range]] = {"error": ANY}
     error = 0.0
-    problem: StepProblem | None = None  # of the last state
+    problem: StepProblem | None = None
 
     def _first_tau(self) -> float:
-        """SLENDER times how long sound takes along the longest side of the lattice, roughly [s]."""
+        """Return SLENDER times the time [s] of sound along the longest side (collective)."""
         lattice = self.environment.lattice
         low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
         low, high = (
@@ -193,15 +206,13 @@ class Static(ImplicitEuler):
         return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
     def set_up(self) -> None:
-        """Make ready, and settle tau. Raises InputError for a body that is not held."""
+        """Choose tau and build the preconditioner. Raises InputError if a body is not held."""
         refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
         minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
         minimum.estimate.linearise(rest)
-        lowest = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[
-            0
-        ]  # of M^(-1) tau^2 (Hessian of E), roughly
-        if lowest > 0 and not WILL_DO[0] <= lowest <= WILL_DO[1]:
+        lowest, _ = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
+        if lowest > 0 and not ACCEPTED_LOWEST[0] <= lowest <= ACCEPTED_LOWEST[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()
             self.stepper = replace(self.stepper, time_step=self.damped_tau)
@@ -210,30 +221,34 @@ class Static(ImplicitEuler):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)
         before = time - self.time_step
+        # Under the same loads the equilibrium is the state before.
         if before > 0.5 * self.time_step and self.environment.is_same(before, time):
-            return StepResult(
-                state.q, state.q, Work(self.error, steps=1), static=True, problem=self.problem
-            ), state
+            cost = Work(self.error, steps=1)
+            return StepResult(state.q, state.q, cost, static=True, problem=self.problem), state
         stepper = self.stepper
-        begun = stepper.work_so_far()
+        work_before = stepper.work_so_far()
         path = LoadPath(stepper, self.environment, state, time, self.time_step)
         result, path = self._follow(path)
         q, self.problem, self.error = result.position, path.problem, result.cost.step_error
-        cost = replace(stepper.work_so_far() - begun, steps=1, step_error=self.error)
+        cost = replace(stepper.work_so_far() - work_before, steps=1, step_error=self.error)
         result = replace(result, previous=q, cost=cost, static=True, problem=self.problem)
         return result, State(q, q, sides=path.sides)
 
     def _follow(self, path: LoadPath) -> tuple[StepResult, LoadPath]:
-        """Bring all of the load on in few load steps; return their path, too. Raises StepFailed."""
-        steps, snes, rest = LoadSteps(), self.stepper.snes, self.stepper.lattice.nodes
-        most = snes.getTolerances()[3]
-        hurries = not self.stepper.budget and self.stepper.options.is_default(
-            "snes_max_it"
-        )  # else the user has said
+        """Apply the whole load in as few load steps as possible; return the result and its path.
+
+        Raises StepFailed.
+        """
+        snes, rest = self.stepper.snes, self.stepper.lattice.nodes
+        steps = LoadSteps()
+        max_it = snes.getTolerances()[3]
+        # The user's own number of iterations holds for all load steps.
+        is_limited = not self.stepper.budget and self.stepper.options.is_default("snes_max_it")
         try:
             while steps.reached < 1.0:
-                if hurries:
-                    snes.setTolerances(max_it=SOON if steps.may_be_refused else most)
+                if is_limited:
+                    limit = HALVING_ITERATIONS if steps.may_be_refused else max_it
+                    snes.setTolerances(max_it=limit)
                 try:
                     result = path.try_share(steps)
                     steps.take()
@@ -245,22 +260,24 @@ class Static(ImplicitEuler):
                     log.info("t = %.6g s: begun at the rest shape: it %s", path.time, reason)
                     path = replace(path, state=State(rest, rest))
         finally:
-            snes.setTolerances(max_it=most)
+            snes.setTolerances(max_it=max_it)
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", path.time, steps.count)
         return result, path
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError for a body, or a part of one that no spring joins with the rest, that
-    nothing holds, and where no more than two nodes are held (collective)."""
+    """Raise InputError if a body is free to move or fewer than three nodes are held (collective).
+
+    A part that no spring joins with the rest counts as a body.
+    """
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
-    held = "held at a point or two, about which it turns"
+    support = "held at a point or two, about which it turns"
     if bodies.free.any():
-        held = "held by nothing"
+        support = "held by nothing"
     elif lattice.table.total - unknowns.total > 2:
         return
-    what = "the body"
+    subject = "the body"
     if len(bodies.free) > 1:
         number = int(np.argmax(bodies.free))
         rows = np.flatnonzero(bodies.number[: lattice.owned] == number)
@@ -270,8 +287,10 @@ def refuse_free_bodies(unknowns: Unknowns) -> None:
             int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN
         )
         place = ", ".join(f"{x:.4g}" for x in sums[:3] / sums[3])
-        what = f"a part {of_body(lattice, first)}of {int(sums[3])} nodes about ({place}) m at rest"
+        nodes = f"{int(sums[3])} nodes about ({place}) m at rest"
+        subject = f"a part {of_body(lattice, first)}of {nodes}"
     raise InputError(
-        f'time.integrator = "static": {what} is {held}: it has no equilibrium without inertia; pin it or lead it by an '
-        "anchor (contact does not count), or choose another integrator"
+        f'time.integrator = "static": {subject} is {support}: it has no equilibrium without '
+        "inertia; pin it or lead it by an anchor (contact does not count), or choose another "
+        "integrator"
     )

@@ -1,18 +1,21 @@
-"""Velocity Verlet: a step t of the scene in N substeps dt under the stability limit, with nothing to solve.
+"""Velocity Verlet: take a step t of the scene in N substeps dt below the stability limit.
 
 Each substep kicks, drifts and kicks, with a = M^(-1) (f_ext - grad E), contact included:
 
-    v_(n+1/2) = v_n + dt/2 a(q_n),    q_(n+1) = q_n + dt v_(n+1/2),    v_(n+1) = v_(n+1/2) + dt/2 a(q_(n+1))
+    v_(n+1/2) = v_n + dt/2 a(q_n)
+    q_(n+1)   = q_n + dt v_(n+1/2)
+    v_(n+1)   = v_(n+1/2) + dt/2 a(q_(n+1))
 
-The two half kicks at one time are one, but for a step's first and last: so v is of the same time as q wherever a
-frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eigenvalue of M^(-1) (Hessian of E).
+Adjacent half kicks are merged, except at the ends of a step, so that a frame has q and v of the
+same time. The method is stable if dt < 2 / omega, where omega^2 is the largest eigenvalue of
+M^(-1) (Hessian of E).
 
-That limit is of small swings (README). What all substeps of a step then gain is the error of the trapezoidal rule for
-the springs' work,
+This limit holds for small oscillations only (README). Beyond them, the substeps gain the error of
+the trapezoidal rule for the work of the springs,
 
     E(q_N) - E(q_0) - sum_n 1/2 (grad E(q_n) + grad E(q_(n+1))) . (q_(n+1) - q_n)
 
-which is none for a quadratic E. A step that gains too much is taken again, in twice as many substeps.
+which is zero for a quadratic E. A step that gains too much is repeated with twice the substeps.
 """
 
 import sys
@@ -39,21 +42,41 @@ from msmpetsc.solve.linear.unknowns import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
-SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
-RETRIES = 4  # of a step
-GAIN = 2e-3  # of all energy, from nowhere in a step: worth half the substep
-CREDIT = 0.1  # of it, that springs may lose and gain again
-EASED = 1 / 32  # of that: twice the substep, which gains from 4 to 16 times as much, will do again
-HALVINGS = 5  # of substeps, for what they gain
-MOST_SUBSTEPS = 1e6  # of a step
-ROUNDING = 1e-14  # of the energy below, that a step may gain
-SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends
-MOST_ITERATIONS = 100  # of it
-TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
+# substep over the stability limit; the Hessian changes within a step
+SAFETY = 0.8
+# most repetitions of a step; they bound the cost of an unstable step
+RETRIES = 4
+# spurious energy that halves the substeps, over all energy; a fifth of NOTABLE_GAIN
+GAIN = 2e-3
+# energy that springs may regain after a loss, over all energy; as in the energy balance
+CREDIT = 0.1
+# gain that doubles substeps, over the limit; doubled substeps gain 4 to 16 times more
+EASED = 1 / 32
+# most halvings of the substeps; 32 times the substeps bound the cost
+HALVINGS = 5
+# most substeps of a step; more would take hours
+MOST_SUBSTEPS = 1e6
+# spurious energy that rounding may cause, over the energy of an unstable body
+ROUNDING = 1e-14
+# relative change of omega^2 that ends the power iteration; SAFETY covers its error
+SETTLED = 1e-3
+# most power iterations; later steps continue from the mode
+MOST_ITERATIONS = 100
+# elastic energy of an unstable body, over that of crushed springs; no load reaches it
+UNSTABLE = 100.0
 
 
 class Verlet(Integrator):
-    """Velocity Verlet's method. ``time.substep`` may only shorten its substeps."""
+    """Take steps by the velocity Verlet method; ``time.substep`` may only shorten its substeps.
+
+    elastic      : (owned, 3) grad E [N] without contact
+    work         : [J] of a step: work of obstacles, varying loads and anchors on this rank's nodes
+    springs_work : [J] of a step: work that the springs of this rank's nodes absorb
+    gained       : [J] spurious energy of the springs so far, less its dissipation; negative: credit
+    halvings     : halvings of the substeps because of spurious energy
+    end          : end time of the step [s]
+    known        : positions (l, 3) [m] that ``gradient`` and the highest frequency belong to
+    """
 
     state: ClassVar[dict[str, Range]] = {
         "substep": (sys.float_info.min, np.inf),
@@ -72,22 +95,17 @@ class Verlet(Integrator):
         owned = self.lattice.owned
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
-        self.elastic = self.gradient[:owned]  # grad E without what obstacles push
+        self.elastic = self.gradient[:owned]
         self.sides = environment.obstacles.no_sides[:, :owned]
         self.damping = environment.damping
-        # [J] in a step: work on this rank's nodes, of obstacles without friction, of loads that change, of anchors
-        self.work = 0.0
-        self.springs_work = 0.0  # [J] in a step, that the springs of this rank's nodes took in
-        self.gained = 0.0  # [J] by the springs since the start, from nowhere and not lost since; negative: a credit
-        self.halvings = 0  # of substeps, for what they gained
-        self.end = 0.0  # of the step [s]
-        self.known: Floats | None = (
-            None  # positions (l, 3) that ``gradient`` and the highest frequency are of
-        )
-        self.anchors: int | None = None  # how many hold
+        self.work = self.springs_work = self.gained = 0.0
+        self.halvings = 0
+        self.end = 0.0
+        self.known: Floats | None = None
+        self.anchors: int | None = None
         self.fixed = environment.anchors.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
-        self.most = TORN * comm.allreduce(crushing_energy(self.lattice))  # [J]
+        self.unstable_energy = UNSTABLE * comm.allreduce(crushing_energy(self.lattice))
 
     def save(self, checkpoint: Checkpoint) -> None:
         checkpoint.keep_counts(self)
@@ -101,31 +119,34 @@ class Verlet(Integrator):
         self.gained, self.halvings = 0.0, 0
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time`` (collective). Raises StepFailed.
+        """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.
 
-        Taken again with shorter substeps where its end shows that they were too long: a blow may
-        stiffen a body, folds may heat it.
+        If the end of the step shows that the substeps were too long, repeat it with shorter
+        substeps: an impact may stiffen the body, and folded cells may gain spurious energy.
         """
         start, self.end = time - self.time_step, time
         self.environment.forces.begin_step(state.q, state.velocity(self.time_step), start)
         self._begin(state, start)
-        pushed = self._pushed(start, time)
-        squared = pushed + (self.highest.squared or self.highest.squared_at(self.position.values))
+        contact_bound = self._contact_bound(start, time)
+        squared = contact_bound + (
+            self.highest.squared or self.highest.squared_at(self.position.values)
+        )
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
-            begun = self._squared_acceleration(start)
-            with np.errstate(over="ignore", invalid="ignore"):  # its energy tells of what runs away
-                self._take(count, start, time)
+            squared_start = self._squared_acceleration(start)
+            # The energy below shows an overflow.
+            with np.errstate(over="ignore", invalid="ignore"):
+                self._take_substeps(count, start, time)
             energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
             dt = self.time_step / count
-            after = (
-                pushed + self.highest.squared_at(self.position.values)
-                if energy <= self.most
-                else np.inf
-            )
+            after = np.inf
+            if energy <= self.unstable_energy:
+                after = contact_bound + self.highest.squared_at(self.position.values)
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
-                return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
+                return self._result(
+                    count, dt**2 / 8 * (self._squared_acceleration(time) - squared_start)
+                )
             if not is_stable:
                 squared = np.clip(after, 2 * squared, 16 * squared)
             self._begin(state, start)
@@ -136,6 +157,7 @@ class Verlet(Integrator):
         )
 
     def _begin(self, state: State, start: float) -> None:
+        """Set positions, velocities and forces to a state at time ``start`` [s] (collective)."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
         self._hold(start)
         self.work = self.springs_work = 0.0
@@ -147,10 +169,11 @@ class Verlet(Integrator):
             self.sides = self.environment.obstacles.contact_faces(
                 self.q, self.q, start, 0.0, before, self.fixed
             )
-            self._pull(start)
+            self._update_gradient(start)
             self.highest.squared = 0.0
 
-    def _take(self, count: int, start: float, time: float) -> None:
+    def _take_substeps(self, count: int, start: float, time: float) -> None:
+        """Take ``count`` equal substeps from ``start`` to ``time`` [s] (collective)."""
         self.known = None
         times = np.linspace(start, time, 1 + count).tolist()
         duration = 0.5 * (times[1] - start)
@@ -163,49 +186,61 @@ class Verlet(Integrator):
             self.work += self.environment.obstacles.energy_of_new_obstacles(
                 self.q, begin, end, self.sides
             )
-            self._pull(end)
+            self._update_gradient(end)
             self._count_work(moved, held)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
 
     def _count_work(self, moved: Rows, held: Mask) -> None:
-        """Add half of the present forces' work [J] on a substep's moves (owned, 3) [m]: of springs, and of anchors.
+        """Add half the work [J] of the present forces to the work of springs and of anchors.
 
-        Anchors lead ``held`` nodes (owned,) against all forces, with the load as the energy balance has it.
+        moved : (owned, 3) [m] displacements of the substep
+        held  : (owned,) bool, nodes that anchors move against all forces
         """
+        # The energy balance takes the load at the end of the step.
         self.springs_work += 0.5 * np.vdot(self.elastic, moved)
         against = self.gradient[: self.lattice.owned] - self.environment.forces.at(self.end)
         self.work += 0.5 * float(np.vdot(against[held], moved[held]))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
-        """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and
-        its substeps are now halved; they are doubled again for the next one where it gained next to
-        nothing (collective). Where obstacles push, what springs seem to gain may be theirs."""
+        """Return whether a step gained too much energy, and then halve the substeps (collective).
+
+        If the gain is negligible, double the substeps of the next step. With penalty obstacles
+        there is no halving, because the gain of the springs may come from the obstacles.
+
+        start  : (l, 3) [m] positions at the start of the step
+        energy : elastic energy [J] at its end
+        """
         own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
         mass = self.lattice.mass[: self.lattice.owned, None]
         gain, kinetic = self.comm.allreduce(
             np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))])
         )
-        most = energy + kinetic
-        enough, gained = GAIN * most + ROUNDING * self.most, max(self.gained + gain, -CREDIT * most)
+        total = energy + kinetic
+        limit = GAIN * total + ROUNDING * self.unstable_energy
+        gained = max(self.gained + gain, -CREDIT * total)
         if (
-            min(gain, gained) > enough
+            min(gain, gained) > limit
             and self.halvings < HALVINGS
             and not self.environment.obstacles.penalties
         ):
             self.halvings += 1
             return True
         self.gained = gained
-        if gain < EASED * enough and self.halvings:
+        if gain < EASED * limit and self.halvings:
             self.halvings -= 1
         return False
 
     def _squared_acceleration(self, time: float) -> float:
-        """|M^(-1) (f_ext - grad E)|_M^2 of this rank's free nodes [J/s^2]."""
+        """Return |M^(-1) (f_ext - grad E)|_M^2 [J/s^2] of this rank's free nodes."""
         force = (self.environment.forces.at(time) - self.gradient[: self.lattice.owned])[self.free]
         return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
 
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
+        """Return the result of a step of ``count`` substeps, and the state after it (collective).
+
+        swing : [J] known oscillation of this rank's energy over the step
+        """
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
@@ -213,7 +248,8 @@ class Verlet(Integrator):
         result = StepResult(self.known, previous, cost, self.work, explicit=True, swing=swing)
         return result, State(self.known, previous, sides=self.sides)
 
-    def _pull(self, time: float) -> None:
+    def _update_gradient(self, time: float) -> None:
+        """Compute the gradient of elastic and contact energy at the present positions."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
         self.elastic = self.gradient[: self.lattice.owned]
@@ -223,15 +259,17 @@ class Verlet(Integrator):
             contact.add_gradient(self.q, self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
-        """Change v by the forces at ``time``; obstacles move as in the substep to its end."""
+        """Change v by the forces at ``time`` over ``duration`` [s], with damping and friction.
+
+        begin, end : times [s] of the substep whose motion the obstacles have
+        """
         self._damp(0.5 * duration)
         beyond = self.environment.forces.beyond(time, self.end)
         load = self.environment.forces.at(time)
         before = None if beyond is None else self.v.copy()
         kick(len(self.free), load, duration, self._movers())
-        if (
-            beyond is not None and before is not None
-        ):  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
+        # A kick by f changes the kinetic energy by duration f . (v- + v+) / 2.
+        if beyond is not None and before is not None:
             self.work += (
                 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
             )
@@ -247,12 +285,12 @@ class Verlet(Integrator):
         return Movers(self.q, self.v, self.free, self.per_mass, self.gradient)
 
     def _damp(self, duration: float) -> None:
-        """Slow the free nodes down as damping by the mass does in this time [s]."""
+        """Damp the velocities of the free nodes over a duration [s] by exp(-alpha dt)."""
         if self.damping:
             self.v[self.free] *= np.exp(-self.damping * duration)
 
     def _drift(self, begin: float, end: float) -> None:
-        """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
+        """Move q to the end of a substep: anchored nodes on their paths, impacts reflected."""
         self._hold(end)
         drift(len(self.free), self.q, end - begin, self._movers())
         prescribed = self.environment.anchors.prescribed(self.position.values, end)
@@ -268,11 +306,14 @@ class Verlet(Integrator):
         self.position.update()
 
     def _kinetic(self, nodes: Indices) -> float:
-        """Kinetic energy [J] of this rank's ``nodes`` (k,)."""
+        """Return the kinetic energy [J] of this rank's ``nodes`` (k,)."""
         return 0.5 * float(self.lattice.mass[nodes] @ (self.v[nodes] ** 2).sum(axis=1))
 
     def _strike(self, begin: float, end: float) -> None:
-        """Find faces of contact; the velocity of a node that bounces off is what then led it there."""
+        """Find the contact faces of a substep and reflect the nodes that strike an obstacle.
+
+        A reflected node gets the velocity that leads to its new position.
+        """
         start = self.q - (end - begin) * self.v
         self.sides = self.environment.obstacles.contact_faces(
             start, self.q, end, end - begin, self.sides, self.fixed
@@ -286,7 +327,7 @@ class Verlet(Integrator):
             self.q[struck] = after[struck]
 
     def _hold(self, time: float) -> None:
-        """Update the free nodes where an anchor begins or ends."""
+        """Update the free nodes if an anchor begins or ends before ``time`` [s]."""
         anchors = len(self.environment.anchors.acting(time))
         if anchors != self.anchors:
             self.anchors = anchors
@@ -294,8 +335,8 @@ class Verlet(Integrator):
             self.free = np.flatnonzero(~self.fixed)
             self.highest.hold(self.fixed)
 
-    def _pushed(self, start: float, time: float) -> float:
-        """Bound what obstacles may add to omega^2 [1/s^2] until ``time``, by Weyl (collective)."""
+    def _contact_bound(self, start: float, time: float) -> float:
+        """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
         fall = self.environment.forces.at(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
@@ -306,14 +347,17 @@ class Verlet(Integrator):
         return float(self.comm.allreduce(squared, MPI.MAX))
 
     def _count(self, squared: float) -> int:
-        """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""
+        """Return the least number of substeps for omega^2 [1/s^2]. Raises StepFailed."""
         limit = SAFETY * 2 / np.sqrt(squared) if squared > 0 else np.inf
         if limit < self.substep < np.inf:
             log.warning(
-                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken, and under it later",
-                self.substep, limit,
-            )  # fmt: skip
-            self.substep = np.inf  # said once
+                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken, and later "
+                "substeps stay below the limit",
+                self.substep,
+                limit,
+            )
+            # The warning comes once.
+            self.substep = np.inf
         count = self.time_step / min(limit, self.substep)
         if not count < MOST_SUBSTEPS:
             raise StepFailed(
@@ -328,8 +372,13 @@ class Verlet(Integrator):
 
 
 class HighestMode:
-    """The mode of the greatest eigenvalue omega^2 [1/s^2] of M^(-1) (Hessian of E), by power iterations that go on
-    from the mode found last. ``squared`` is that omega^2, 0 while it is not known."""
+    """Compute the largest eigenvalue omega^2 [1/s^2] of M^(-1) (Hessian of E).
+
+    Each power iteration starts from the last mode.
+
+    squared : omega^2, or 0 while it is unknown
+    mode    : (l, 3) eigenvector x with |x|_M = 1
+    """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity):
         self.comm, self.lattice, self.elasticity = comm, lattice, elasticity
@@ -337,8 +386,8 @@ class HighestMode:
         self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
 
     def hold(self, fixed: Mask) -> None:
-        """Set the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever
-        the number of ranks."""
+        """Set the ``fixed`` nodes (owned,) and start from a vector of all modes (collective)."""
+        # The vector must not depend on the number of ranks.
         self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
         self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))
@@ -347,9 +396,10 @@ class HighestMode:
         self.squared = 0.0
 
     def squared_at(self, q: Positions) -> float:
-        """Return omega^2 [1/s^2] of the springs at q (l, 3) [m] (collective).
+        """Return omega^2 [1/s^2] of the projected Hessian at q (l, 3) [m] (collective).
 
-        Without the negative curvature across pressed springs, which is no oscillation and has no bound.
+        The projection leaves out the negative curvature across compressed springs, which causes no
+        oscillation and has no bound.
         """
         x, owned = self.mode.values, self.lattice.owned
         hessian = self.elasticity.hessian_at(q, projected=True)
@@ -360,13 +410,14 @@ class HighestMode:
             hessian.add_product(x, product)
             np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
             x[:owned][self.fixed] = 0
-            self.squared = self._normalise()  # |M^(-1) H x|_M for |x|_M = 1
+            # |M^(-1) H x|_M for |x|_M = 1
+            self.squared = self._normalise()
             if not abs(self.squared - before) > SETTLED * self.squared:
                 break
         return self.squared
 
     def _normalise(self) -> float:
-        """Scale the mode x to |x|_M = 1, and return what that was (collective)."""
+        """Scale the mode x to |x|_M = 1; return |x|_M from before (collective)."""
         x = self.mode.values[: self.lattice.owned]
         size = float(
             np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
@@ -377,19 +428,19 @@ class HighestMode:
         return size
 
     def destroy(self) -> None:
-        """Collective."""
+        """Destroy the PETSc objects of the mode (collective)."""
         self.mode.destroy()
 
 
 def crushing_energy(lattice: Lattice) -> float:
-    """Return the energy [J] that presses every spring of this rank to a point."""
+    """Return the energy [J] that compresses every spring of this rank to zero length."""
     springs = slice(lattice.springs_owned)
     return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
 
 @kernel
 def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: Movers) -> None:
-    """v += duration M^(-1) (f_ext - grad E)."""
+    """Add duration M^(-1) (f_ext - grad E) to v."""
     for row in range(first, count, step):
         i = nodes.rows[row]
         for c in range(3):
@@ -398,7 +449,7 @@ def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: 
 
 @kernel
 def drift(first: int, count: int, step: int, q: Positions, duration: float, nodes: Movers) -> None:
-    """q += duration v."""
+    """Add duration v to q."""
     for row in range(first, count, step):
         i = nodes.rows[row]
         for c in range(3):

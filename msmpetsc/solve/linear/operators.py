@@ -1,6 +1,7 @@
-"""The matrix A, and operators on vectors of three coordinates as contexts of MATPYTHON.
+"""Matrix A, and the operators on vectors of unknowns as contexts of MATPYTHON.
 
-The scalar matrix A acts on the m x 3 block that a vector of unknowns is: one product for three right-hand sides.
+A vector of unknowns is an m x 3 dense block. The scalar matrix A multiplies its three columns in a
+single product.
 """
 
 import numpy as np
@@ -20,7 +21,7 @@ from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT
 
 
 class Block:
-    """PETSc dense m x 3 matrix that vectors of unknowns are copied into and out of."""
+    """Dense m x 3 matrix of PETSc, a copy of a vector of unknowns."""
 
     def __init__(self, matrix: PETSc.Mat, memory: Memory):
         rows, _ = matrix.getSizes()
@@ -29,22 +30,26 @@ class Block:
 
     @property
     def values(self) -> Floats:
-        """x, then y, then z; to be read or written at once."""
+        """Return the numbers of this rank: x, then y, then z; read or write them at once."""
         return self.memory.values(self.mat)
 
 
 class ContactBlocks:
-    """t^2 (Hessian of contact): a 3 x 3 block a node in contact, added to either operator below."""
+    """Apply t^2 (Hessian of contact): a 3 x 3 block for each node in contact.
+
+    parts : rows of unknowns (k,) and their blocks (k, 3, 3)
+    row   : (owned,) row of each node among the unknowns, -1 if pinned
+    """
 
     def __init__(self, unknowns: Unknowns, time_step: float):
         self.t2, self.unknowns = time_step**2, unknowns
-        self.parts: list[tuple[Indices, Rows]] = []  # rows of unknowns, their blocks (k, 3, 3)
+        self.parts: list[tuple[Indices, Rows]] = []
         row = np.full(unknowns.lattice.owned, -1)
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
     def linearise(self, contact: Contact | None, q: Positions, duals: Duals | None) -> None:
-        """Take the blocks at q, by duals of friction if any."""
+        """Compute the blocks at q (l, 3) [m], with the duals of friction if given."""
         self.parts = []
         with CONTACT:
             for nodes, blocks in contact.hessian(q, duals) if contact else ():
@@ -53,7 +58,7 @@ class ContactBlocks:
                     self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
 
     def add(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y += blocks x."""
+        """Add the product of the blocks with x to y."""
         if not self.parts:
             return
         with CONTACT:
@@ -63,15 +68,11 @@ class ContactBlocks:
 
 
 class ThreeColumns:
-    """A (x) I_3 without forming it; ``contact`` is None where the scene has no penalty."""
+    """Apply A (x) I_3, plus contact, without assembling it; no penalty: ``contact`` is None."""
 
     def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, contact: ContactBlocks | None = None):
-        self.matrix, self.unknowns, self.memory, self.contact = (
-            matrix,
-            unknowns,
-            unknowns.memory,
-            contact,
-        )
+        self.matrix, self.contact = matrix, contact
+        self.unknowns, self.memory = unknowns, unknowns.memory
         self.input = Block(matrix, self.memory)
         self.product = matrix.matMult(self.input.mat)
 
@@ -88,9 +89,10 @@ class ThreeColumns:
 
 
 class TrueHessian:
-    """M + t^2 (Hessian of E, and of contact) at the positions last linearised about, applied spring by spring.
+    """Apply the true Hessian H = M + t^2 (Hessian of E and of contact) spring by spring.
 
-    products : so far
+    products : number of products so far
+    elastic  : Hessian of E at the last positions; None before ``linearise``
     """
 
     def __init__(
@@ -100,16 +102,13 @@ class TrueHessian:
         time_step: float,
         contact: ContactBlocks | None = None,
     ):
-        self.unknowns, self.elasticity, self.t2, self.contact = (
-            unknowns,
-            elasticity,
-            time_step**2,
-            contact,
-        )
+        self.unknowns, self.elasticity = unknowns, elasticity
+        self.t2, self.contact = time_step**2, contact
         lattice = unknowns.lattice
-        self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
+        # The rows of pinned nodes stay zero.
+        self.v = np.zeros_like(lattice.nodes)
         self.product = np.empty_like(lattice.nodes)
-        self.elastic: Hessian | None = None  # until it is linearised
+        self.elastic: Hessian | None = None
         self.surface: SurfaceHessian | None = None
         self.products = 0
 
@@ -120,21 +119,22 @@ class TrueHessian:
         projected: bool = False,
         duals: Duals | None = None,
     ) -> None:
-        """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (elasticity.springs),
-        ``duals`` the true curvature of friction (contact.obstacles.friction)."""
+        """Linearise about positions q (l, 3) [m].
+
+        projected : project out the negative curvature of each spring (elasticity.springs)
+        duals     : duals of friction, which replace its true curvature (contact.obstacles.friction)
+        """
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             if self.contact:
                 self.contact.linearise(contact, q, duals)
-            of_surface = duals[-1] if duals else None
-            self.surface = (
-                contact.surface.hessian(q, projected, of_surface)
-                if contact and contact.surface
-                else None
-            )
+            self.surface = None
+            if contact and contact.surface:
+                surface_duals = duals[-1] if duals else None
+                self.surface = contact.surface.hessian(q, projected, surface_duals)
 
     def take_slopes(self, slopes: Array) -> None:
-        """Take other V U' of a solid's cells (elasticity.solid.CellHessians) than those at q."""
+        """Replace V U' of a solid's cells at q by ``slopes`` (elasticity.solid.CellHessians)."""
         for part in self.elastic.parts if self.elastic else ():
             if isinstance(part, CellHessians):
                 part.slopes[:] = slopes
@@ -148,7 +148,10 @@ class TrueHessian:
                 self.contact.add(x, y)
 
     def forces(self, v: Rows) -> Rows:
-        """Return the Hessian of E and of the surface times v (l, 3), in (l, 3) [N] until the next call."""
+        """Return the Hessian of E and of the surface's contact times v (l, 3) [m]: (l, 3) [N].
+
+        The next call overwrites the array.
+        """
         assert self.elastic is not None, "the Hessian was not linearised"
         self.product[:] = 0
         self.elastic.add_product(v, self.product)
@@ -159,9 +162,10 @@ class TrueHessian:
 
 
 def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str = "") -> PETSc.Mat:
-    """A = M + t^2 L [kg] as a PETSc matrix; ``-mat_type`` chooses its type (collective).
+    """Return A = M + t^2 L [kg] as a PETSc matrix of type ``-mat_type`` (collective).
 
-    Raises InputError for more nonzeros than PETSc can count, and for a type whose vectors are not where the arrays are.
+    Raises InputError if the nonzeros exceed PETSc's integers, or if the matrix type computes on
+    another device than the run.
     """
     lattice = unknowns.lattice
     row, free = np.full(len(lattice.nodes), -1), to_host(unknowns.free)
@@ -199,16 +203,17 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str =
 def assembly_bytes(
     nodes: float | Array, springs: float | Array, nonzeros: float | Array
 ) -> float | Array:
-    """Return the bytes that ``assemble`` has at once beside its arguments; numbers, or arrays of a number a rank.
+    """Return the peak memory [bytes] of ``assemble`` beside its arguments.
 
-    They are row of each node; weight, ends and kept of each spring; of each nonzero row, column and value,
-    COO's two indices, then CSR's index and value.
+    A node takes its row; a spring its weight, ends and mask. A nonzero takes row, column and value,
+    then the indices of COO, then index and value of CSR. The arguments are numbers, or arrays with
+    a number for each rank.
     """
     return 8 * nodes + (8 + 4 * 4 + 2) * springs + (3 * 8 + 2 * 4 + 4 + 8) * nonzeros
 
 
 def python_matrix(unknowns: Unknowns, context: object, comm: PETSc.Comm) -> PETSc.Mat:
-    """A MATPYTHON on vectors of unknowns."""
+    """Return a MATPYTHON with this context on vectors of unknowns (collective)."""
     size = (3 * unknowns.size, 3 * unknowns.total)
     matrix = PETSc.Mat().createPython((size, size), context, comm=comm)
     matrix.setName(type(context).__name__)

@@ -1,8 +1,8 @@
-"""Numbering of PETSc's unknowns by nodes and coordinates, and values of nodes with ghosts.
+"""Numbering of the unknowns by nodes and coordinates, and ghost exchange of nodal values.
 
-Pinned nodes are no unknowns. A vector of unknowns holds, on each rank, the x of its free nodes,
-then their y, then their z: so its local array is an m x 3 dense block, which a scalar m x m matrix
-can multiply at once.
+Pinned nodes are not unknowns. On each rank, a vector of unknowns holds the x of the free nodes,
+then their y, then their z. Its local array is therefore an m x 3 dense block, which a scalar m x m
+matrix multiplies in a single product.
 """
 
 from typing import NamedTuple
@@ -20,43 +20,38 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.device import memory_of
 from msmpetsc.solve.petsc.events import GHOSTS
 
-LARGEST = int(
-    np.iinfo(PETSc.IntType).max
-)  # of PETSc's integers: 32 bits, unless it was configured otherwise
+# largest integer of PETSc; its configuration decides between 32 and 64 bits
+LARGEST = int(np.iinfo(PETSc.IntType).max)
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
-BALLAST = 1e-6  # of the mass
-BYTES_OF_NODE = 8  # of ``numbers``, for a forecast of memory
+# inertia of static nodes in multigrid, over mass; a flat cell has a singular block
+BALLAST = 1e-6
+# memory of ``numbers`` [bytes per node]; forecasts of memory need it
+BYTES_OF_NODE = 8
 
 
 class Unknowns:
-    """The free nodes of a lattice, numbered over all ranks, and the scatter that fills the ghosts.
+    """Number the free nodes of a lattice over all ranks, and exchange their ghosts.
 
-    free    : (m,) local numbers of the free owned nodes, where the lattice's arrays are
-    numbers : (l,) global number of each local node among the free ones, -1 where pinned
+    free    : (m,) local numbers of the free owned nodes
+    rows    : (m,) the same numbers for kernels, unsigned, which need no check of the sign
+    numbers : (l,) global number of each local node among the free nodes, -1 if pinned
     total   : number of free nodes on all ranks
-    inertia : (owned,) [kg] by which a node resists being moved: its mass; nothing where an equilibrium is looked for
-    ballast : (owned,) [kg] the same in multigrid, never nothing: a cell squashed flat has a singular block of its own
-    static  : whether it is an equilibrium
-    memory  : where PETSc's vectors have their numbers
+    inertia : (owned,) [kg] mass in the residual; 0 for statics
+    ballast : (owned,) [kg] mass in multigrid; small but positive for statics
+    memory  : memory of PETSc's vectors, on the CPU or the GPU
 
-    Raises InputError for more of them than PETSc can number.
+    Raises InputError if there are more unknowns than PETSc can number.
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, static: bool = False):
-        self.comm, self.lattice, self.memory, self.static = (
-            comm,
-            lattice,
-            memory_of(lattice.nodes),
-            static,
-        )
+        self.comm, self.lattice, self.static = comm, lattice, static
+        self.memory = memory_of(lattice.nodes)
         self.inertia = np.zeros_like(lattice.mass) if static else lattice.mass
         self.ballast = BALLAST * lattice.mass if static else lattice.mass
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
-        self.rows = self.free.astype(
-            np.uint32
-        )  # for kernels, which need not look whether a number is negative
+        self.rows = self.free.astype(np.uint32)
         self.size = len(self.free)
-        first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]  # an Intracomm
+        first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]
         self.total = comm.allreduce(self.size)
         refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)
@@ -65,8 +60,9 @@ class Unknowns:
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
-        self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
-        sources = with_ghosts(comm, lattice, index)[free_ghosts].ravel()  # in a vector of unknowns
+        # whether any rank has ghosts
+        self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0
+        sources = with_ghosts(comm, lattice, index)[free_ghosts].ravel()
         self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
         vector = self.create_vector()
         index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)
@@ -85,15 +81,15 @@ class Unknowns:
         return vector
 
     def columns(self, vector: PETSc.Vec) -> Rows:
-        """A vector of unknowns as (3, m), not to be written to."""
+        """Return a vector of unknowns as a read-only array (3, m)."""
         return self.memory.read(vector).reshape(3, self.size)
 
     def columns_to_write(self, vector: PETSc.Vec) -> Rows:
-        """A vector of unknowns as (3, m), to be written to at once."""
+        """Return a vector of unknowns as an array (3, m), to be written at once."""
         return self.memory.write(vector).reshape(3, self.size)
 
     def to_nodes(self, vector: PETSc.Vec, nodes: Array) -> None:
-        """Write unknowns into the free rows, ghosts included, of ``nodes`` (l, 3) (collective)."""
+        """Copy a vector of unknowns to the free rows, with ghosts, of (l, 3) (collective)."""
         if self.has_ghosts:
             with GHOSTS:
                 self.scatter.scatter(vector, self.ghost_values)
@@ -102,30 +98,30 @@ class Unknowns:
             nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
 
     def from_nodes(self, nodes: Positions, vector: PETSc.Vec) -> None:
-        """Write the free owned rows of ``nodes`` (>= owned, 3) into the unknowns."""
+        """Copy the free owned rows of ``nodes`` (>= owned, 3) to a vector of unknowns."""
         self.collect(nodes, self.columns_to_write(vector))
 
     def collect(self, nodes: Rows, columns: Rows) -> None:
-        """Write the free owned rows of ``nodes`` (>= owned, 3) into ``columns`` (3, m)."""
+        """Copy the free owned rows of ``nodes`` (>= owned, 3) to ``columns`` (3, m)."""
         _collect(self.size, nodes, self.rows, columns)
 
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
-        """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
+        """Write M a + t^2 b of arrays (l, 3) of nodal values to a vector of unknowns."""
         _scaled_sum(
             self.size, self.columns_to_write(vector), Terms(self.inertia, a, t2, b, self.rows)
         )
 
     def destroy(self) -> None:
-        """Collective."""
+        """Destroy all PETSc objects (collective)."""
         self.scatter.destroy()
         self.ghost_values.destroy()
 
 
 class VectorPool:
-    """Vectors of unknowns that are lent to their users, until these give them back or are forgotten.
+    """Lend vectors of unknowns to users, and reuse the vectors afterwards.
 
-    A vector of several ranks must be destroyed by all of them together. So the pool destroys its vectors itself,
-    once, and no vector is destroyed as Python forgets it.
+    All ranks must destroy a vector together. Therefore the pool destroys its vectors itself, and
+    Python's garbage collection destroys none.
     """
 
     def __init__(self, unknowns: Unknowns):
@@ -134,28 +130,28 @@ class VectorPool:
         self._free: list[PETSc.Vec] = []
 
     def take(self) -> PETSc.Vec:
-        """Return a vector of any values (collective)."""
+        """Return a vector with arbitrary values (collective)."""
         if self._free:
             return self._free.pop()
         self._all.append(self.unknowns.create_vector())
         return self._all[-1]
 
     def lend(self, user: object, *vectors: PETSc.Vec) -> None:
-        """Take vectors back when nothing refers to their user any more."""
+        """Return vectors to the pool when Python deletes their user."""
         finalize(user, self._free.extend, vectors).atexit = False
 
     def give_back(self, vector: PETSc.Vec) -> None:
-        """Take a vector back."""
+        """Return a vector to the pool."""
         self._free.append(vector)
 
     def destroy(self) -> None:
-        """Collective."""
+        """Destroy all vectors of the pool (collective)."""
         for vector in self._all:
             vector.destroy()
 
 
 class Ghosted:
-    """Values (l, 3) of the owned nodes, then of the ghosts, in the memory of two PETSc vectors."""
+    """Nodal values (l, 3), first owned nodes, then ghosts, shared with two PETSc vectors."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         refuse_unknowns(lattice.table.total)
@@ -168,24 +164,25 @@ class Ghosted:
         index.destroy()
 
     def update(self) -> None:
-        """Bring the ghosts their owners' values (collective)."""
+        """Update the ghosts with their owners' values (collective)."""
         with GHOSTS:
             self.scatter.scatter(self.owned, self.ghosts)
 
     def destroy(self) -> None:
+        """Destroy all PETSc objects (collective)."""
         for owner in (self.scatter, self.owned, self.ghosts):
             owner.destroy()
 
 
 def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
-    """Return rows (l, ...) of local nodes from those of the owned ones, on the host (collective)."""
+    """Return rows (l, ...) of all local nodes from rows (owned, ...) on the CPU (collective)."""
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     return np.concatenate([rows, to_owner.answer(rows[asked])])
 
 
 def refuse_unknowns(nodes: int) -> None:
-    """Raise InputError for more ``nodes`` than PETSc can number three coordinates of."""
+    """Raise InputError if PETSc cannot number the three coordinates of so many nodes."""
     if 3 * nodes > LARGEST:
         most = f"the {LARGEST} unknowns that PETSc can number here"
         raise InputError(
@@ -194,11 +191,13 @@ def refuse_unknowns(nodes: int) -> None:
 
 
 def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
-    """Raise InputError where a rank has more nonzeros, ``own`` of this one, than PETSc can count."""
+    """Raise InputError if a rank has more nonzeros, ``own`` of this rank, than PETSc can count."""
     most = comm.allreduce(own, MPI.MAX)
     if most > LARGEST:
-        many = f"{most} nonzeros of the system matrix on one rank are more than the {LARGEST} that PETSc can count here"
-        raise InputError(f"cages: {many}; more ranks have fewer each, or {ADVICE}")
+        raise InputError(
+            f"cages: {most} nonzeros of the system matrix on one rank are more than the {LARGEST} "
+            f"that PETSc can count here; more ranks have fewer each, or {ADVICE}"
+        )
 
 
 @kernel
@@ -216,7 +215,7 @@ def _collect(first: int, count: int, step: int, nodes: Rows, rows: Indices, colu
 
 
 class Terms(NamedTuple):
-    """What the sum M a + t^2 b is made of, at some rows of arrays of nodes."""
+    """Terms of the sum M a + t^2 b at some ``rows`` of nodal arrays."""
 
     mass: Floats
     a: Array
@@ -226,8 +225,8 @@ class Terms(NamedTuple):
 
 
 @kernel
-def _scaled_sum(first: int, count: int, step: int, columns: Rows, of: Terms) -> None:
+def _scaled_sum(first: int, count: int, step: int, columns: Rows, terms: Terms) -> None:
     for i in range(first, count, step):
-        row = of.rows[i]
+        row = terms.rows[i]
         for c in range(3):
-            columns[c, i] = of.mass[row] * of.a[row, c] + of.t2 * of.b[row, c]
+            columns[c, i] = terms.mass[row] * terms.a[row, c] + terms.t2 * terms.b[row, c]

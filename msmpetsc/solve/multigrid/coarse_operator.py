@@ -1,4 +1,4 @@
-"""Matrices of coarse levels applied in single precision, on a CPU: PETSc's AIJ has but double."""
+"""Single-precision products with the matrices of coarse levels on the CPU, which PETSc lacks."""
 
 from typing import NamedTuple
 
@@ -10,10 +10,12 @@ from msmpetsc.backend.kernel import njit
 
 
 class BlockRows(NamedTuple):
-    """Some 3 x 3 blocks of a matrix: those of row i are begin[i] to begin[i + 1], the k-th of column columns[k].
+    """3 x 3 blocks of a matrix in compressed rows.
 
-    place  : where the first number of each is among those of the AIJ
-    values : (k, 9) float32
+    begin   : (n + 1,) row i has the blocks begin[i] to begin[i + 1]
+    columns : (k,) column of each block
+    place   : (k,) index of each block's first number in the values of the AIJ
+    values  : (k, 9) float32
     """
 
     begin: Indices
@@ -25,21 +27,25 @@ class BlockRows(NamedTuple):
     def chosen(
         cls, chosen: Mask, rows: int, row: Indices, columns: Indices, place: Indices
     ) -> "BlockRows":
+        """Return the blocks (b,) that a mask chooses, without values."""
         begin = np.searchsorted(row[chosen], np.arange(rows + 1))
         values = np.empty((chosen.sum(), 9), np.float32)
         return cls(begin, columns[chosen].astype(np.int32), place[chosen], values)
 
 
 class CoarseOperator:
-    """Applies the matrix of a coarse level in single precision. All methods are collective.
+    """Apply the matrix H of a coarse level in single precision. All methods are collective.
 
-    A product is as fast as its blocks stream from memory. Of a block and its transpose one is kept, in four
-    bytes a number and with one index: 0.6 kB a node, where the AIJ that it is made from has 2.9. It acts on
-    differences of nodes, and on the sum of each row's blocks, so that stiffness of which a translation feels
-    nothing takes none of its digits.
+    Memory bandwidth limits a product. Therefore only the upper triangle is kept, in single
+    precision and with an index for each block: 0.6 kB a node instead of 2.9 kB of the AIJ. The
+    blocks act on differences of nodes, and the sums of the rows act on the nodes. Thus a
+    translation keeps its digits, even if H is stiff.
 
     matrix   : AIJ of block size 3, symmetric, with full blocks
-    operator : MATPYTHON of which this is the context
+    operator : MATPYTHON with this context
+    own      : upper triangle of the columns on this rank
+    remote   : blocks whose columns are ghosts
+    sums     : (n, 9) sums of the rows' blocks
     """
 
     def __init__(self, matrix: PETSc.Mat):
@@ -57,14 +63,12 @@ class CoarseOperator:
             is_own & (columns > first + row), last - first, row, columns - first, place
         )
         columns[~is_own] = number
-        self.others = BlockRows.chosen(~is_own, last - first, row, columns, place)
+        self.remote = BlockRows.chosen(~is_own, last - first, row, columns, place)
         self.sums = np.empty((last - first, 9), np.float32)
         self.x, self.y = np.empty((2, last - first, 3), np.float32)
         self.ghosts = PETSc.Vec().createSeq(3 * len(ghosts))
-        whole, wanted = (
-            matrix.createVecRight(),
-            PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType)),
-        )
+        whole = matrix.createVecRight()
+        wanted = PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType))
         self.scatter = PETSc.Scatter().create(whole, wanted, self.ghosts, None)
         whole.destroy()
         wanted.destroy()
@@ -73,23 +77,23 @@ class CoarseOperator:
         self.operator.setUp()
 
     def update(self) -> None:
-        """Take the blocks as the matrix has them now."""
+        """Copy the present values of the matrix."""
         begin, _, values = self.matrix.getValuesCSR()
         self.sums[:] = np.add.reduceat(values.reshape(-1, 3), begin[:-1] // 3, axis=0).reshape(
             -1, 9
         )
-        for part in (self.own, self.others):
+        for part in (self.own, self.remote):
             take_blocks(self.length, part, values)
         self.operator.assemble()
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = H x."""
+        """Write H x to y."""
         self.x[:] = x.array_r.reshape(-1, 3)
         multiply_upper(self.own, self.sums, self.x, self.y)
         if self.matrix.comm.size > 1:
             self.scatter.scatter(x, self.ghosts)
             add_product(
-                self.others, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y
+                self.remote, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y
             )
         y.array_w[:] = self.y.ravel()
 
@@ -100,7 +104,7 @@ class CoarseOperator:
 
 @njit()
 def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
-    """Take the values of blocks from the ``given`` numbers of an AIJ, whose rows have that length."""
+    """Copy the blocks from the values of an AIJ with ``length`` (n,) nonzeros per scalar row."""
     for i in range(len(blocks.begin) - 1):
         for k in range(blocks.begin[i], blocks.begin[i + 1]):
             for r in range(3):
@@ -110,9 +114,9 @@ def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
 
 @njit(fastmath={"reassoc", "contract", "nsz"})
 def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
-    """y = H x of blocks whose column is greater than their row, the others being their transposes.
+    """Write H x to y for a symmetric H given by its upper blocks.
 
-    sums : (n, 9) of all blocks of a row, by which a translation keeps its digits where H is stiff
+    sums : (n, 9) sum of all blocks of each row
     """
     begin, columns, _, h = blocks
     y[:] = 0
@@ -135,7 +139,7 @@ def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
 
 @njit()
 def add_product(blocks: BlockRows, x: Array, ghosts: Array, y: Array) -> None:
-    """y += H (ghosts - x), x that of each block's row."""
+    """Add H (ghosts - x) to y, with the x of each block's row."""
     begin, columns, _, h = blocks
     for i in range(len(begin) - 1):
         u, v, w = x[i, 0], x[i, 1], x[i, 2]

@@ -1,7 +1,7 @@
-"""Contact of the surface with itself in multigrid's cycle, where it joins nodes of the finest and coarsest levels.
+"""Contact of the surface with itself in the multigrid cycle, on the finest and coarsest levels.
 
-A pair that presses is stiff along one direction of some forty unknowns, and bodies that lie on each other move as one.
-Diagonal blocks tell CG neither: they hold each node to the ground.
+An active contact pair is stiff in a single direction of about forty unknowns, and stacked bodies
+move together. Diagonal blocks represent neither, because they fix each node to the ground.
 """
 
 import numpy as np
@@ -15,33 +15,34 @@ from msmpetsc.backend.arrays import Array, Rows
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 
-SPARE = 2.0  # times the nonzeros of the present contact: more room than that is not kept
+# most contact nonzeros kept, over those in use; the factor must stay sparse
+SPARE = 2.0
 
 
 class ContactSmoother:
-    """Smoother of the finest level where contact of the surface with itself joins nodes, C = t^2 W^T H_c W.
+    """Smoother of the finest level with contact C = t^2 W^T H_c W between nodes.
 
-    It inverts D + C, D the block diagonal without that contact, by Woodbury's formula on the points in contact,
+    The smoother inverts D + C, with D the block diagonal without C, by Woodbury's formula on the
+    points in contact:
 
-        (D + C)^-1 = D^-1 - D^-1 W^T B (I + B^T G B)^-1 B^T W D^-1,    t^2 H_c = B B^T,    G = W D^-1 W^T.
+        (D + C)^-1 = D^-1 - D^-1 W^T B (I + B^T G B)^-1 B^T W D^-1
+        t^2 H_c = B B^T,    G = W D^-1 W^T
 
-    With B from Cholesky's factorisation, pivoted, a direction 1e9 times as stiff as D keeps seven digits.
-    Where H - C is no more than b D, H is no more than b (D + C) for b >= 1, so that Chebyshev's bound
-    stays.
+    The pivoted Cholesky factor B keeps seven digits of a direction 1e9 times as stiff as D. If
+    H - C <= b D with b >= 1, then H <= b (D + C). Therefore Chebyshev's bound remains valid.
 
-    inverse : D^-1 (m, 9) of the free nodes [1/kg]
-    nodes   : (c,) of these that carry the points; ``weights`` (k, c) by which, of k points
-    middle  : (3k, 3k) between W and W^T
+    inverse : (m, 9) D^-1 [1/kg] of the free nodes
+    nodes   : (c,) free nodes that carry the k points in contact
+    weights : (k, c) interpolation W from nodes to points
+    middle  : (3k, 3k) factor between W^T and W
     """
 
     def __init__(self, unknowns: Unknowns, surface: SurfaceHessian, t2: float, inverse: Array):
         self.comm = unknowns.comm
         weights = surface.weights[:, unknowns.free]
         self.nodes = np.unique(weights.indices)
-        self.weights, self.inverse = (
-            csr_array(weights[:, self.nodes]),
-            inverse[self.nodes].reshape(-1, 3, 3),
-        )
+        self.weights = csr_array(weights[:, self.nodes])
+        self.inverse = inverse[self.nodes].reshape(-1, 3, 3)
         self.back = csr_array(self.weights.T)
         size = surface.points.shape[0]
         compliance, scaled = np.zeros((size, size)), self.weights.copy()
@@ -56,7 +57,7 @@ class ContactSmoother:
         self.middle = root.T @ root
 
     def correct(self, y: Rows) -> None:
-        """Turn y = D^-1 x (3, m) into (D + C)^-1 x."""
+        """Change y (3, m) from D^-1 x to (D + C)^-1 x (collective)."""
         moved = self.weights @ y[:, self.nodes].T
         if self.comm.size > 1:
             moved = self.comm.allreduce(moved)
@@ -65,7 +66,7 @@ class ContactSmoother:
 
 
 def root_of(matrix: Rows) -> Rows:
-    """Return B (n, r) with B B^T a positive semidefinite matrix (n, n) of rank r, by pivoted Cholesky."""
+    """Return the factor B (n, r) of a positive semidefinite matrix B B^T (n, n) of rank r."""
     lower, pivots, rank, _ = dpstrf(matrix, lower=1)
     root = np.zeros((len(matrix), rank))
     root[pivots - 1] = np.tril(lower)[:, :rank]
@@ -73,33 +74,37 @@ def root_of(matrix: Rows) -> Rows:
 
 
 class CoarseContact:
-    """Contact C = t^2 (W P)^T H_c (W P) on coarse levels. All methods are collective.
+    """Add contact C = t^2 (W P)^T H_c (W P) to coarse levels. All methods are collective.
 
-    The coarsest matrix has all of it, the levels between its diagonal blocks, so that they keep their nonzeros. The
-    coarsest has nonzeros for the contact of before as well, as long as these are few: with the same ones PETSc
-    analyses it no more before it factors it, which takes longer than the factor.
+    The coarsest matrix has the whole of C. The levels between have its diagonal blocks only, so
+    that their nonzeros do not change. The coarsest matrix keeps the nonzeros of earlier contact if
+    they are few. With unchanged nonzeros, PETSc skips the symbolic factorisation, which takes
+    longer than the numeric factorisation.
 
-    interpolations : P to each next finer level, of vectors
+    interpolations : P from each coarse level to the next finer level
+    scalar         : P of a single coordinate, this rank's rows; empty before the first contact
+    coarsest       : coarsest matrix with contact; None before the first contact
+    nonzeros       : pattern of this rank's contact in the coarsest matrix
     """
 
     def __init__(self, unknowns: Unknowns, interpolations: list[PETSc.Mat], t2: float):
         self.unknowns, self.interpolations, self.t2 = unknowns, interpolations, t2
-        self.scalar: list[
-            csr_array
-        ] = []  # P of one coordinate, this rank's rows; until there is contact
-        self.coarsest: PETSc.Mat | None = None  # with contact
-        self.nonzeros = csr_array((0, 0))  # ones where this rank's rows of it have room for contact
+        self.scalar: list[csr_array] = []
+        self.coarsest: PETSc.Mat | None = None
+        self.nonzeros = csr_array((0, 0))
 
     def added(self, matrices: list[PETSc.Mat], surface: SurfaceHessian | None) -> PETSc.Mat:
-        """Add contact to the matrices of all coarse levels but the last; the last one with contact."""
+        """Add contact to the matrices of the coarse levels, and return the coarsest with contact.
+
+        The coarsest matrix itself does not change.
+        """
         if surface is None:
             return matrices[-1]
         self.scalar = self.scalar or self._scalar()
         weights = surface.weights[:, self.unknowns.free]
         for matrix, p in zip(matrices, self.scalar, strict=True):
-            whole = sum(
-                surface.comm.allgather(weights @ p)
-            )  # in the order of the ranks: the same sum each time
+            # The order of the ranks makes the sum reproducible.
+            whole = sum(surface.comm.allgather(weights @ p))
             first, last = (bound // 3 for bound in matrix.getOwnershipRange())
             weights = csr_array(whole[:, first:last])
             if matrix is not matrices[-1]:
@@ -111,7 +116,11 @@ class CoarseContact:
         return self._coarsest(matrices[-1], csr_array(joined))
 
     def _coarsest(self, without: PETSc.Mat, contact: csr_array) -> PETSc.Mat:
-        """Return the coarsest matrix with this rank's rows of contact [kg], itself as it is ``without``."""
+        """Return the coarsest matrix plus t^2 times contact.
+
+        without : coarsest matrix without contact
+        contact : this rank's rows of (W P)^T H_c (W P) [N/m]
+        """
         here = csr_array(
             (np.ones_like(contact.data), contact.indices, contact.indptr), contact.shape
         )
@@ -131,39 +140,40 @@ class CoarseContact:
         return self.coarsest
 
     def _add(self, contact: PETSc.Mat, nonzeros: PETSc.Mat.Structure) -> None:
+        """Add a matrix to the coarsest matrix, and destroy it."""
         assert self.coarsest is not None
         self.coarsest.axpy(1.0, contact, nonzeros)
         contact.destroy()
 
     def _scalar(self) -> list[csr_array]:
-        """P of one coordinate of each level: of the finest rows of x come first, then of y and z."""
-        found: list[csr_array] = []
+        """Return P of a single coordinate for each coarse level, this rank's rows."""
+        scalar: list[csr_array] = []
         for p in self.interpolations:
             begin, columns, values = p.getValuesCSR()
             whole = csr_array((values, columns, begin), shape=(len(begin) - 1, p.getSize()[1]))
-            rows = slice(self.unknowns.size) if not found else slice(None, None, 3)
-            found.append(csr_array(csr_array(whole[rows])[:, ::3]))
-        return found
+            # Unknowns are ordered by coordinate, coarse rows by node.
+            rows = slice(None, None, 3) if scalar else slice(self.unknowns.size)
+            scalar.append(csr_array(csr_array(whole[rows])[:, ::3]))
+        return scalar
 
     def destroy(self) -> None:
+        """Destroy the coarsest matrix with contact (collective)."""
         if self.coarsest:
             self.coarsest.destroy()
             self.coarsest = None
 
 
 def add_diagonal(matrix: PETSc.Mat, blocks: Rows) -> None:
-    """Add 3 x 3 blocks (n, 9) to the diagonal of a matrix whose rows are this rank's."""
+    """Add 3 x 3 blocks (n, 9) to the diagonal of this rank's rows of a matrix (collective)."""
     first, last = (bound // 3 for bound in matrix.getOwnershipRange())
-    begin, columns = (
-        np.arange(len(blocks) + 1, dtype=PETSc.IntType),
-        np.arange(first, last, dtype=PETSc.IntType),
-    )
+    begin = np.arange(len(blocks) + 1, dtype=PETSc.IntType)
+    columns = np.arange(first, last, dtype=PETSc.IntType)
     matrix.setValuesBlockedIJV(begin, columns, blocks.reshape(-1, 3, 3), addv=True)
     matrix.assemble()
 
 
 def aij(rows: csr_array, like: PETSc.Mat) -> PETSc.Mat:
-    """Return a matrix of the type and sizes of another with this rank's ``rows``."""
+    """Return a matrix with this rank's ``rows`` and the type and sizes of ``like`` (collective)."""
     matrix = PETSc.Mat().create(like.comm)
     matrix.setSizes(like.getSizes())
     matrix.setBlockSize(3)

@@ -1,11 +1,14 @@
-"""Multigrid cycle on a lattice's grids for the true Hessian, as a PCMG: levels, smoothers, coarse
-solve and cycle are set by PETSc's options (-pc_mg_..., -mg_levels_..., -mg_coarse_...).
+"""Geometric multigrid on a lattice for the true Hessian, as a PCMG.
 
-The hierarchy is that of the projected Hessian H, which is positive definite at any positions, so that CG on the true
-one has a preconditioner that is, too. The finest level is applied spring by spring or cell by cell in single precision,
-and smoothed with a block diagonal D. The first coarse one is summed spring by spring or cell by cell
-(solve.multigrid.galerkin), those below are products P^T H P of PETSc's; all but the coarsest are applied in single
-precision, too (solve.multigrid.coarse_operator).
+PETSc's options set levels, smoothers, coarse solve and cycle (-pc_mg_..., -mg_levels_...,
+-mg_coarse_...).
+
+The hierarchy uses the projected Hessian H, which is positive definite at any positions. Therefore
+CG with the true Hessian has a positive definite preconditioner. The finest level applies H spring
+by spring or cell by cell in single precision, with a block diagonal D in its smoother. The first
+coarse matrix is summed in the same way (solve.multigrid.galerkin). PETSc computes the coarser
+matrices as products P^T H P. All levels but the coarsest multiply in single precision
+(solve.multigrid.coarse_operator).
 """
 
 from collections.abc import Iterator
@@ -34,17 +37,23 @@ from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.events import FINE
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
-COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
-POINTS = 200  # of the surface in contact, that join nodes of the finest level: the stiffest
-LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-SAFETY = 1.1  # times it where no bound is known, as ten iterations of CG know it
-RAISED = 1e-8, 1e-5  # of themselves: coarse diagonals, where all bodies are held and where not
-TRANSPOSES_SQUARE = (3, 19)  # PETSc from here on restricts by the transpose of a square matrix
+# most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
+COARSEST = 800
+# most surface points that the finest smoother couples; its matrix is dense
+POINTS = 200
+# lower end of a smoother's range, over its upper end; coarse grids damp the rest
+RANGE_START = 0.25
+# factor on an eigenvalue estimated by ten CG iterations; the estimate is too small
+SAFETY = 1.1
+# increase of coarse diagonals without and with free bodies; see ``_raise_diagonal``
+RAISED = 1e-8, 1e-5
+# first release of PETSc that restricts by the transpose of a square matrix
+TRANSPOSES_SQUARE = (3, 19)
 
 
 @dataclass(frozen=True)
 class Level:
-    """Coarse level: its grid, P from it to the next finer one, its matrix (AIJ, block size 3)."""
+    """Coarse level: grid, interpolation P to the next finer level, matrix (AIJ, block size 3)."""
 
     grid: CoarseGrid
     interpolation: PETSc.Mat
@@ -52,13 +61,17 @@ class Level:
 
 
 class Multigrid:
-    """The PCMG of one lattice and time step, and the hierarchy that it works on. All methods are collective.
+    """PCMG of a lattice and a time step, with its hierarchy. All methods are collective.
 
-    bodies : that have coarse grids of their own
-    pc     : its options have the ``prefix``
-    levels : the coarse ones, the finest of them first
-    coarse : products with the matrix of each of them but the last; none on a GPU, where PETSc's serve
-    sizes  : nodes and nonzeros of all levels, the finest first, which would have so many; empty before ``update``
+    bodies : bodies of the lattice, each with its own coarse grids
+    fine   : operator of the finest level
+    pc     : the PCMG, with options of the ``prefix``
+    levels : coarse levels, the finest first
+    coarse : single-precision products of all coarse levels but the last; empty on a GPU
+    bounds : largest eigenvalue of D^-1 H of each level but the coarsest, the finest level first
+    sizes  : nodes and nonzeros of all levels, the finest first, as if all were assembled
+
+    Raises InputError for options that do not fit the lattice.
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
@@ -72,7 +85,7 @@ class Multigrid:
         except InputError:
             self.owned.close()
             raise
-        self.coarse: list[CoarseOperator] = []  # until ``update``
+        self.coarse: list[CoarseOperator] = []
         self.sizes: list[tuple[int, int]] = []
         self.bounds = [0.0] * len(self.levels)
         self.contact = CoarseContact(
@@ -83,18 +96,21 @@ class Multigrid:
         self.owned.callback(self.pc.destroy)
 
     def _create_levels(self, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
+        """Return the sum of the first coarse matrix, and the coarse levels without values."""
         unknowns, comm = self.unknowns, self.unknowns.comm
         size, everywhere = unknowns.size, grid_indices(unknowns)
-        apart = self.bodies.apart(comm, everywhere)
-        ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
+        offsets = self.bodies.offsets(comm, everywhere)
+        ijk = (everywhere + [1, 0, 0] * offsets[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, max(asked - 1, 1) if asked else None)
         if asked and asked != len(coarse) + 1:
+            nearest = len(coarse) + 1
             raise InputError(
-                f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {len(coarse) + 1}"
+                f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {nearest}"
             )
-        galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, apart)
-        rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
+        galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, offsets)
+        rows = np.arange(size)[:, None] + size * np.arange(3)
+        sizes = 3 * size, 3 * unknowns.total
         levels: list[Level] = []
         for grid in coarse:
             p = interpolation(comm, ijk, rows, sizes, grid, unknowns.memory.mat_type)
@@ -106,12 +122,14 @@ class Multigrid:
         return galerkin, levels
 
     def update(self, q: Positions, contact: Rows, surface: SurfaceHessian | None = None) -> None:
-        """Build the hierarchy at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m].
+        """Build the hierarchy at positions q (l, 3) [m].
 
-        surface : contact of the surface with itself
+        contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
+        surface : Hessian of the surface's contact with itself
         """
-        joined, others = surface.split(self.fine.compliance, POINTS) if surface else (None, None)
-        contact = contact + others.blocks if others else contact
+        # The stiffest points couple nodes, the remaining points add to diagonal blocks.
+        joined, remaining = surface.split(self.fine.compliance, POINTS) if surface else (None, None)
+        contact = contact + remaining.blocks if remaining else contact
         self.fine.update(q, contact, joined)
         self.operator.assemble()
         self.sum.update(q, contact)
@@ -135,7 +153,7 @@ class Multigrid:
             noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
             self.bounds[i] = SAFETY * greatest_eigenvalue(level.matrix, noise)
         for i, bound in enumerate(self.bounds):
-            set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), LEAST * bound, bound)
+            set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), RANGE_START * bound, bound)
         if is_new:
             self._read_options()
             self.sizes = self._sizes()
@@ -157,9 +175,8 @@ class Multigrid:
         if not self.sizes:
             return f"multigrid of {1 + len(self.levels)} levels, not built yet"
         nonzeros = [number for _, number in self.sizes]
-        lines = [
-            f"multigrid of {len(self.sizes)} levels, operator complexity {sum(nonzeros) / nonzeros[0]:.3f}"
-        ]
+        complexity = f"operator complexity {sum(nonzeros) / nonzeros[0]:.3f}"
+        lines = [f"multigrid of {len(self.sizes)} levels, {complexity}"]
         lines.append(f"{'level':>5} {'nodes':>10} {'nonzeros':>12}")
         numbers = range(len(self.sizes) - 1, -1, -1)
         lines += [
@@ -169,7 +186,7 @@ class Multigrid:
         return "\n".join(lines)
 
     def _finest_bound(self) -> float:
-        """Greatest eigenvalue of D^-1 H on the finest level, at most, or as some iterations of CG know it."""
+        """Return a bound on the eigenvalues of D^-1 H of the finest level, or an estimate by CG."""
         bound, unknowns = self.fine.elasticity.bound, self.unknowns
         if bound is not None:
             return bound
@@ -177,7 +194,7 @@ class Multigrid:
         return SAFETY * greatest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
 
     def _galerkin_product(self, finer: Level, level: Level) -> None:
-        """P^T H P."""
+        """Compute P^T H P of a level from the matrix of the next finer coarse level."""
         is_new = not level.matrix
         with ExitStack() as options:
             for name, value in self._product_options(finer.matrix) if is_new else ():
@@ -188,10 +205,12 @@ class Multigrid:
             level.matrix.setOption(PETSc.Mat.Option.SPD, True)
 
     def _raise_diagonal(self, matrix: PETSc.Mat) -> None:
-        """Few fine nodes in a coarse cell leave its columns linearly dependent.
+        """Increase the diagonal of a coarse matrix by RAISED, to make it positive definite.
 
-        What is added holds coarse nodes to the ground, and a slender body resists its load by no more than that. A free
-        one without mass needs it: a load moves it so far that single precision has no digits for its shape.
+        A coarse cell with few fine nodes has linearly dependent columns. The increase fixes coarse
+        nodes to the ground. It must be small for a held slender body, whose bending is as soft. A
+        free body without mass needs more: otherwise a load moves it so far that single precision
+        loses its shape.
         """
         diagonal = matrix.getDiagonal()
         diagonal.scale(1 + RAISED[int(self.bodies.free.any())])
@@ -199,20 +218,17 @@ class Multigrid:
         diagonal.destroy()
 
     def _product_options(self, matrix: PETSc.Mat) -> Iterator[tuple[str, str]]:
-        """PETSc's options of the product P^T H P that are ours, where the user gives none."""
+        """Yield our defaults for PETSc's options of the product P^T H P."""
         given = PETSc.Options().getAll()
+        # PETSc's default sums messages in the order of arrival, which varies.
         if matrix.comm.size > 1 and "matptap_via" not in given:
-            yield (
-                "matptap_via",
-                "allatonce",
-            )  # the default adds what other ranks send as it comes in: no two runs alike
+            yield "matptap_via", "allatonce"
+        # The product of PETSc 3.26 on an H100 is wrong: it is 0.
         if self.unknowns.memory is device.CUDA and "matptap_backend_cpu" not in given:
-            yield (
-                "matptap_backend_cpu",
-                "true",
-            )  # on an H100 PETSc 3.26's own product of two sparse matrices was 0
+            yield "matptap_backend_cpu", "true"
 
     def _create_cycle(self) -> None:
+        """Give the PCMG its levels, interpolations, restrictions and smoothers."""
         pc, top = self.pc, len(self.levels)
         pc.setOptionsPrefix(self.prefix)
         pc.setOperators(self.operator)
@@ -232,9 +248,11 @@ class Multigrid:
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
 
     def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
-        """P^T by itself: of a square P PETSc cannot tell by its shape, nor PETSc 3.22 of a MATTRANSPOSE of one.
+        """Return the restriction P^T as a matrix of its own.
 
-        To restrict by a square matrix, PETSc 3.22 multiplies by its transpose, 3.18 by itself.
+        PETSc recognises the restriction by its shape, which fails for a square P. For a square
+        matrix, PETSc 3.22 multiplies by the transpose and PETSc 3.18 by the matrix itself. PETSc
+        3.22 fails for a MATTRANSPOSE as well.
         """
         fine, coarse = interpolation.getSizes()
         is_transposed = fine[1] == coarse[1] and PETSc.Sys.getVersion() >= TRANSPOSES_SQUARE
@@ -248,29 +266,34 @@ class Multigrid:
         return restriction
 
     def _read_options(self) -> None:
-        """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG."""
+        """Read PETSc's options. Raises InputError for a smoother that needs a finest matrix.
+
+        A preset's pc_type may name the first preconditioner of a step instead of the PCMG.
+        """
         options = PETSc.Options(self.prefix)
         for name in ("mg_levels_pc_type", f"mg_levels_{len(self.levels)}_pc_type"):
             if options.hasName(name):
                 kind = options.getString(name)
                 raise InputError(
-                    f"-{self.prefix}{name} {kind}: the finest level has no matrix, but 3 x 3 blocks of its own"
+                    f"-{self.prefix}{name} {kind}: the finest level has no matrix, but 3 x 3 "
+                    "blocks of its own"
                 )
         with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):
             self.pc.setFromOptions()
             self.pc.setUp()
 
     def destroy(self) -> None:
+        """Destroy all PETSc objects (collective)."""
         self.owned.close()
 
 
 def greatest_eigenvalue(
     matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlocks | None" = None
 ) -> float:
-    """Return about the greatest eigenvalue of D^-1 H of a level, D its 3 x 3 diagonal blocks (collective).
+    """Return an estimate of the largest eigenvalue of D^-1 H by ten CG iterations (collective).
 
-    noise  : (n,) of this rank, from 0 to 1
-    blocks : D^-1 where H is not assembled
+    noise  : (n,) random numbers of this rank, from 0 to 1
+    blocks : D^-1 if H is not assembled; otherwise D is the 3 x 3 block diagonal of the matrix
     """
     x, b = matrix.createVecs()
     b.array[:] = noise - 0.5
@@ -290,7 +313,7 @@ def greatest_eigenvalue(
 
 
 class Restriction:
-    """P^T whichever way it is applied (a context of MATPYTHON)."""
+    """Apply P^T, also as its own transpose (a context of MATPYTHON)."""
 
     def __init__(self, interpolation: PETSc.Mat):
         self.interpolation = interpolation
@@ -302,19 +325,22 @@ class Restriction:
 
 
 class ProjectedHessian:
-    """H = M + t^2 (projected Hessian of E, and of contact) at the positions that the hierarchy was built at.
+    """Apply H = M + t^2 (projected Hessian of E and of contact) (a context of MATPYTHON).
 
-    It is positive definite whatever these are (a context of MATPYTHON).
+    H belongs to the positions of the last ``update`` and is positive definite.
 
-    products : so far
+    products   : number of products so far
+    inverse    : (m, 9) D^-1 [1/kg]
+    compliance : (owned,) [m/N] estimated compliance of a node at rest
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, t2: float):
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
         lattice = unknowns.lattice
-        self.v = np.zeros_like(lattice.nodes, dtype=np.float32)  # pinned nodes stay zero
+        # The rows of pinned nodes stay zero.
+        self.v = np.zeros_like(lattice.nodes, dtype=np.float32)
         self.product = np.empty_like(self.v)
-        self.elastic: Hessian | None = None  # until ``update``
+        self.elastic: Hessian | None = None
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
@@ -327,14 +353,13 @@ class ProjectedHessian:
         self.smoother: ContactSmoother | None = None
 
     def update(self, q: Positions, contact: Rows, joined: SurfaceHessian | None = None) -> None:
-        """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m].
+        """Compute H and D^-1 at positions q (l, 3) [m].
 
-        joined : of the surface's contact with itself
+        contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
+        joined  : contact of the surface that couples nodes
         """
-        self.elastic, self.contact = (
-            self.elasticity.hessian_at(q, projected=True, dtype=np.float32),
-            contact,
-        )
+        self.elastic = self.elasticity.hessian_at(q, projected=True, dtype=np.float32)
+        self.contact = contact
         unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
         self.elasticity.add_bound(q, blocks)
         nodes = FreeNodes(unknowns.free, unknowns.ballast, contact, self.t2)
@@ -345,7 +370,7 @@ class ProjectedHessian:
         )
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = H x."""
+        """Write H x to y."""
         assert self.elastic is not None, "the hierarchy was not built"
         self.products += 1
         with FINE:
@@ -359,7 +384,7 @@ class ProjectedHessian:
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
 
     def by_blocks(self, x: Rows, y: Rows) -> Rows:
-        """Write D^-1 x (3, m) into y, and return it; D the 3 x 3 diagonal blocks of H."""
+        """Write D^-1 x (3, m) to y, contact of the surface included, and return y."""
         apply_blocks(self.unknowns.size, x, self.inverse, y)
         if self.smoother:
             self.smoother.correct(y)
@@ -367,7 +392,7 @@ class ProjectedHessian:
 
 
 class DiagonalBlocks:
-    """Inverse of the 3 x 3 diagonal blocks of the finest level (a context of PCPYTHON)."""
+    """Apply the inverse of the finest level's 3 x 3 diagonal blocks (a context of PCPYTHON)."""
 
     def __init__(self, hessian: ProjectedHessian):
         self.hessian = hessian
@@ -399,7 +424,13 @@ def apply_blocks(first: int, count: int, step: int, x: Rows, inverse: Array, y: 
 
 
 class FreeNodes(NamedTuple):
-    """The unknowns (m,) of a step: their nodes, mass and contact (owned, 9), or (0, 9), of all nodes, t^2 [s^2]."""
+    """Terms of the diagonal blocks of H.
+
+    free    : (m,) numbers of the free nodes
+    mass    : (owned,) [kg]
+    contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
+    t2      : t^2 [s^2]
+    """
 
     free: Indices
     mass: Floats
@@ -411,6 +442,7 @@ class FreeNodes(NamedTuple):
 def invert_blocks(
     first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes
 ) -> None:
+    """Invert the diagonal blocks m I + t^2 (blocks + contact) of the free nodes."""
     free, mass, contact, t2 = nodes
     for i in range(first, count, step):
         node = free[i]
@@ -419,14 +451,8 @@ def invert_blocks(
         e, f, g = t2 * d[4], t2 * d[5], t2 * d[8]
         if len(contact):
             p = contact[node]
-            a, b, c, e, f, g = (
-                a + t2 * p[0],
-                b + t2 * p[1],
-                c + t2 * p[2],
-                e + t2 * p[4],
-                f + t2 * p[5],
-                g + t2 * p[8],
-            )
+            a, b, c = a + t2 * p[0], b + t2 * p[1], c + t2 * p[2]
+            e, f, g = e + t2 * p[4], f + t2 * p[5], g + t2 * p[8]
         a, e, g = a + m, e + m, g + m
         u, v, w = e * g - f * f, c * f - b * g, b * f - c * e
         over = 1.0 / (a * u + b * v + c * w)

@@ -1,9 +1,12 @@
-"""Bodies that no spring joins, as a step's unknowns see them: what is held lies between them, too.
+"""Separate bodies in multigrid, and exact translations of free bodies.
 
-Each has coarse grids of its own, and translations of what no spring holds are kept exactly.
+A body is a set of free nodes joined by springs. Pinned nodes separate bodies. Each body has its own
+coarse grids. With T the translations of the free bodies and Q = T (T^T M T)^-1 T^T M, a cycle B
+becomes
 
-With T the translations and Q = T (T^T M T)^-1 T^T M, a cycle B becomes (I - Q) B (I - Q)^T + T (T^T M T)^-1 T^T. They
-are eigenvectors of M^-1 H, so that forces that balance never move a body as a whole.
+    (I - Q) B (I - Q)^T + T (T^T M T)^-1 T^T.
+
+Translations are eigenvectors of M^-1 H. Balanced forces therefore never move a body as a whole.
 """
 
 from dataclasses import dataclass
@@ -22,21 +25,24 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies of a lattice."""
+    """Bodies of a lattice.
 
-    number: Indices  # (l,) of each local node's body; -1 where it is held
-    free: Mask  # (b,) bool of each body, whether no spring holds it
+    number : (l,) body of each local node, -1 if pinned
+    free   : (b,) bool, whether no spring joins the body with a pinned node
+    """
 
-    def apart(self, comm: MPI.Comm, ijk: Indices) -> Indices:
-        """Return how far each local node's body is to be moved along the grid's first axis, (l,), so that no two have a
-        coarse cell in common; 0 where the grid has no room for that, and of what is held (collective).
+    number: Indices
+    free: Mask
 
-        ijk : (l, 3) grid indices of the local nodes
+    def offsets(self, comm: MPI.Comm, ijk: Indices) -> Indices:
+        """Return grid offsets (l,) along the first axis that separate the bodies (collective).
+
+        Shifted bodies share no coarse cell. Pinned nodes have offset 0. If the grid indices (l, 3)
+        have no room, all offsets are 0.
         """
         farthest = comm.allreduce(int(ijk.max(initial=0)), MPI.MAX)
-        room = (
-            2 << farthest.bit_length()
-        )  # twice what they take, and a power of two, so on the coarser grids as well
+        # A power of two above the extent separates bodies on coarser grids as well.
+        room = 2 << farthest.bit_length()
         return np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
 
 
@@ -50,9 +56,9 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
         (np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2
     )
     part = connected_components(graph, directed=False)[1]
-    name = _names(unknowns, part)
-    table = SortedKeys(comm, name[: lattice.owned][moves[: lattice.owned]])
-    number = np.where(moves, table.find(np.where(moves, name, -1)), -1)
+    label = _labels(unknowns, part)
+    table = SortedKeys(comm, label[: lattice.owned][moves[: lattice.owned]])
+    number = np.where(moves, table.find(np.where(moves, label, -1)), -1)
     held = np.zeros(table.total, bool)
     ends = springs[either & ~both]
     held[number[ends[moves[ends]]]] = True
@@ -60,33 +66,36 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
     return Bodies(number, ~held)
 
 
-def _names(unknowns: Unknowns, part: Indices) -> Indices:
-    """The least global number (l,) in the body of each node; ``part`` (l,) that of this rank it belongs to.
+def _labels(unknowns: Unknowns, part: Indices) -> Indices:
+    """Return the smallest global number (l,) of a node in the body of each node (collective).
 
-    Ranks that have parts of one body tell each other until none learns of a lesser number.
+    Ranks that share a body exchange their smallest numbers until no number changes.
+
+    part : (l,) connected part of this rank's nodes that each node belongs to
     """
     comm, lattice = unknowns.comm, unknowns.lattice
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
-    name, is_new = lattice.global_numbers, True
+    label, is_new = lattice.global_numbers, True
     while is_new:
         least = np.full(part.max(initial=-1) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(least, part, name)
-        lesser = least[part]
-        lesser[lattice.owned :] = np.minimum(
-            lesser[lattice.owned :], to_owner.answer(lesser[asked])
+        np.minimum.at(least, part, label)
+        smaller = least[part]
+        smaller[lattice.owned :] = np.minimum(
+            smaller[lattice.owned :], to_owner.answer(smaller[asked])
         )
-        is_new = comm.allreduce(bool((lesser < name).any()), MPI.LOR)
-        name = lesser
-    return name
+        is_new = comm.allreduce(bool((smaller < label).any()), MPI.LOR)
+        label = smaller
+    return label
 
 
 class Translations:
-    """Translations of the free bodies. All methods are collective.
+    """Treat translations of free bodies exactly in a multigrid cycle. All methods are collective.
 
-    body : (m,) which of the free ones a free node belongs to; their number where its body is held
-    mass : (m,) of each free node [kg]
-    of_body : (b,) of each free body [kg]
+    count   : number b of free bodies
+    body    : (m,) free body of each free node; b if its body is held
+    mass    : (m,) mass of each free node [kg]
+    of_body : (b,) mass of each free body [kg]
     """
 
     def __init__(self, unknowns: Unknowns, bodies: Bodies):
@@ -97,12 +106,12 @@ class Translations:
         self.of_body = self._sums(self.mass[None])[0]
 
     def of(self, forces: Rows) -> Rows:
-        """Return T (T^T M T)^-1 T^T f, (3, m), of f (3, m)."""
+        """Return T (T^T M T)^-1 T^T f (3, m) of forces f (3, m)."""
         moved = self._sums(forces) / self.of_body
         return like(forces, np.append(moved, np.zeros((3, 1)), axis=1))[:, self.body]
 
     def around(self, cycle: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Apply to x what a cycle becomes, into y."""
+        """Apply a cycle with exact translations to x; write the result to y."""
         unknowns = self.unknowns
         forces, rest = unknowns.columns(x), x.duplicate()
         whole = self.of(forces)
@@ -113,7 +122,7 @@ class Translations:
         moved += whole - self.of(self.mass * moved)
 
     def _sums(self, rows: Rows) -> Floats:
-        """Sums (r, b) over each free body's nodes of rows (r, m)."""
+        """Return the sums (r, b) of rows (r, m) over the nodes of each free body."""
         own = [to_host(np.bincount(self.body, row, self.count + 1)[: self.count]) for row in rows]
         sums: Floats = self.unknowns.comm.allreduce(np.array(own).reshape(len(rows), self.count))
         return sums

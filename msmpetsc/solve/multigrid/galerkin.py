@@ -1,9 +1,12 @@
-"""Matrix of the first coarse level, summed spring by spring or cell by cell.
+"""Galerkin matrix P^T H P of the first coarse level, summed over springs, nodes and cells.
 
-Each spring lies within one coarse cell of 2 x 2 x 2 cells. With w_a the weights (8,) of a cell's corners at the end a,
-zero where that is held, a spring of block B adds (w_a - w_b)(w_a - w_b)^T (x) t^2 B to the matrix (24 x 24) of its
-cell; a node of mass m with the block C of contact adds w w^T (x) (m I + t^2 C); and a cell of a solid adds its Hessian,
-whose strains are taken of the coarse cell's corners (elasticity.neo_hookean).
+A coarse cell has 2 x 2 x 2 fine cells, and each spring lies within a coarse cell. Let w_a be the
+weights (8,) of the cell's corners at end a of a spring, or 0 if the end is pinned. The matrix
+(24 x 24) of the cell is the sum of these terms:
+
+- a spring with block B: (w_a - w_b)(w_a - w_b)^T (x) t^2 B
+- a node of mass m with contact block C: w w^T (x) (m I + t^2 C)
+- a solid cell: its Hessian in the strains of the coarse corners (elasticity.neo_hookean)
 """
 
 from typing import NamedTuple
@@ -26,23 +29,28 @@ from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
-HELD = 27  # code of an end that is no unknown; others are 9 i + 3 j + k of where they are in their coarse cell
-UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]  # of the nine numbers of a block, and of those six
-PAIRS = np.array(
-    [(p, q) for p in range(8) for q in range(p, 8)]
-)  # of corners: the upper triangle of a cell's matrix
+# code of a pinned node; a node at (i, j, k) in its coarse cell has 9 i + 3 j + k
+PINNED = 27
+# the upper triangle in a 3 x 3 block, and the diagonal in the upper triangle
+UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
+# pairs (36, 2) of corners: the upper triangle of a cell's matrix
+PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])
 
 
 def _weights() -> Rows:
-    """Weights (28, 8) of a coarse cell's corners at each of its 27 fine nodes; none where one is held."""
+    """Return the weights (28, 8) of a coarse cell's corners at each position code."""
     ijk = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1)
     along = np.where(CORNERS[None] > 0, ijk[:, None, :] / 2, 1 - ijk[:, None, :] / 2)
     return np.concatenate([along.prod(axis=2), np.zeros((1, 8))])
 
 
 class Products(NamedTuple):
-    """Of each of some weights (n, 8), w w^T where it is not zero: entry i's are begin[i] to begin[i + 1] of pairs and
-    their factors."""
+    """Nonzeros of the outer products w w^T of weights (n, 8), in compressed rows.
+
+    begin  : (n + 1,) product i has the entries begin[i] to begin[i + 1]
+    pair   : (k,) index of each entry in PAIRS
+    factor : (k,) value of each entry
+    """
 
     begin: Indices
     pair: Indices
@@ -50,6 +58,7 @@ class Products(NamedTuple):
 
     @classmethod
     def of(cls, weights: Rows) -> "Products":
+        """Return the products of weights (n, 8)."""
         factors = weights[:, PAIRS[:, 0]] * weights[:, PAIRS[:, 1]]
         which, pair = np.nonzero(factors)
         begin = np.searchsorted(which, np.arange(len(weights) + 1)).astype(np.int32)
@@ -57,34 +66,44 @@ class Products(NamedTuple):
 
 
 WEIGHTS = _weights()
-OF_SPRINGS = Products.of(
-    (WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8)
-)  # by 28 times a code and another
+# products of a spring, at 28 times the code of an end plus that of the other end
+OF_SPRINGS = Products.of((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))
+# products of a node, at its code
 OF_NODES = Products.of(WEIGHTS)
 
 
 class ByCell(NamedTuple):
-    """Things of a rank ordered by the coarse cell they lie in: those of cell i are order[start[i] : start[i + 1]]."""
+    """Springs, nodes or cells of a rank, sorted by their coarse cell.
+
+    start : (c + 1,) coarse cell i has the items order[start[i] : start[i + 1]]
+    order : (n,) numbers of the items
+    code  : position codes in the coarse cell of each item's ends or corners, in that order
+    """
 
     start: Indices
     order: Indices
-    code: Indices  # of each, in that order, where its ends or corners are in that cell
+    code: Indices
 
     @classmethod
     def of(cls, cells: Indices, keys: Indices, code: Indices, which: Indices) -> "ByCell":
-        """keys : ascending ones of all cells; cells (n,) the key of each thing; which (n,) its number."""
+        """Return items (n,) sorted by their cells' keys (n,), given all keys (c,) ascending."""
         by_cell = np.argsort(cells, kind="stable")
         start = np.searchsorted(cells[by_cell], keys, side="left")
         start = np.append(start, len(cells)).astype(np.int32)
         return cls(start, which[by_cell].astype(np.int32), code[by_cell].astype(np.uint8))
 
-    def near(self, array: Array) -> "ByCell":
-        """Return the same in the memory that an array is in."""
+    def to_device_of(self, array: Array) -> "ByCell":
+        """Return a copy in the memory, CPU or GPU, of an array."""
         return ByCell(*(like(array, part) for part in self))
 
 
 class PairSum(NamedTuple):
-    """Blocks that springs or nodes add to; ``places`` (c, 36) has that of each pair of a coarse cell's corners."""
+    """Sum of the blocks of springs or nodes.
+
+    values   : (b, 6) upper triangles of the blocks
+    places   : (c, 36) block of each pair of a coarse cell's corners, -1 if there is none
+    products : products of the weights of each code
+    """
 
     values: Rows
     places: Indices
@@ -93,7 +112,12 @@ class PairSum(NamedTuple):
 
 
 class CellSum(NamedTuple):
-    """Blocks that fine cells add to; ``weights`` are times the step [s], as a Hessian is of second degree in them."""
+    """Sum of the blocks of fine cells.
+
+    values  : (b, 9) blocks
+    places  : (c, 36) block of each pair of a coarse cell's corners, -1 if there is none
+    weights : (28, 8) weights of the corners times the time step [s], because H has t^2
+    """
 
     values: Rows
     places: Indices
@@ -102,14 +126,14 @@ class CellSum(NamedTuple):
 
 
 class GalerkinSum:
-    """Sums P^T H P of a lattice, H = M + t^2 (projected Hessian of E), into a matrix of the first coarse grid.
+    """Sum P^T H P of the first coarse grid, with H = M + t^2 (projected Hessian of E).
 
-    ijk    : (l, 3) grid index of each local node
-    apart  : (l,) how far its body is moved along the first axis, to have coarse cells of its own
-    matrix : AIJ of block size 3; it has values after the first ``update``
+    On a CPU, all cells add to the blocks of this rank's pairs of nodes. On a GPU, each cell has its
+    own blocks, which PETSc sums.
 
-    On a CPU all cells add to the blocks of this rank's pairs of nodes; on a GPU each has blocks of
-    its own, which PETSc then adds.
+    ijk     : (l, 3) grid index of each local node
+    offsets : (l,) offset of each node's body along the first axis (free_bodies.Bodies.offsets)
+    matrix  : AIJ of block size 3; it has values after the first ``update``
     """
 
     def __init__(
@@ -119,11 +143,11 @@ class GalerkinSum:
         t2: float,
         grid: CoarseGrid,
         ijk: Indices,
-        apart: Indices,
+        offsets: Indices,
     ):
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
-        keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity, ijk, apart)
+        keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity, ijk, offsets)
         self.weights, self.full = (like(lattice.nodes, a) for a in (t2**0.5 * WEIGHTS, SYMMETRIC))
         of_springs = OF_SPRINGS._replace(factor=t2 * OF_SPRINGS.factor)
         self.of_springs, self.of_nodes = (
@@ -137,14 +161,12 @@ class GalerkinSum:
         self.matrix = self._create_matrix(grid, first, second, upper)
 
     def _pairs(self, grid: CoarseGrid, keys: Indices) -> tuple[Indices, Indices, Indices]:
-        """Global numbers (b,), (b,) of the pairs of nodes that have a block; which a cell adds to, (c, 36), -1 none."""
+        """Return the pairs of nodes (b,), (b,) with a block, and each cell's blocks (c, 36)."""
         number = grid.table.find(encode_morton(decode_morton(keys)[:, None, :] + CORNERS))
         first, second = number[:, PAIRS[:, 0]], number[:, PAIRS[:, 1]]
         exists = (first >= 0) & (second >= 0)
-        pairs, places = (
-            (first * grid.table.total + second)[exists],
-            np.full(exists.shape, -1, np.int32),
-        )
+        pairs = (first * grid.table.total + second)[exists]
+        places = np.full(exists.shape, -1, np.int32)
         places[exists] = np.arange(len(pairs))
         if on_host(self.unknowns.lattice.nodes):
             pairs, shared = np.unique(pairs, return_inverse=True)
@@ -154,6 +176,7 @@ class GalerkinSum:
     def _create_matrix(
         self, grid: CoarseGrid, first: Indices, second: Indices, upper: Indices
     ) -> PETSc.Mat:
+        """Return the matrix with blocks of the pairs; ``upper`` adds transposes (collective)."""
         comm = self.unknowns.comm
         refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
         matrix = PETSc.Mat().create(comm=comm)
@@ -172,9 +195,12 @@ class GalerkinSum:
         return matrix
 
     def update(self, q: Positions, contact: Rows) -> None:
-        """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes
-        [N/m] (collective)."""
-        symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
+        """Sum the matrix at positions q (l, 3) [m] (collective).
+
+        contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
+        """
+        count = len(self.places)
+        symmetric = np.zeros((self.blocks, 6), like=q)
         solid, viscosity = self.elasticity.solid, self.elasticity.viscosity
         if self.elasticity.springs:
             of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
@@ -194,37 +220,39 @@ class GalerkinSum:
 
 
 def set_block_size(matrix: PETSc.Mat) -> None:
-    """Give a matrix of three rows a node this block size, its diagonal part, which pbjacobi
-    inverts, too: PETSc makes that of a matrix on several ranks without one."""
+    """Set block size 3 for a matrix and its diagonal part.
+
+    PETSc gives the diagonal part of a parallel matrix no block size, but pbjacobi inverts it.
+    """
     matrix.setBlockSize(3)
     matrix.getDiagonalBlock().setBlockSize(3)
 
 
 def _by_cell(
-    unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, apart: Indices
+    unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, offsets: Indices
 ) -> tuple[Indices, ByCell, ByCell, ByCell]:
-    """Keys of the coarse cells that anything of this rank lies in; its springs, free nodes and cells."""
+    """Return the keys of this rank's coarse cells, and its springs, nodes and cells by them."""
     lattice = unknowns.lattice
-    held, free = to_host(lattice.pinned), to_host(unknowns.free)
+    pinned, free = to_host(lattice.pinned), to_host(unknowns.free)
     springs = to_host(lattice.springs)[: lattice.springs_owned if elasticity.springs else 0]
-    moving = np.flatnonzero(~held[springs].all(axis=1))
+    moving = np.flatnonzero(~pinned[springs].all(axis=1))
     corners = elasticity.corners
     ends = [springs[moving], free[:, None], corners]
     low = [ijk[nodes].min(axis=1) // 2 for nodes in ends]
-    along = [
-        apart[nodes].max(axis=1) // 2 for nodes in ends
-    ]  # what is held is moved with what it holds
+    # A pinned node has offset 0 and follows the body that it holds.
+    coarse_offsets = [offsets[nodes].max(axis=1) // 2 for nodes in ends]
     keys = [
-        encode_morton(corner + [1, 0, 0] * by[:, None])
-        for corner, by in zip(low, along, strict=True)
+        encode_morton(corner + [1, 0, 0] * offset[:, None])
+        for corner, offset in zip(low, coarse_offsets, strict=True)
     ]
     codes = [
-        np.where(held[nodes], HELD, (ijk[nodes] - 2 * corner[:, None]) @ [9, 3, 1])
+        np.where(pinned[nodes], PINNED, (ijk[nodes] - 2 * corner[:, None]) @ [9, 3, 1])
         for nodes, corner in zip(ends, low, strict=True)
     ]
-    every, which = np.unique(np.concatenate(keys)), (moving, free, np.arange(len(corners)))
+    every = np.unique(np.concatenate(keys))
+    which = moving, free, np.arange(len(corners))
     of_springs, of_nodes, of_cells = (
-        ByCell.of(key, every, code, number).near(lattice.nodes)
+        ByCell.of(key, every, code, number).to_device_of(lattice.nodes)
         for key, code, number in zip(keys, codes, which, strict=True)
     )
     return every, of_springs, of_nodes, of_cells
@@ -234,6 +262,7 @@ def _by_cell(
 def add_springs(
     first: int, count: int, step: int, q: Positions, into: PairSum, springs: Springs
 ) -> None:
+    """Add t^2 times the projected Hessians of the springs at q (l, 3) [m]."""
     values, places, (start, order, code), (begin, pair, factor) = into
     ends, rest, k = springs
     for i in range(first, count, step):
@@ -242,17 +271,12 @@ def add_springs(
             m, n = ends[s, 0], ends[s, 1]
             x, y, z = q[m, 0] - q[n, 0], q[m, 1] - q[n, 1], q[m, 2] - q[n, 2]
             c, ex, ey, ez = spring_block((x, y, z), rest[s], k[s], True)
-            xx, xy, xz, yy, yz, zz = (
-                c + ex * ex,
-                ex * ey,
-                ex * ez,
-                c + ey * ey,
-                ey * ez,
-                c + ez * ez,
-            )
+            xx, xy, xz = c + ex * ex, ex * ey, ex * ez
+            yy, yz, zz = c + ey * ey, ey * ez, c + ez * ez
             for entry in range(begin[kind], begin[kind + 1]):
                 f, place = factor[entry], places[i, pair[entry]]
-                values[place, 0] += f * xx  # a view of the block would take as long again
+                # A view of the block would double the time.
+                values[place, 0] += f * xx
                 values[place, 1] += f * xy
                 values[place, 2] += f * xz
                 values[place, 3] += f * yy
@@ -277,9 +301,9 @@ def add_nodes(first: int, count: int, step: int, own: Rows, into: PairSum) -> No
 def add_solid(
     first: int, count: int, step: int, scratch: Array, into: CellSum, cells: CellRows
 ) -> None:
-    """Add t^2 times the Hessians of cells, whose corners follow coarse cells.
+    """Add t^2 times the Hessians of fine cells, whose corners are interpolated from coarse corners.
 
-    scratch : (s, 8, 14) of each coarse corner the strain of one component and what it does; cell i has row i % s
+    scratch : (s, 8, 14) rows of ``_write_coarse``; coarse cell i uses row i % s
     """
     values, places, by_cell, weights = into
     for i in range(first, count, step):
@@ -301,7 +325,11 @@ def add_solid(
 
 @njit(inline="always")
 def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: int, s: int) -> None:
-    """Write, of each coarse corner, the strain g, h of a cell (7), what the modes h push (4), and cof F g (3)."""
+    """Write a row (14,) for each coarse corner of a fine cell.
+
+    A row has the strain g, h of a unit displacement (7), the forces of the modes h (4), and
+    cof F g (3).
+    """
     n = kept_cofactors(cells.state, s)
     for a in range(8):
         u = (
@@ -316,7 +344,10 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
 
 @njit(inline="always")
 def _add_block(block: Floats, own: float, state: Floats, s: int, g: Floats, h: Floats) -> None:
-    """Add own I + U'' m n^T + U' [t]_x with t = F (h x g), what v . (F x (u (x) h)) g is of u and v."""
+    """Add own I + U'' m n^T + U' [t]_x, with t = F (h x g), to the block of two corners.
+
+    m and n are cof F g and cof F h. The last term is the bilinear form v . (F x (u (x) h)) g.
+    """
     f, slope, curvature = kept_gradient(state, s), state[s + 72], state[s + 80]
     x, y, z = h[1] * g[2] - h[2] * g[1], h[2] * g[0] - h[0] * g[2], h[0] * g[1] - h[1] * g[0]
     for r in range(3):

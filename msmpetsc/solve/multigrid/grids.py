@@ -1,8 +1,8 @@
-"""The coarse grids of a lattice: every second node of its grid, then every second of those, and how
-values pass from one to the next.
+"""Coarse grids of a lattice and the interpolation between them.
 
-A node of the finer grid at integer position i is interpolated trilinearly: along an axis it lies on the coarse node
-i / 2, or halfway between two. So all its weights are alike, 1 over the number of its parents: 1, 2, 4 or 8.
+Each grid has every second node of the finer grid along each axis. Interpolation is trilinear: along
+an axis, a node at integer position i lies on the coarse node i / 2 or halfway between two coarse
+nodes. Its 1, 2, 4 or 8 parents therefore have equal weights.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,19 @@ from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 
-SHRINK = 0.7  # a grid with more nodes than this share of the finer one's is no help
+# most nodes of a coarse grid, over the finer grid's; a larger grid does not pay
+SHRINK = 0.7
 
 
 @dataclass(frozen=True)
 class CoarseGrid:
-    """Nodes of one level; ``table`` has their Morton keys, in whose order they are numbered over all ranks."""
+    """Nodes of a coarse level, numbered over all ranks by their Morton keys ``table``."""
 
     table: SortedKeys
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Coordinates of this rank's nodes, and of all: x, y and z of a node follow each other."""
+        """Return the numbers of coordinates of this rank and of all ranks, interleaved by node."""
         return 3 * len(self.table.keys), 3 * self.table.total
 
 
@@ -38,15 +39,17 @@ def grid_indices(unknowns: Unknowns) -> Indices:
     nodes, keys = to_host(lattice.nodes), lattice.table.keys
     if not len(nodes):
         return np.empty((0, 3), np.int64)
-    # the first node of its body that this rank owns: a spring joins ghosts with such a node
+    # The origin is an owned node: a spring joins each ghost with an owned node.
     first = np.maximum(lattice.first_of_body[lattice.body] - lattice.table.first, 0)
     steps: Indices = np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
     return decode_morton(keys[first]) + steps
 
 
 def parents_of(ijk: Indices) -> tuple[Indices, Mask]:
-    """Return the Morton keys (n, 8) of the coarse nodes that grid indices (n, 3) are interpolated from, and which of
-    them are needed, (n, 8) bool: those of a corner that lies beyond an even index have no weight."""
+    """Return the Morton keys (n, 8) of the parents of grid indices (n, 3), and a mask (n, 8).
+
+    Corners that lie beyond an even index have no weight; the mask leaves them out.
+    """
     needed = ~((CORNERS[None] > 0) & (ijk[:, None, :] % 2 == 0)).any(axis=2)
     return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)), needed
 
@@ -54,10 +57,14 @@ def parents_of(ijk: Indices) -> tuple[Indices, Mask]:
 def grids(
     comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | None = None
 ) -> list[CoarseGrid]:
-    """Return the grids above nodes at grid indices (n, 3), of ``total`` on all ranks, the finest first (collective).
+    """Return the coarse grids of nodes at grid indices (n, 3), the finest first (collective).
 
-    There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a
-    coarser one would not be much smaller. Raises InputError for more nodes than PETSc can number.
+    Coarsening stops early if the next grid would not be much smaller. Raises InputError if PETSc
+    cannot number the nodes.
+
+    total    : number of nodes on all ranks
+    coarsest : most nodes of the last grid, if ``count`` is None
+    count    : number of grids
     """
     levels: list[CoarseGrid] = []
     while not levels or (total > coarsest if count is None else len(levels) < count):
@@ -79,10 +86,11 @@ def interpolation(
     grid: CoarseGrid,
     mat_type: str,
 ) -> PETSc.Mat:
-    """Return P (AIJ), from the values at a grid to those at finer nodes (collective).
+    """Return the interpolation P (AIJ) from a coarse grid to finer nodes (collective).
 
-    ijk  : (n, 3) grid indices of this rank's finer nodes that are unknowns
-    rows : (n, 3) this rank's rows of their x, y and z
+    ijk       : (n, 3) grid indices of this rank's finer nodes that are unknowns
+    rows      : (n, 3) local rows of their x, y and z
+    row_sizes : numbers of rows of this rank and of all ranks
     """
     keys, needed = parents_of(ijk)
     number = np.full(keys.shape, -1)

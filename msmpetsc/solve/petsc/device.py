@@ -1,9 +1,9 @@
-"""The device of a run, by the type of PETSc's matrix, and PETSc's objects in its memory.
+"""Device of a run, chosen by PETSc's matrix type, and PETSc objects in its memory.
 
-Both forms of ``Memory`` do the same: hand out the numbers of a vector as an array, without a copy, and make
-vectors and dense blocks over arrays of ours. Which one it is, ``memory_of`` an array tells.
+``Memory`` gives access to a PETSc vector as an array without a copy, and makes vectors and dense
+matrices over existing arrays. ``memory_of`` returns the memory of an array: CPU or GPU.
 
-CuPy and numba's CUDA target are imported by those alone who ask for a GPU: a CPU's run needs neither.
+CuPy and numba's CUDA target are imported only if a GPU is requested, because CPU runs need neither.
 """
 
 import ctypes
@@ -21,13 +21,14 @@ from msmpetsc.solve.petsc.library import dense_pointer, petsc_library
 OPTION = "mat_type"
 AIJCUSPARSE = "aijcusparse"
 ON_GPU = {AIJCUSPARSE, "seqaijcusparse", "mpiaijcusparse"}
-AWARE = "use_gpu_aware_mpi"  # PETSc's option, and the variable that it is read into
+# PETSc's option, and the C variable that holds its value
+GPU_AWARE_MPI = "use_gpu_aware_mpi"
 
 
 def choose(comm: MPI.Comm, device: str | None) -> None:
-    """Make ``--device`` the matrix type that runs have (collective).
+    """Set the matrix type of runs from ``--device`` (collective).
 
-    Raises InputError where both are given and differ, and at once what ``sender`` would raise later.
+    Raises InputError if ``-mat_type`` contradicts it, or if the device is not available.
     """
     mat_type = PETSc.Options().getAll().get(OPTION)
     if device and mat_type is not None and (mat_type in ON_GPU) != (device == "cuda"):
@@ -38,38 +39,43 @@ def choose(comm: MPI.Comm, device: str | None) -> None:
 
 
 def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
-    """Function that takes arrays to where runs compute (collective).
+    """Return a function that copies arrays to the device of the run (collective).
 
-    Raises InputError on all ranks where that is a GPU and one of them has none, or PETSc has no CUDA.
+    Raises InputError on all ranks if the device is a GPU, but a rank has none or PETSc lacks CUDA.
     """
     if PETSc.Options().getAll().get(OPTION) not in ON_GPU:
         return lambda array: array
-    wanted = PETSc.Options().getString(OPTION)  # and is marked as used: verlet has no matrix
+    # Reading the option marks it as used; Verlet has no matrix that would read it.
+    wanted = PETSc.Options().getString(OPTION)
     with together(comm):
         lacking = what_is_missing()
         if lacking:
             raise InputError(f"--device cuda (-{OPTION} {wanted}): {lacking}")
     import cupy
 
-    cupy.cuda.Device(
-        PETSc.COMM_WORLD.rank % cupy.cuda.runtime.getDeviceCount()
-    ).use()  # of several the one PETSc takes
-    if AWARE not in PETSc.Options().getAll():
-        # Not all MPI know GPUs, and without one PETSc stops at the first device use. It has read its options by now.
-        ctypes.c_bool.in_dll(petsc_library(), AWARE).value = False
+    # PETSc takes the same GPU out of several.
+    cupy.cuda.Device(PETSc.COMM_WORLD.rank % cupy.cuda.runtime.getDeviceCount()).use()
+    if GPU_AWARE_MPI not in PETSc.Options().getAll():
+        # An MPI without GPU support stops PETSc. PETSc has read its options already.
+        ctypes.c_bool.in_dll(petsc_library(), GPU_AWARE_MPI).value = False
     send: Callable[[Array], Array] = cupy.asarray
     return send
 
 
 def what_is_missing() -> str | None:
-    """Why this process cannot compute on a GPU, in words; None if it can."""
+    """Return why this process cannot compute on a GPU, in words; None if it can."""
     if not PETSc.Sys.hasExternalPackage("cuda"):
-        return "this PETSc was built without CUDA; scripts/build_petsc_cuda makes one that was not"
+        return (
+            "this PETSc was built without CUDA; scripts/build_petsc_cuda builds a PETSc with CUDA"
+        )
     return missing_cuda()
 
 
 def missing_cuda() -> str | None:
-    """Why Python has no GPU, in words; None if it has. The runtime is asked, for PETSc would crash at exit."""
+    """Return why Python cannot use a GPU, in words; None if it can.
+
+    The test asks the CUDA runtime, because PETSc crashes at exit if there is no GPU.
+    """
     try:
         import cupy
         from numba import cuda  # noqa: F401
@@ -77,43 +83,42 @@ def missing_cuda() -> str | None:
         return f"{error.name or 'CuPy'} cannot be imported; pip install 'msmpetsc[cuda]' brings it"
     try:
         return None if cupy.cuda.runtime.getDeviceCount() else "no GPU is seen"
-    except (
-        Exception
-    ) as error:  # of CuPy, of the runtime or of what loads it: no driver, one too old, no library
+    # A missing or old driver raises errors of CuPy, the CUDA runtime or the loader.
+    except Exception as error:
         return f"no GPU is seen: {str(error).splitlines()[0]}"
 
 
 class Memory:
-    """PETSc's vectors and matrices in the memory of the CPU; ``vec_type`` and ``mat_type`` are PETSc's names there."""
+    """Access to PETSc's vectors and matrices in CPU memory, with PETSc's names of their types."""
 
     vec_type, mat_type = PETSc.Vec.Type.STANDARD, PETSc.Mat.Type.AIJ
 
     def read(self, vector: PETSc.Vec) -> Floats:
-        """Return this rank's numbers, not to be written to."""
+        """Return this rank's numbers of a vector for reading."""
         return np.asarray(vector.array_r)
 
     def write(self, vector: PETSc.Vec) -> Floats:
-        """Return this rank's numbers, to be written to at once; reading them as well is allowed."""
+        """Return this rank's numbers of a vector for reading and writing at once."""
         return np.asarray(vector.array)
 
     def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
-        """Return a vector of all ranks' arrays (n,), which it keeps its numbers in."""
+        """Return a vector that shares the memory of the ranks' arrays (n,)."""
         return PETSc.Vec().createWithArray(array, (len(array), None), comm=comm)
 
     def dense(self, rows: tuple[int, int], columns: int, comm: PETSc.Comm) -> PETSc.Mat:
-        """Return a dense matrix; rows: of this rank, of all."""
+        """Return a dense matrix; ``rows`` are the numbers of rows of this rank and of all."""
         return _ready(PETSc.Mat().createDense((rows, (None, columns)), comm=comm))
 
     def values(self, dense: PETSc.Mat) -> Floats:
-        """Return this rank's part of a dense matrix, column after column, to be read or written at once."""
+        """Return this rank's part of a dense matrix by columns, to be used at once."""
         return np.asarray(dense.getDenseArray().T.reshape(-1))
 
 
 class CudaMemory(Memory):
-    """PETSc's vectors and matrices in the memory of a GPU.
+    """Access to PETSc's vectors and matrices in GPU memory.
 
-    Pointers are given back at once, as petsc4py does for DLPack: PETSc then knows that the GPU has the last word, and
-    what is written later is in the same stream as all of PETSc's work, the default one.
+    A pointer is restored at once, as petsc4py does for DLPack, so that PETSc takes the GPU's copy
+    as valid. Later writes are safe, because they use PETSc's stream, the default stream.
     """
 
     vec_type, mat_type = PETSc.Vec.Type.CUDA, PETSc.Mat.Type.AIJCUSPARSE
@@ -126,7 +131,7 @@ class CudaMemory(Memory):
 
     def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
         return PETSc.Vec().createCUDAWithArrays(
-            cudahandle=array.data.ptr,  # type: ignore[attr-defined]  # CuPy's
+            cudahandle=array.data.ptr,  # type: ignore[attr-defined]
             size=(len(array), None),
             comm=comm,
         )
@@ -144,7 +149,7 @@ class CudaMemory(Memory):
 
 
 def view(pointer: int, size: int) -> Floats:
-    """Return memory of a GPU that is someone else's, (size,) numbers, as an array; valid as long as that memory."""
+    """Return GPU memory owned by PETSc as an array (size,), valid as long as the memory."""
     import cupy
 
     numbers: Floats = cupy.empty(0)
@@ -155,6 +160,7 @@ def view(pointer: int, size: int) -> Floats:
 
 
 def _ready(dense: PETSc.Mat) -> PETSc.Mat:
+    """Return a dense matrix after its set-up and assembly (collective)."""
     dense.setUp()
     dense.assemble()
     return dense
@@ -164,4 +170,5 @@ HOST, CUDA = Memory(), CudaMemory()
 
 
 def memory_of(array: Floats) -> Memory:
+    """Return the memory, CPU or GPU, that holds an array."""
     return HOST if on_host(array) else CUDA

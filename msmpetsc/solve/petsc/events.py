@@ -1,7 +1,7 @@
-"""What -log_view shows of a run: events by what is done, and stages of the run.
+"""Events and stages of a run for -log_view.
 
-An event within another counts in both, as PETSc's own do: KSPSolve has the products that it makes.
-What is done at the levels of multigrid -pc_mg_log shows.
+Nested events both count the time, as PETSc's events do: KSPSolve includes its products. For the
+levels of multigrid, see -pc_mg_log.
 """
 
 from contextlib import ExitStack
@@ -9,33 +9,37 @@ from contextlib import ExitStack
 from petsc4py import PETSc
 
 SETUP, STEPS, OUTPUT = (PETSc.Log.Stage(name) for name in ("set-up", "steps", "output"))
-REFERENCE = PETSc.Log.Stage("reference")  # steps solved once more, which are no part of the run
-for unused in REFERENCE, PETSc.Log.Stage("PCMPI"):  # PETSc's own of -mpi_linear_solver_server
-    unused.visible = False  # -log_view calls a stage that never begins Unknown
-OF_THE_RUN = (
-    0,
-    SETUP.id,
-    STEPS.id,
-    OUTPUT.id,
-)  # 0: PETSc's own, before the set-up and after the last frame
+# reference solves for true errors; the times of the run leave them out
+REFERENCE = PETSc.Log.Stage("reference")
+# -log_view calls an unused visible stage Unknown; PCMPI is PETSc's own stage
+for unused in REFERENCE, PETSc.Log.Stage("PCMPI"):
+    unused.visible = False
+# stages of a run; 0 is PETSc's main stage, before the set-up and after the last frame
+OF_THE_RUN = (0, SETUP.id, STEPS.id, OUTPUT.id)
 
 GRADIENT = PETSc.Log.Event("msmpetsc gradient")
-ENERGY = PETSc.Log.Event("msmpetsc energy")  # differences of g
-HESSIAN = PETSc.Log.Event("msmpetsc hessian")  # its linearisation
-PRODUCT = PETSc.Log.Event("msmpetsc product")  # with the true Hessian
-FINE = PETSc.Log.Event("msmpetsc fine")  # a product at the finest level of the cycle
+# differences of g
+ENERGY = PETSc.Log.Event("msmpetsc energy")
+# linearisation of the Hessian
+HESSIAN = PETSc.Log.Event("msmpetsc hessian")
+# products with the true Hessian
+PRODUCT = PETSc.Log.Event("msmpetsc product")
+# products at the finest level of multigrid
+FINE = PETSc.Log.Event("msmpetsc fine")
 CYCLE = PETSc.Log.Event("msmpetsc cycle")
-GRIDS = PETSc.Log.Event("msmpetsc grids")  # all of a hierarchy that stays when it is built anew
+# grids and interpolations, which a new hierarchy reuses
+GRIDS = PETSc.Log.Event("msmpetsc grids")
 HIERARCHY = PETSc.Log.Event("msmpetsc hierarchy")
 ESTIMATE = PETSc.Log.Event("msmpetsc estimate")
 CONTACT = PETSc.Log.Event("msmpetsc contact")
 GHOSTS = PETSc.Log.Event("msmpetsc ghosts")
 FILES = PETSc.Log.Event("msmpetsc output")
-LOCAL = PETSc.Log.Event("msmpetsc local")  # all that is done spring by spring outside of KSP
+# spring-by-spring work outside of KSP
+LOCAL = PETSc.Log.Event("msmpetsc local")
 
 
 def begun(stage: PETSc.Log.Stage) -> ExitStack:
-    """Begin a stage, which ends when the stack is closed; -log_view shows it from then on."""
+    """Begin a stage and make it visible; closing the returned stack ends the stage."""
     stage.visible = True
     stack = ExitStack()
     stack.enter_context(stage)
@@ -43,5 +47,5 @@ def begun(stage: PETSc.Log.Stage) -> ExitStack:
 
 
 def seconds(event: str) -> float:
-    """Seconds that this rank spent in an event, in all stages of the run."""
+    """Return the seconds that this rank spent in an event, in all stages of the run."""
     return float(sum(PETSc.Log.Event(event).getPerfInfo(stage)["time"] for stage in OF_THE_RUN))

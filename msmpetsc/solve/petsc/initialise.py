@@ -1,6 +1,6 @@
-"""PETSc started with the user's options: those of no solver it mostly reads only then.
+"""Start PETSc with the user's options, and lend options to a PETSc that runs already.
 
-One that runs already is lent others for the time of a run.
+PETSc reads most options that belong to no solver only at its start.
 """
 
 import atexit
@@ -27,27 +27,31 @@ NOT_HERE = {
     "-fp_trap": "numbers that are not finite are told by the step that meets them",
 }
 OPTION = re.compile(r"--?[A-Za-z]")
-READ_BY_OBJECTS = re.compile(r"(^|_)(snes|ksp|pc|mat|vec|mg|sub|eps|st)_")  # whenever one is made
+# options that PETSc reads whenever it makes an object
+READ_BY_OBJECTS = re.compile(r"(^|_)(snes|ksp|pc|mat|vec|mg|sub|eps|st)_")
 TOKEN = re.compile(r'"[^"]*"?|\S+')
 
 
 def initialise(comm: MPI.Comm, words: list[str]) -> None:
     """Start PETSc (collective).
 
-    words : options and values, as on the command line; those of PETSC_OPTIONS and of .petscrc are read as well
+    words : options and values, as on the command line; PETSc adds PETSC_OPTIONS and .petscrc
 
-    Raises InputError for option files that cannot be read, and for values that PETSc refuses at its start.
+    Raises InputError if an options file cannot be read or PETSc refuses a value at its start.
     """
-    on_root(comm, lambda: _check_words(words))  # rank 0 alone reads files: others would wait
+    # Only rank 0 of PETSc reads option files: its error would block the other ranks.
+    on_root(comm, lambda: _check_words(words))
     failed = None
     with _captured_stderr() as text:
         try:
             petsc4py.init(["msmpetsc", *words])
-        except RuntimeError as error:  # PETSc.Error, which has no name before PETSc is there
+        # PETSc.Error cannot be imported before PETSc is initialised.
+        except RuntimeError as error:
             failed = error
     if failed is not None:
-        told = text[0].partition("PETSC ERROR: See ")[0]  # before where to find help
-        lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", told, re.MULTILINE) or [str(failed)]
+        # PETSc's hints on further help follow the message.
+        message = text[0].partition("PETSC ERROR: See ")[0]
+        lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", message, re.MULTILINE) or [str(failed)]
         raise InputError(
             f"PETSc cannot start with its options: {printable(lines[-1].strip(), 200)}"
         )
@@ -56,7 +60,7 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
 
 def _check_words(words: list[str]) -> None:
-    """Raise InputError for options that end the process, and for the first option file that PETSc could not read."""
+    """Raise InputError for options that end the process and for unreadable options files."""
     words = [*os.environ.get("PETSC_OPTIONS", "").split(), *words, ""]
     for option, name in pairwise(words):
         if option in NOT_HERE:
@@ -67,13 +71,13 @@ def _check_words(words: list[str]) -> None:
         if not name or OPTION.match(name):
             raise InputError(f"{option}: names no file")
         if not Path(name).is_file() or not os.access(name, os.R_OK):
-            raise InputError(f"{where}: is no file that can be read")
+            raise InputError(f"{where}: no readable file of this name")
         if option == FILE_OPTIONS[0]:
             _check_lines(where, Path(name).read_text(errors="replace").splitlines())
 
 
 def _check_lines(where: str, lines: list[str]) -> None:
-    """Raise InputError for a line that is no option, with or without a value, nor an alias."""
+    """Raise InputError for a line that is neither an option, maybe with a value, nor an alias."""
     for number, line in enumerate(lines, 1):
         tokens = TOKEN.findall(line.partition("#")[0])
         if tokens and tokens[0] in NOT_HERE:
@@ -93,18 +97,18 @@ def _check_lines(where: str, lines: list[str]) -> None:
 
 @contextmanager
 def _captured_stderr() -> Iterator[list[str]]:
-    """Capture what the C library prints in the block; the text is filled in after it."""
+    """Capture the standard error of the process, C code included; fill it in after the block."""
     text = [""]
     sys.stderr.flush()
-    kept = os.dup(2)
+    saved_stderr = os.dup(2)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 2)
         try:
             yield text
         finally:
             ctypes.CDLL(None).fflush(None)
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(saved_stderr, 2)
+            os.close(saved_stderr)
             file.seek(0)
             text[0] = file.read().decode(errors="replace")
 
@@ -117,18 +121,18 @@ def is_running() -> bool:
 
 @atexit.register
 def finalise() -> None:
-    """End PETSc, if it runs, while Python still does (collective).
+    """Finalise PETSc, if it runs, before Python ends (collective).
 
-    PETSc destroys what Python's collector has left it: a PC of type python calls Python for that.
+    PETSc destroys the remaining objects. A PC of type python calls Python to destroy itself.
     """
     if is_running():
         sys.modules["petsc4py.PETSc"]._finalize()
 
 
 def start_for_runs(comm: MPI.Comm, words: Sequence[str]) -> None:
-    """Start PETSc, if it does not run, with those options that it reads only then (collective).
+    """Start PETSc, unless it runs, with the options that it reads only at its start (collective).
 
-    The others are for ``lent_options``, which takes them back.
+    ``lent_options`` lends the remaining options for the time of a run.
     """
     if not is_running():
         at_start = [
@@ -141,9 +145,9 @@ def start_for_runs(comm: MPI.Comm, words: Sequence[str]) -> None:
 
 @contextmanager
 def lent_options(comm: MPI.Comm, words: Sequence[str]) -> Iterator[None]:
-    """Start PETSc with these options; if it runs already, lend it them for the time of the block (collective).
+    """Start PETSc with options; if it runs already, lend it the options for the block (collective).
 
-    Raises InputError for options that a PETSc that runs would not read any more.
+    Raises InputError for options that a running PETSc no longer reads.
     """
     if not is_running():
         initialise(comm, list(words))
@@ -158,7 +162,8 @@ def lent_options(comm: MPI.Comm, words: Sequence[str]) -> Iterator[None]:
             name not in before or (before[name] or "") != value
         ):
             raise InputError(
-                f"-{name}: PETSc runs already, and reads this at its start only: give it to the first run"
+                f"-{name}: PETSc runs already and reads this option only at its start: give it to "
+                "the first run"
             )
     try:
         for name, value in options.items():

@@ -1,4 +1,4 @@
-"""PETSc's C functions that petsc4py lacks, and its errors as the one line of an InputError."""
+"""PETSc's C functions that petsc4py lacks, and PETSc errors as InputError of a single line."""
 
 import ctypes
 import re
@@ -18,25 +18,25 @@ INSERT = int(PETSc.InsertMode.INSERT_VALUES)
 
 @cache
 def petsc_library() -> ctypes.CDLL:
-    """Return PETSc's library, opened once; what it prints may come by Python, whose lock is kept therefore."""
-    return ctypes.PyDLL(PETSc.__file__)  # petsc4py's extension has those of libpetsc, too
+    """Return PETSc's C library.
+
+    PyDLL keeps Python's lock, because PETSc may call Python.
+    """
+    # petsc4py's extension module also exports the symbols of libpetsc.
+    return ctypes.PyDLL(PETSc.__file__)
 
 
 def total_iterations(ksp: PETSc.KSP) -> int:
-    """Iterations of all solves of a KSP, whoever called it (KSPGetTotalIterations)."""
+    """Return the number of iterations of all solves of a KSP (KSPGetTotalIterations)."""
     count = Integer()
     petsc_library().KSPGetTotalIterations(ctypes.c_void_p(ksp.handle), ctypes.byref(count))
     return count.value
 
 
 def dense_pointer(matrix: PETSc.Mat) -> int:
-    """Address of a rank's part of a dense matrix, maybe on a GPU (MatDenseGetArrayAndMemType)."""
-    library, handle, array, kind = (
-        petsc_library(),
-        ctypes.c_void_p(matrix.handle),
-        ctypes.c_void_p(),
-        ctypes.c_int(),
-    )
+    """Return the address, on CPU or GPU, of a local dense matrix (MatDenseGetArrayAndMemType)."""
+    library = petsc_library()
+    handle, array, kind = ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
     library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))
     pointer = array.value or 0
     library.MatDenseRestoreArrayAndMemType(handle, ctypes.byref(array))
@@ -44,10 +44,14 @@ def dense_pointer(matrix: PETSc.Mat) -> int:
 
 
 def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
-    """Say which entries ``set_values_coo`` will set, by global indices (n,); negative ones are left
-    out, those named twice are added (MatSetPreallocationCOO) (collective)."""
+    """Set the entries, by global indices (n,), that ``set_values_coo`` will fill (collective).
+
+    Entries with a negative index are left out, and repeated entries are summed
+    (MatSetPreallocationCOO).
+    """
     index = [np.ascontiguousarray(i, PETSc.IntType) for i in (rows, columns)]
-    count = ctypes.c_int64(len(rows))  # PetscCount
+    # a PetscCount
+    count = ctypes.c_int64(len(rows))
     _check(
         petsc_library().MatSetPreallocationCOO(
             ctypes.c_void_p(matrix.handle), count, *map(_address, index)
@@ -56,7 +60,7 @@ def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
 
 
 def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
-    """Set those entries to values (n,), on a GPU if the matrix is there (MatSetValuesCOO)."""
+    """Set the preallocated entries to values (n,), on the matrix's device (MatSetValuesCOO)."""
     _check(
         petsc_library().MatSetValuesCOO(
             ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)
@@ -66,7 +70,7 @@ def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
 
 @contextmanager
 def replaced_option(name: str, value: str) -> Iterator[None]:
-    """Replace the value of an option while the block is run."""
+    """Replace the value of an option during the block."""
     database, before = PETSc.Options(), PETSc.Options().getAll()
     database.setValue(name, value)
     try:
@@ -79,50 +83,57 @@ def replaced_option(name: str, value: str) -> Iterator[None]:
 
 
 def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:
-    """Give Chebyshev's method, if it is, what it damps between (KSPChebyshevSetEigenvalues)."""
+    """Set the eigenvalue bounds if the KSP is Chebyshev's method (KSPChebyshevSetEigenvalues)."""
     bounds = ctypes.c_double(greatest), ctypes.c_double(least)
     _check(petsc_library().KSPChebyshevSetEigenvalues(ctypes.c_void_p(ksp.handle), *bounds))
 
 
 def _address(array: Array) -> ctypes.c_void_p:
+    """Return the address of an array on the CPU or the GPU."""
     on_gpu = getattr(array, "__cuda_array_interface__", None)
     return ctypes.c_void_p(on_gpu["data"][0] if on_gpu else array.ctypes.data)
 
 
 def _check(error: int) -> None:
+    """Raise PETSc.Error for a non-zero error code."""
     if error:
         raise PETSc.Error(error)
 
 
 @contextmanager
-def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
+def petsc_errors(heading: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Turn PETSc errors of the block, or of the decorated function, into an InputError.
 
-    ImportError is that of an object of type python whose context is not there.
+    PETSc raises ImportError if an object of type python has no context.
 
-    abandon : called after such an error
+    heading : beginning of the message, which ends with PETSc's own message
+    abandon : function called after an error
     """
     try:
         yield
     except (PETSc.Error, ImportError) as error:
-        # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, for ever.
-        # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
+        # An exception of Python code within PETSc is the cause of newer petsc4py's
+        # error. Its traceback holds this frame: a second name for it here would keep
+        # PETSc's objects alive.
         cause = error.__cause__
         if cause is not None and not isinstance(cause, (PETSc.Error, ImportError)):
-            raise cause  # noqa: B904 (the error itself, not another)
+            raise cause  # noqa: B904
         abandon()
-        raise InputError(f"{what}: {last_words(cause or error)}") from None
+        raise InputError(f"{heading}: {last_words(cause or error)}") from None
 
 
 def last_words(error: BaseException) -> str:
-    """Message of a PETSc error, without its calls; for an unknown type with the nearest."""
+    """Return the message of a PETSc error without its call stack.
+
+    If the message names an unknown type, add the nearest known type.
+    """
     lines = str(error).splitlines()
-    said = [
+    messages = [
         line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line
     ]
-    words = said[-1] if said else lines[0]
-    wanted = re.search(r"requested (KSP|PC|SNES) type (\w+)", words)
-    if wanted is None:
-        return words
-    types = vars(getattr(PETSc, wanted[1]).Type).values()
-    return words + did_you_mean(wanted[2], [name for name in types if isinstance(name, str)])
+    message = messages[-1] if messages else lines[0]
+    unknown = re.search(r"requested (KSP|PC|SNES) type (\w+)", message)
+    if unknown is None:
+        return message
+    types = vars(getattr(PETSc, unknown[1]).Type).values()
+    return message + did_you_mean(unknown[2], [name for name in types if isinstance(name, str)])

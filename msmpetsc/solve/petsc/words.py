@@ -1,4 +1,4 @@
-"""PETSc's options as words: taken apart, and judged where they come from a file."""
+"""PETSc options as words: parsing, and safety checks of options from files."""
 
 import re
 import shlex
@@ -9,16 +9,18 @@ from msmpetsc.errors import InputError, printable
 
 NAME = re.compile(r"-[A-Za-z]")
 SOLVER_OPTION = re.compile(r"-(npc_|inner_|sub_|mg_\w*|esteig_)?(snes|ksp|pc|mat|mg|sub)_\w+")
-PLAIN_VALUE = re.compile(r"([-+]?\.?\d|[^\W\d])[\w.,+-]*")  # no path, no file:name, no module:class
+# values that are no path, no file:name and no module:class
+PLAIN_VALUE = re.compile(r"([-+]?\.?\d|[^\W\d])[\w.,+-]*")
+# options that read or write files or run code
 MORE_THAN_SOLVING = re.compile(
     r"^-\w*_(python|view|monitor|dump|load|file|filename|reason|plot|tmpdir|prefix)(_|$)"
 )
 
 
 def unsafe_word(words: Sequence[str]) -> str | None:
-    """Return the first of PETSc's options and their values that a file may not hold, if any.
+    """Return the first option or value that a file must not contain; None if all are safe.
 
-    A file may choose solvers; it may not make PETSc, or us, run code, read files or write them.
+    A file may choose solvers. It must not make the program run code, read files or write files.
     """
     for word in words:
         known = SOLVER_OPTION.fullmatch(word) or PLAIN_VALUE.fullmatch(word)
@@ -28,7 +30,7 @@ def unsafe_word(words: Sequence[str]) -> str | None:
 
 
 def options_of(words: Sequence[str]) -> dict[str, str]:
-    """Return the options as PETSc's database has them: names without a dash, "" where there is no value."""
+    """Return words as a table of options: name without dash -> value, or "" without a value."""
     options: dict[str, str] = {}
     name = None
     for word in words:
@@ -41,9 +43,9 @@ def options_of(words: Sequence[str]) -> dict[str, str]:
 
 
 def words_of(options: str | Mapping[str, Any]) -> list[str]:
-    """Return options given in Python as words: "-ksp_rtol 1e-3 -ksp_view", or {"ksp_rtol": 1e-3, "ksp_view": None}.
+    """Return options given in Python as a list of words. Raises InputError for non-options.
 
-    Raises InputError for what is no option.
+    options : "-ksp_rtol 1e-3 -ksp_view" or {"ksp_rtol": 1e-3, "ksp_view": None}
     """
     try:
         words = shlex.split(options) if isinstance(options, str) else _words_of_mapping(options)
@@ -59,6 +61,7 @@ def words_of(options: str | Mapping[str, Any]) -> list[str]:
 
 
 def _words_of_mapping(options: Mapping[str, Any]) -> list[str]:
+    """Return a table of options as words. Raises ValueError for a malformed name."""
     words = []
     for name, value in options.items():
         option = f"-{name.removeprefix('-')}"

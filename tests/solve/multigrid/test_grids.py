@@ -17,7 +17,7 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
     with hierarchy(COMM, build(COMM, LATTICES[name], pins=pins), coarsest=2) as case:
         nodes, free = case.lattice.nodes, case.unknowns.free
         fine = np.rint((nodes - ORIGIN) / CELL).astype(int)
-        fine[:, 0] += case.multigrid.bodies.apart(
+        fine[:, 0] += case.multigrid.bodies.offsets(
             COMM, fine
         )  # each body has coarse nodes of its own
         fine = fine[free]

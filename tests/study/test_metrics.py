@@ -11,7 +11,12 @@ from study_stand_in import blank_frame
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.writer import ResultFile
-from msmpetsc.study.metrics import distance_of_shapes, frame_metrics, merge_repeats, trajectory_error
+from msmpetsc.study.metrics import (
+    distance_of_shapes,
+    frame_metrics,
+    merge_repeats,
+    trajectory_error,
+)
 
 
 def result(

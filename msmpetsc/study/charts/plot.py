@@ -22,7 +22,7 @@ from msmpetsc.study.table import records, spread
 INK = "#2b2f36"
 FAINT = "#8a8f98"
 GRID = "#e4e6ea"
-# Okabe and Ito's colours without yellow, which is faint on white; then Tol's and a brown
+# Okabe and Ito's colours without yellow, faint on white; then Paul Tol's and a brown
 COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
     "#882255", "#999933", "#332288", "#8c6239",

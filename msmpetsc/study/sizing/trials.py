@@ -1,4 +1,4 @@
-"""Trial runs of a plan, which measure the errors of time step, solver and cells, and their costs."""
+"""Trial runs of a plan, which measure errors and costs of time steps, step errors and cells."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -388,7 +388,7 @@ class Sizer:
         return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
 
     def _excluding(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
-        """Return a model without a failed choice's cells, if they are few, or without its method."""
+        """Return a model without a failed choice's cells if they are few, or without its method."""
         if choice.cells < fewest:
             return replace(model, least=fewest)
         method = self._as_tried(choice.method)

@@ -7,8 +7,8 @@
 The scenes are the paper's, and clamped beams of 9,000, 96,000 and, with --large, 995,000 cells. All
 are solved to a step error of 1e-3 on a single core. The methods are `newton` with `-pc_type jacobi`
 and with `gamg`, with --ranks `newton` on N ranks, and `newton`. Each repeat runs all methods in
-turn. --only selects rows whose name contains NAME. --alone runs only `newton`, and with --ranks also
-`newton` on N ranks. --gpu runs `newton` on the CPU and on the machine's GPU.
+turn. --only selects rows whose name contains NAME. --alone runs only `newton`, and with --ranks
+also `newton` on N ranks. --gpu runs `newton` on the CPU and on the machine's GPU.
 
 Figures leave out the first frame, which contains start-up costs. Times are medians of the repeats'
 means, with least and greatest in brackets; `slowest tenth` is the mean of the slowest tenth of the

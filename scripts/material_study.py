@@ -159,9 +159,9 @@ def beam_section(across: float = np.inf) -> Section:
     """Return the section of the square beam, or of its lattice with ``across`` cells across.
 
     A cell's edges stay straight. The displacements u_x = c x z and u_y = -nu c y z of its corners
-    stretch edges and face diagonals (k1 : k2 = 40 : 16). Bending has the energy E c^2 h^2 / 24 per
-    volume, the springs have 103/1120 E c^2 h^2, so E I grows by 1 + 169/140 (h/b)^2. Masses at the
-    corners increase rho I by 1 + 2 (h/b)^2.
+    stretch edges and face diagonals (k1 : k2 = 40 : 16). Their energy per volume sums to
+    103/560 E c^2 h^2 / 2, bending has 1/12 E c^2 h^2 / 2. So E I grows by 1 + 169/140 (h/b)^2.
+    Masses at the corners increase rho I by 1 + 2 (h/b)^2.
     """
     solid = section(WIDTH**2, WIDTH**4 / 12, KAPPA_SQUARE)
     ratio = 1 / across**2

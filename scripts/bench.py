@@ -38,7 +38,7 @@ from msmpetsc.solve.petsc import device
 NUMBERS = ("wall_time", "iterations", "ksp_its", "products", "proof_products", "step_error")
 # material laws; "own" is the scene's
 LAWS = ("own", "neo-hookean")
-# nodes below which Python takes most of the memory, so that memory a node means nothing
+# number of nodes below which most of the memory is Python's own
 SMALL = 50_000
 # cells along the beam, Young's modulus [Pa], frames
 BEAMS = {

@@ -297,7 +297,7 @@ def limit(coarse: int, fine: int, poisson: float | None = SPRINGS) -> float:
 def clamp_errors(
     sizes: tuple[int, ...], exact: float, held: float, poisson: float | None = SPRINGS
 ) -> np.ndarray:
-    """Return the relative error of the stiffness for each size in cells a radius."""
+    """Return the relative error of the stiffness for each size in cells per radius."""
     return exact / np.array([compliance(cells, TILT, held, poisson) for cells in sizes]) - 1
 
 
@@ -306,7 +306,7 @@ def clamp_rows() -> lab.Rows:
 
     The reference is the work of a bar along the grid.
     """
-    # cells a radius
+    # cells per radius
     sizes = (4, 8, 16)
     for law, poisson in LAWS.items():
         exact = limit(*sizes[1:], poisson)

@@ -52,11 +52,9 @@ class Case:
     content    : digest of the scene file and of the files that it names
     set        : all overrides of the scene, "key.path=value"; the fields below repeat some of
                  them as columns of the table
-    time_step  : [s]
-    preset     : solver preset, "" for verlet
+    preset     : "" for verlet
     substep    : upper limit [s] of verlet's substeps
     true_error : number of steps between measurements of the true step error
-    timeout    : time limit of a run [s]
     reference  : run whose motion is taken as exact
     point      : point of the map; None for a case of a sweep
     """

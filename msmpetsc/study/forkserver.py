@@ -23,7 +23,7 @@ PROGRAM = "msmpetsc.cli.main"
 # first words of a command that starts the program in a new interpreter
 COLD = [sys.executable, "-m", "msmpetsc"]
 SERVER = multiprocessing.get_context("forkserver")
-# modules that a run imports, except PETSc
+# the modules that a run imports, except PETSc
 SERVER.set_forkserver_preload(
     [
         "msmpetsc.study.preloaded", PROGRAM, "msmpetsc.cli.commands.run", "msmpetsc.app.resume",

@@ -35,13 +35,12 @@ MEANING = {
 }
 OUTCOMES = tuple(MEANING)
 # exit statuses of msmpetsc
-STEP_FAILED = 3
-REFUSED = 2
+STEP_FAILED, REFUSED = 3, 2
 # kinds of failure in the measure file that are outcomes under the same name
 NAMED_FAILURES = ("not finite", "energy", "refused")
 # largest shape error [-] of a body in its rest shape
 RECOVERED = 0.02
-# iterations a step above which a run is "slow"
+# iterations per step above which a run is "slow"
 SLOW = 30
 
 
@@ -75,7 +74,7 @@ def costs(record: dict[str, Any]) -> Row:
 
 
 def frame_metrics(result: Path, time_step: float) -> Row:
-    """Return metrics of a result file; times and iterations are means a step after start-up."""
+    """Return metrics of a result file; times and iterations are means per step after start-up."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}

@@ -20,11 +20,7 @@ GRACE = 3.0
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a process.
-
-    status : exit status, None if the time limit was reached
-    reason : last error of the log, "" if status is 0
-    """
+    """The end of a process: exit status, None after a timeout; reason, "" for status 0."""
 
     status: int | None
     reason: str

@@ -29,7 +29,7 @@ from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, records, require_extra, write_table
 
-# folder inside a study's folder that holds the folders of its parts
+# folder of the parts' folders
 PARTS = "parts"
 
 

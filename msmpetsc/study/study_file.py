@@ -1,4 +1,8 @@
-"""The schema of a study file (TOML): its scenes, sweeps, methods and maps."""
+"""The schema of a study file (TOML): its scenes, sweeps, methods and maps.
+
+Paths are relative to the study file; times are in seconds. In every table ``set`` holds overrides
+of scenes, ``error`` is a target of the relative step error, and ``full`` means only with --full.
+"""
 
 import shlex
 from collections.abc import Iterable
@@ -70,8 +74,6 @@ class ReferenceRun(Table):
     substep : upper limit [s] of verlet's substeps; the stability limit if absent
     cells   : the case's own lattice if absent
     law     : material law; the case's own if absent
-    error   : target of the relative error of a step
-    timeout : [s]
     """
 
     integrator: IntegratorName = "verlet"
@@ -111,10 +113,8 @@ class Length(Table):
 class StudyScene(Length):
     """A scene of the study, with its length, reference and measurements.
 
-    file       : path relative to the study file
     frame      : time [s] between comparisons with the reference; the scene's time step if absent
     true_error : number of steps between measurements of the true step error
-    full       : run only with --full
     """
 
     name: Name
@@ -134,12 +134,9 @@ class Sweep(Table):
     laws           : material laws of cases and references; labels of curves name them
     time_steps     : [s]; for verlet the time between frames
     substeps       : upper limits [s] of verlet's substeps; the stability limit if empty
-    errors         : targets of the relative error of a step
     max_iterations : iteration budgets, run in addition to ``errors``
     steps          : number of steps in place of the scene's
-    set            : further overrides of the scenes
     label          : label of curves in place of preset and options
-    full           : run only with --full
     """
 
     scenes: ListOf[str] = ()
@@ -168,9 +165,7 @@ class Sweep(Table):
 class Method(Table):
     """An integrator with its solver settings, run at every point of the maps.
 
-    preset : solver preset; not used by verlet
-    error  : target of the relative error of a step; the preset's if absent
-    set    : overrides of every scene, for example its material law
+    Verlet does not use the preset. Without an ``error`` the preset's holds.
     """
 
     label: Name
@@ -185,9 +180,8 @@ class Method(Table):
 class Axis(Table):
     """An axis of a map: a key of the scene, or a template of overrides that contain {value}.
 
-    name     : title of the axis
-    key      : key of the scene: "material.young_modulus"
-    template : overrides: "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"
+    key      : "material.young_modulus"
+    template : "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"
     values   : in the order of the axis
     unit     : unit of the labels; "%" shows 0.2 as 20%, "s" shows 0.01 as 10 ms
     """
@@ -208,7 +202,6 @@ class Axis(Table):
 class MapCase(Length):
     """A named case, a row of a map whose columns are the methods.
 
-    file     : path relative to the study file
     recovers : whether the body should end in its rest shape
     options  : PETSc options of all methods except verlet
     """
@@ -223,11 +216,8 @@ class MapCase(Length):
 class Map(Length):
     """A stability map of a scene over two axes, or of named cases.
 
-    title   : heading; the name if empty
-    file    : path relative to the study file
     methods : labels of methods; all methods if empty
     x, y    : axes from left to right and from bottom to top
-    full    : run only with --full
     """
 
     one_of: ClassVar[tuple[str, ...]] = ("file", "case")
@@ -254,9 +244,7 @@ class Map(Length):
 class Study(Table):
     """A study file: scenes with sweeps, or methods with maps.
 
-    title   : heading of the report
-    repeats : runs of each case, of whose times the medians are reported
-    timeout : time limit [s] of a run
+    repeats : runs of each case; the report gives medians of their times
     jobs    : cases at a time, unless --jobs is given
     """
 

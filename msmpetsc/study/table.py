@@ -130,7 +130,7 @@ def measured(table: "DataFrame", *columns: str) -> "DataFrame":
 
 
 def timed(table: "DataFrame") -> "DataFrame":
-    """Return the rows of cases that succeeded and have a time a step."""
+    """Return the rows of cases that succeeded and have a time per step."""
     return measured(succeeded(table), "time_frame")
 
 

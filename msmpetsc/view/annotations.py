@@ -14,10 +14,8 @@ from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK,
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
 
-# height of a caption [px]
-CAPTION = 68
-# size and middle of a caption's two lines [px]
-LINES = ((21, 22), (16, 50))
+# height of a caption, and size and middle of each of its lines [px]
+CAPTION, LINES = 68, ((21, 22), (16, 50))
 
 
 @cache
@@ -38,16 +36,11 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 
 
 # a legend's line height, gap between entries, and type size [px]
-LINE = 34
-GAP = 36
-TYPE_SIZE = 15
+LINE, GAP, TYPE_SIZE = 34, 36, 15
 # width of the symbol in front of an entry's text [px]
 WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30, "note": 0}
-# first and last row of a bar and of a tick [px]
-BAR = (5, 17)
-TICK = (14, 20)
-# middle and size of a tick's number [px]
-NUMBER = (27, 12)
+# first and last row of a bar and of a tick, middle and size of a tick's number [px]
+BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)
 # factor by which a legend is drawn larger and then reduced, for smooth edges
 SUPERSAMPLING = 3
 
@@ -124,9 +117,7 @@ def _entry_picture(entry: Entry) -> Image.Image:
     """Return the enlarged picture of a legend entry, with half a gap on either side."""
     fine = SUPERSAMPLING
     font = typeface(fine * TYPE_SIZE)
-    middle = fine * LINE / 2
-    left = fine * GAP / 2
-    half = 8 * fine
+    middle, left, half = fine * LINE / 2, fine * GAP / 2, 8 * fine
     # a bar's last number needs room
     gap = (18 if entry.ticks else 8) * fine
     width = fine * WIDTHS[entry.kind]

@@ -11,16 +11,11 @@ from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.view.drawable import Drawable
 
-FIXED = "#46566b"
-ARROW = "#cf5a3c"
-INK = "#333a42"
-GROUND = "#efece6"
-SHADOW = "#cdc7bb"
-GLASS = "#a3b6c4"
-GLASS_EDGE = "#667e90"
+FIXED, ARROW, INK = "#46566b", "#cf5a3c", "#333a42"
+GROUND, SHADOW = "#efece6", "#cdc7bb"
+GLASS, GLASS_EDGE = "#a3b6c4", "#667e90"
 # red and blue, as in the paper's Figure 2
-BOUNDARY_CELL = "#c8372d"
-INTERIOR_CELL = "#2f5fb3"
+BOUNDARY_CELL, INTERIOR_CELL = "#c8372d", "#2f5fb3"
 # ColorBrewer's YlGnBu with a neutral grey at 0, so that zero looks uncoloured
 SCALE = ("#dcdcdc", "#b9ddb9", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
 # colours of bodies and of parts, used cyclically

@@ -40,8 +40,8 @@ class Playback:
     """The frames and the speed of a film.
 
     numbers : position in the list of frames of each picture's frame
-    fps     : pictures a second
-    speed   : simulated seconds a second; 0 if the frames are not in order of time
+    fps     : pictures per second
+    speed   : simulated seconds per second; 0 if the frames are not in order of time
     """
 
     numbers: Indices

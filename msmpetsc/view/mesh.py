@@ -110,8 +110,7 @@ def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indi
 
 
 # values of lattice/cell_kind
-BOUNDARY = 1
-INTERIOR = 2
+BOUNDARY, INTERIOR = 1, 2
 # scale of a drawn cell, which separates it from its neighbours
 CELL_SCALE = 0.86
 # opacity of a body whose cells are shown

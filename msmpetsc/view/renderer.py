@@ -17,10 +17,8 @@ from msmpetsc.view.mesh import CELL_SCALE, CUT_OPACITY, FIXED_SHARE, KINDS, surf
 from msmpetsc.view.overlays import Ground, Overlays
 
 GLASS_OPACITY = 0.22
-# share of a ground's radius from which it fades
-FADING = 0.55
-# number of corners of a ground's rim
-RIM_CORNERS = 72
+# share of a ground's radius from which it fades, and number of corners of its rim
+FADING, RIM_CORNERS = 0.55, 72
 
 
 class Renderer(AbstractContextManager["Renderer"]):

@@ -21,8 +21,7 @@ from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
 
 # largest sides of a panel, and least width for a caption [px]
-PANEL = np.array([400, 870])
-NARROWEST = 240
+PANEL, NARROWEST = np.array([400, 870]), 240
 # width of the sheet above which panels are broken into rows [px]
 ROW = 2000
 # default number of moments
@@ -38,21 +37,10 @@ def contact_sheet(
 ) -> Path:
     """Draw a result's surface at some moments as a PNG file; return ``png_path``.
 
-    Parameters
-    ----------
-    h5_path, png_path
-        Result file, and picture to write.
-    frames
-        Frame numbers; by default the frames at the scene's ``picture.times``, if it has any.
-    count
-        Number of moments that ``choose_moments`` selects if ``frames`` is not given.
-    style
-        Direction of view, field, size and cells.
+    frames : frame numbers; by default the frames at the scene's picture.times, if it has any
+    count  : number of moments that ``choose_moments`` selects, if ``frames`` is not given
 
-    Raises
-    ------
-    InputError
-        If the result cannot be read or drawn.
+    Raises InputError if the result cannot be read or drawn.
     """
     style = style or Style()
     with plain_damage(Path(h5_path)), Result(h5_path) as run:
@@ -112,13 +100,9 @@ def _moments(
 def choose_moments(run: Result, count: int) -> dict[int, str]:
     """Return at most ``count`` characteristic frames in order of time, each with its reason.
 
-    The frames by descending priority:
-
-    - the first and the last frame
-    - the greatest elastic energy
-    - before it, the greatest kinetic energy: a falling body is fastest just before contact
-    - after it, the greatest potential energy: the top of a bounce
-    - the middle of the longest gap between chosen frames, repeatedly
+    The first and the last frame have priority, then the greatest elastic energy. Next come the
+    greatest kinetic energy before it (contact of a falling body) and the greatest potential energy
+    after it (top of the bounce). Remaining frames halve the longest gaps between chosen frames.
     """
     kinetic, elastic, potential = (
         run.frames[name][:] for name in ("kinetic", "elastic", "potential")

@@ -19,9 +19,7 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
 from msmpetsc.study.table import records, spread
 
-INK = "#2b2f36"
-FAINT = "#8a8f98"
-GRID = "#e4e6ea"
+INK, FAINT, GRID = "#2b2f36", "#8a8f98", "#e4e6ea"
 # Okabe and Ito's colours without yellow, faint on white; then Paul Tol's and a brown
 COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
@@ -34,8 +32,7 @@ SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross"
 DASHES = ((1, 0), (6, 3), (2, 2))
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
 # width of a chart and height of a panel [px]
-WIDTH = 1080
-HEIGHT = 280
+WIDTH, HEIGHT = 1080, 280
 # area of a marker [px^2]
 MARKER = 50
 # mean width of a legend's letter [px]
@@ -72,9 +69,8 @@ class CurveStyle:
     dash: tuple[int, int] = DASHES[0]
 
 
-# by label
+# style of each label, and columns on the x axis and the y axis
 Styles = dict[str, CurveStyle]
-# names of the columns on the x axis and the y axis
 Columns = tuple[str, str]
 
 
@@ -113,12 +109,10 @@ def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dic
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
     """Return a logarithmic axis for positive values, at least a decade long; NaN is ignored."""
-    low = math.log10(np.nanmin(values))
-    high = math.log10(np.nanmax(values))
+    low, high = math.log10(np.nanmin(values)), math.log10(np.nanmax(values))
     middle = (low + high) / 2
     half = max(high - low, 0.85) * 0.58
-    low = middle - half
-    high = middle + half
+    low, high = middle - half, middle + half
     steps = (1, 2, 5) if high - low < 2.5 else (1,)
     ticks = [
         step * 10.0**decade for decade in range(math.floor(low), math.ceil(high)) for step in steps
@@ -212,10 +206,8 @@ class Chart:
 
     name     : name of its PNG file without suffix
     kind     : heading that it shares with similar charts
-    styles   : styles of all curves, for the legend
     columns  : largest number of panels side by side
     gap      : distance between panels, which contains the axis labels [px]
-    height   : height of a panel [px]
     findings : lines by their heading
     """
 

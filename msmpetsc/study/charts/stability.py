@@ -29,10 +29,8 @@ SYMBOLS = {
 }  # fmt: skip
 # outcomes whose symbols are white
 DARK = {"crashed", "timeout", "not finite", "energy", "diverged"}
-# panels side by side
-COLUMNS = 6
-# height of a cell [px]
-CELL = 24
+# panels side by side, and height of a cell [px]
+COLUMNS, CELL = 6, 24
 # columns of a cell's tooltip
 TIP = (
     "outcome", "steps", "iterations", "most_iterations", "inverted", "shape_error",
@@ -162,7 +160,7 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
 
 
 def symbol(row: Row) -> str:
-    """Return the text of a cell: the symbol of its outcome, or the iterations a step."""
+    """Return the text of a cell: the symbol of its outcome, or the iterations per step."""
     count = row["iterations"]
     if row["outcome"] in SYMBOLS or count is None:
         return SYMBOLS.get(row["outcome"], "")

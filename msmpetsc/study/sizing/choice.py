@@ -23,10 +23,7 @@ MAX_COST_ORDER = 1.6
 
 @dataclass(frozen=True)
 class Candidate:
-    """A method for a scene: integrator, time step [s], preset and target of the step error [-].
-
-    Verlet has neither a preset nor a step error.
-    """
+    """An integrator with its time step [s] and, except for verlet, solver preset and step error."""
 
     integrator: IntegratorName
     time_step: float
@@ -36,11 +33,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Stepping:
-    """A method tried on a coarse lattice, with its error and its cost there.
-
-    error : error of the time step alone [-]
-    cost  : computing time a simulated time [s/s]
-    """
+    """A method on a coarse lattice: error of its time step [-], computing per simulated time."""
 
     method: Candidate
     error: float
@@ -49,11 +42,7 @@ class Stepping:
 
 @dataclass(frozen=True)
 class Solving:
-    """A target of the step error, with the error in the motion that follows from it, and its cost.
-
-    error : error in the motion [-]
-    cost  : ratio to the cost of the trials' step error
-    """
+    """A target of the step error: resulting error of the motion [-], cost over the trials' cost."""
 
     step_error: float | None
     error: float
@@ -76,7 +65,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Choice:
-    """A run, with its expected error and its cost: computing time a simulated time [s/s]."""
+    """A run with its expected error and cost: computing time per simulated time [s/s]."""
 
     method: Candidate
     cells: int
@@ -88,12 +77,11 @@ class Choice:
 class CostModel:
     """Errors and costs of cells, time steps and step errors, extrapolated from the trials.
 
-    law      : error of the cells over the edge of a cell, cells^(-1/3)
-    cells    : number of cells of the lattice on which ``steppings`` were tried
-    costs    : cells and cost on each lattice tried, all with the same method, ascending
-    explicit : whether that method was verlet, whose substeps shrink with the edge of a cell
-    least    : fewest cells that may be chosen
-    most     : most cells that may be chosen
+    law         : error of the cells over the edge of a cell, cells^(-1/3)
+    cells       : number of cells of the lattice on which ``steppings`` were tried
+    costs       : cells and cost on each lattice tried, all with the same method, ascending
+    explicit    : whether that method was verlet, whose substeps shrink with the edge of a cell
+    least, most : range of cells that may be chosen
     """
 
     law: ErrorLaw
@@ -163,10 +151,9 @@ class CostModel:
 class SizeTrial:
     """A trial run, with its cost and its result file.
 
-    asked    : number of valid cells that was requested
-    cells    : number of valid cells of the lattice
-    cost     : computing time a simulated time [s/s]
-    substeps : mean number of substeps a step for verlet, of iterations otherwise
+    asked    : requested number of valid cells; ``cells`` is the lattice's number
+    cost     : computing time per simulated time [s/s]
+    substeps : mean number of substeps per step for verlet, of iterations otherwise
     inverted : number of cells that are inverted at the end
     """
 
@@ -191,7 +178,6 @@ class SizePlan:
     choice : cheapest run that meets the error, or else the run of least error
     met    : whether the run is expected to meet the error
     bounds : reasons why the error is not smaller, or not certain
-    tried  : all trial runs
     """
 
     choice: Choice

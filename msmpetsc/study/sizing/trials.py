@@ -36,10 +36,8 @@ REFINEMENT = 2
 # powers of REFINEMENT by which the coarsest lattice is coarsened; the first that runs
 COARSEST_POWERS = (2.0, 5 / 3, 4 / 3)
 IMPLICIT: tuple[IntegratorName, ...] = ("bdf2", "implicit-euler")
-# number of times that the scene's step is halved
-HALVINGS = 6
-# number of times that verlet's substeps are halved
-SUBSTEP_HALVINGS = 3
+# largest numbers of halvings of the scene's step and of verlet's substeps
+HALVINGS, SUBSTEP_HALVINGS = 6, 3
 # ratio of cells below which the distance of a finer to a coarser lattice is random
 DISTINCT_CELLS = 4
 # cells of the finest lattice in the first round
@@ -53,17 +51,14 @@ USUAL_ORDER = 1.5
 # step errors tried in addition to that of the trials
 LOOSE_STEP_ERRORS = (1e-1, 1e-2)
 # time limits of a trial on coarse lattices and on the finest [s]
-TIMEOUT = 150.0
-FINEST_TIMEOUT = 900.0
-# number of choices that are run
-CHOICES = 6
+TIMEOUT, FINEST_TIMEOUT = 150.0, 900.0
+MAX_CHOICES = 6
 # ratio of most to least cells at which the search for cells ends
 NARROW = 1.05
 # error / target above which the finest lattice is refined if its order is uncertain
 UNCERTAIN = 1 / 3
 # error / target that a choice aims at, and the least that ends the search
-AIM = 0.9
-ACCEPTED = 0.75
+AIM, ACCEPTED = 0.9, 0.75
 
 
 class Asked(NamedTuple):
@@ -81,10 +76,7 @@ class Asked(NamedTuple):
 
 
 class Sizer:
-    """Planner that runs trials of a scene for a surface error and reports each of them.
-
-    Raises InputError if the scene is not valid or gives no number of cells.
-    """
+    """Planner that runs trials of a scene for a surface error and reports each of them."""
 
     def __init__(
         self, scene: Path, bench: Bench, asked: Asked, report: Callable[[SizeTrial | str], None]
@@ -110,15 +102,11 @@ class Sizer:
         # step error of the trials
         self.solved = min(1e-3, self.target / 10)
         self.bounds: list[str] = []
-        # why the error of the cells is uncertain
         self.cell_bound = ""
         self.trials: list[SizeTrial] = []
 
     def plan(self) -> SizePlan:
-        """Run trials, first on few cells, and return the plan.
-
-        Raises InputError if too few trials succeed.
-        """
+        """Return the plan from trials, first on few cells. Raises InputError if too few succeed."""
         most = self.cells
         ratio = REFINEMENT**3
         while self.cells >= ratio * START_CELLS:
@@ -218,7 +206,7 @@ class Sizer:
         if first is None:
             return [], []
         runs = [first]
-        # a whole number of substeps a step, so that frames have the same times
+        # a whole number of substeps per step, so that frames have the same times
         sizes = [self.step / math.ceil(first.substeps)]
         for _ in range(SUBSTEP_HALVINGS):
             sizes.append(sizes[-1] / 2)
@@ -274,10 +262,7 @@ class Sizer:
         return steppings
 
     def _cost_at_scale(self, stepping: Stepping) -> float:
-        """Return the cost on the finest lattice, up to a common factor.
-
-        Verlet's substeps shrink with the edge of a cell.
-        """
+        """Return the cost on the finest lattice, up to a factor that all methods share."""
         return stepping.cost * (REFINEMENT if stepping.method.integrator == "verlet" else 1)
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
@@ -329,13 +314,8 @@ class Sizer:
             orders = (least, least)
         across = _distance(runs[0], runs[-1])
         cosine = cosine_of(distances[0], distances[1], across) if len(runs) > 2 else 0.0
-        law = error_law(
-            [each.edge for each in runs],
-            distances,
-            orders,
-            None if is_out_of_phase else across,
-            cosine,
-        )
+        edges = [each.edge for each in runs]
+        law = error_law(edges, distances, orders, None if is_out_of_phase else across, cosine)
         law = replace(law, observed=law.observed and not is_inverted)
         self.cell_bound = ""
         if not law.observed:
@@ -364,7 +344,7 @@ class Sizer:
         # (edge, error) of lattices that are fine enough, and too coarse
         fine = [(finest.edge, finest_error)] if finest_error < AIM * self.target else []
         coarse: list[tuple[float, float]] = []
-        for _ in range(CHOICES):
+        for _ in range(MAX_CHOICES):
             choice = model.cheapest(AIM * self.target) or model.cheapest(self.target)
             if choice is None:
                 break
@@ -450,14 +430,10 @@ class Sizer:
                 f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}"
             )
             return None
+        inverted = row.get("inverted") or 0.0
+        result = self.bench.result_of(case)
         trial = SizeTrial(
-            method=method,
-            asked=cells,
-            cells=row["cells"],
-            cost=row["time_second"],
-            substeps=row["iterations"],
-            inverted=row.get("inverted") or 0.0,
-            result=self.bench.result_of(case),
+            method, cells, row["cells"], row["time_second"], row["iterations"], inverted, result
         )
         self.trials.append(trial)
         self.report(trial)

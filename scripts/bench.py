@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Benchmark the cost of a step of `newton` against its earlier preconditioners. Needs the meshes.
+"""Measure the cost of a step by `newton`, also with Jacobi's and GAMG's preconditioner.
 
     scripts/bench.py [--only NAME ...] [--laws LAW ...] [--alone] [--frames N] [--repeats N]
         [--ranks N] [--gpu] [--large]
@@ -8,7 +8,8 @@ The scenes are the paper's, and clamped beams of 9,000, 96,000 and, with --large
 are solved to a step error of 1e-3 on a single core. The methods are `newton` with `-pc_type jacobi`
 and with `gamg`, with --ranks `newton` on N ranks, and `newton`. Each repeat runs all methods in
 turn. --only selects rows whose name contains NAME. --alone runs only `newton`, and with --ranks
-also `newton` on N ranks. --gpu runs `newton` on the CPU and on the machine's GPU.
+also `newton` on N ranks. --gpu runs `newton` on the CPU and on the machine's GPU. The meshes of the
+scenes are needed.
 
 Figures leave out the first frame, which contains start-up costs. Times are medians of the repeats'
 means, with least and greatest in brackets; `slowest tenth` is the mean of the slowest tenth of the

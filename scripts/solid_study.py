@@ -277,7 +277,7 @@ CLAMPS = {"plane through cells": 1.0, "end face": 0.0}
 
 
 def compliance(cells: int, tilt: Rotation, held: float, poisson: float | None = SPRINGS) -> float:
-    """Return the work [J] of a bar's weight; ``cells`` a radius, ``held`` radii are clamped."""
+    """Return the work [J] of a bar's weight, with cells per radius and held radii clamped."""
     length = FREE + held * RADIUS
     mesh = trimesh.creation.cylinder(RADIUS, length, sections=256)
     mesh.vertices = tilt.apply(mesh.vertices[:, [2, 0, 1]] + [length / 2 - held * RADIUS, 0, 0])

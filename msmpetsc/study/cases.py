@@ -47,7 +47,7 @@ class MapPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """The settings of a run and its repeats; for a field that is None the scene's value holds.
+    """The settings of a run and its repeats; None leaves a choice to the scene or the program.
 
     content    : digest of the scene file and of the files that it names
     set        : all overrides of the scene, "key.path=value"; the fields below repeat some of

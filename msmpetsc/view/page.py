@@ -92,7 +92,7 @@ def residuals(frames: Iterable[Indices]) -> Iterator[bytes]:
     """Yield each frame's residual to the linear extrapolation 2 p - q from the frames p, q before.
 
     A residual r is stored as 2 r, or as -2 r - 1 if negative, so that small values have a zero high
-    byte. All low bytes come first, then all high bytes.
+    byte. The low bytes of a frame precede its high bytes.
     """
     p = q = None
     for frame in frames:

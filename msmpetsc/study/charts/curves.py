@@ -108,7 +108,7 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
 
 
 def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFrame:
-    """Return the cheapest row with an error up to ``level``, and rows whose range overlaps its."""
+    """Return the cheapest row with an error up to ``level``, and rows with overlapping ranges."""
     rows = measured(rows, *measure.columns)
     rows = rows[rows[measure.error] <= level].sort_values(measure.cost, kind="stable")
     reached = rows.assign(**spread(rows, measure.cost))

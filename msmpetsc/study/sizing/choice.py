@@ -33,7 +33,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Stepping:
-    """A method on a coarse lattice: error of its time step [-], computing per simulated time."""
+    """A method tried on a coarse lattice: error of its time step [-], cost [s per simulated s]."""
 
     method: Candidate
     error: float

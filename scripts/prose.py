@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Check the English of docstrings and comments:  scripts/prose.py [files or folders]
 
-Print each offence with its place, then the rates of each folder. The exit status is 1 if a sentence
-is too long or begins badly, or if a comment stands behind code or is too wide. It is 1 as well if a
-folder has more vague words than ``VAGUE`` allows.
+Print each offence with its place, then the rates of each folder. Exit with status 1 if a sentence
+is too long or begins badly, if a comment stands at the end of a line of code or is too wide, or if
+a folder has more of the vague words than a reader bears.
 """
 
 import ast
@@ -16,11 +16,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-# words in a sentence
-LONGEST = 25
-# columns of a comment
-WIDEST = 88
-# most of these words in 1,000; as in PyFR, scikit-fem and lineax
+LONGEST = 25  # words in a sentence
+WIDEST = 88  # columns of a comment
+# most of these words in 1,000, as counted in the models of good style (PyFR, scikit-fem, lineax)
 VAGUE = {"what": 0.5, "one, ones, those, others, such": 3.6}
 MARKS = ("type:", "noqa", "fmt:", "!", "pragma", "%%")
 CODE = re.compile(r"``[^`]*``|`[^`]*`|^(?: {4,}|>>>|\|).*$", re.MULTILINE)
@@ -45,8 +43,7 @@ def comments(source: str) -> Iterator[tuple[int, str, bool, int]]:
         text = token.string[1:].strip()
         if token.type != tokenize.COMMENT or text.startswith(MARKS):
             continue
-        line = token.start[0]
-        behind = bool(token.line[: token.start[1]].strip())
+        (line, column), behind = token.start, bool(token.line[: token.start[1]].strip())
         if block and not behind and block[-1][0] + block[-1][1].count("\n") + 1 == line:
             begin, before, _, width = block.pop()
             block.append((begin, f"{before}\n{text}", False, max(width, token.end[1])))

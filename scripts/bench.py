@@ -1,20 +1,22 @@
 #!/usr/bin/env python3
-"""The cost of a step, `newton` beside what it took the place of. Needs the meshes.
+"""Measure the cost of a step by `newton`, also with Jacobi's and GAMG's preconditioner.
 
-    scripts/bench.py [--only NAME ...] [--laws LAW ...] [--alone] [--frames N] [--repeats N] [--ranks N] [--gpu]
-        [--large]
+    scripts/bench.py [--only NAME ...] [--laws LAW ...] [--alone] [--frames N] [--repeats N]
+        [--ranks N] [--gpu] [--large]
 
-Runs the paper's scenes, clamped beams of 9,000 and 96,000 cells and, with --large, of 995,000, each to a step error of
-1e-3 on one core: `newton` with `-pc_type jacobi` and `gamg`, with --ranks `newton` on so many, and `newton`, one after
-the other, and all of that again for each repeat. --only takes rows whose name contains NAME. --alone takes `newton`
-alone, on one core and with --ranks on so many, --gpu on the GPU of the machine as well.
+The scenes are the paper's, and clamped beams of 9,000, 96,000 and, with --large, 995,000 cells. All
+are solved to a step error of 1e-3 on a single core. The methods are `newton` with `-pc_type jacobi`
+and with `gamg`, with --ranks `newton` on N ranks, and `newton`. Each repeat runs all methods in
+turn. --only selects rows whose name contains NAME. --alone runs only `newton`, and with --ranks
+also `newton` on N ranks. --gpu runs `newton` on the CPU and on the machine's GPU. The meshes of the
+scenes are needed.
 
-Figures are of all frames but the first, for what is done once shows in it: the mean time, its median over the repeats
-with the least and the greatest of them in brackets; `slowest tenth` is the mean of those frames. KSP iterations and
-products with the Hessian, which do not depend on the machine, are means; where `/` divides them they are of the methods
-in their order. `times as fast` and what stands behind it is of the last method: `proof`, the share of its products that
-estimates and searches for a negative curvature take; `coarse`, the share of a cycle's time beside its products at the
-finest level.
+Figures leave out the first frame, which contains start-up costs. Times are medians of the repeats'
+means, with least and greatest in brackets; `slowest tenth` is the mean of the slowest tenth of the
+frames. KSP iterations and products with the Hessian are means; `/` separates the methods. `times as
+fast` and the columns after it describe the last method. `proof` is the share of products spent on
+estimates and negative curvature. `coarse` is a cycle's share of time outside products at the finest
+level.
 """
 
 import sys
@@ -34,28 +36,32 @@ from scene_tables import PAPER, SCENES, slowest_tenth
 
 from msmpetsc.solve.petsc import device
 
-NUMBERS = "wall_time", "iterations", "ksp_its", "products", "proof_products", "step_error"
-LAWS = "own", "neo-hookean"  # the scene's
-SMALL = 50_000  # nodes: of fewer the memory is mostly Python's
-BEAMS = {  # cells along the beam, Young's modulus [Pa], frames
+NUMBERS = ("wall_time", "iterations", "ksp_its", "products", "proof_products", "step_error")
+# material laws; "own" is the scene's
+LAWS = ("own", "neo-hookean")
+# number of nodes below which most of the memory is Python's own
+SMALL = 50_000
+# cells along the beam, Young's modulus [Pa], frames
+BEAMS = {
     "beam 1e4": (40, 5e5, 30),
     "beam 1e4 stiff": (40, 5e7, 30),
     "beam 1e5": (88, 5e5, 10),
     "beam 1e6": (192, 5e5, 4),
 }
 LARGE = "beam 1e6"
-SIDES = 1.0, 0.375, 0.375  # of a beam [m]
+# sides of a beam [m]
+SIDES = (1.0, 0.375, 0.375)
 
 
 class Method(NamedTuple):
-    """A way to run a scene: words of `msmpetsc run`, and the number of ranks."""
+    """A method to run a scene: options of `msmpetsc run`, and the number of ranks."""
 
     words: tuple[str, ...]
     ranks: int = 1
 
 
 class Sample(NamedTuple):
-    """What one run measured: its numbers frame by frame, frame 0 left out, and what --measure says of it."""
+    """Measurements of a run: columns of all frames except frame 0, and the measure file."""
 
     frames: dict[str, np.ndarray]
     cost: dict
@@ -66,22 +72,25 @@ METHODS = {
     "newton, gamg": Method(("--preset", "newton", "-pc_type", "gamg")),
     "newton": Method(("--preset", "newton")),
 }
-TODAY = "newton"
+NEWTON = "newton"
 
 
 # ---- runs
 
 
 def beam(name: str, folder: Path) -> tuple[str, ...]:
-    """Return the changes that make a beam of studies/beam_soft.toml, and write its mesh."""
+    """Write the mesh of a beam; return the changes of studies/beam_soft.toml that describe it."""
     along, young, frames = BEAMS[name]
-    size, length = f"cages.cell_size={SIDES[0] / along!r}", f"time.duration={frames / 60!r}"
-    return lab.box(folder / "beam.obj", SIDES), size, f"material.young_modulus={young!r}", length
+    size = f"cages.cell_size={SIDES[0] / along!r}"
+    duration = f"time.duration={frames / 60!r}"
+    mesh = lab.box(folder / "beam.obj", SIDES)
+    return mesh, size, f"material.young_modulus={young!r}", duration
 
 
 def measured(name: str, method: Method, frames: int | None, law: str = LAWS[0]) -> Sample | None:
-    """Return what one run of a row measured; None if it failed."""
-    folder, is_beam = lab.OUT / "bench", name in BEAMS
+    """Run a row's scene with a method and return its measurements; None if it failed."""
+    folder = lab.OUT / "bench"
+    is_beam = name in BEAMS
     of_law = () if law == LAWS[0] else (f'material.law="{law}"',)
     changes = ("output.surface=false", *of_law, *(beam(name, folder) if is_beam else ()))
     words = ["--error", "1e-3", *method.words, *(["--frames", frames] if frames else [])]
@@ -94,12 +103,12 @@ def measured(name: str, method: Method, frames: int | None, law: str = LAWS[0]) 
 
 
 def means(runs: Sequence[Sample], number: str) -> list[float]:
-    """Return the mean of a number over all frames but the first, of each repeat."""
+    """Return the mean of a column over all frames but the first, for each repeat."""
     return [float(run.frames[number][1:].mean()) for run in runs]
 
 
 def row(name: str, runs: dict[str, list[Sample]]) -> lab.Row:
-    """Return a row of the table; the last method is the one that is held against the others."""
+    """Return a row of the table; the last method is compared with the fastest of the rest."""
     times = {
         method: [1e3 * mean for mean in means(repeats, "wall_time")]
         for method, repeats in runs.items()
@@ -110,10 +119,10 @@ def row(name: str, runs: dict[str, list[Sample]]) -> lab.Row:
         found[number] = " / ".join(
             lab.shown(means(of, number)[0]) if of else "-" for of in runs.values()
         )
-    *others, last = runs
+    *rivals, last = runs
     if not runs[last]:
         return found
-    best = min((median(times[method]) for method in others if times[method]), default=None)
+    best = min((median(times[method]) for method in rivals if times[method]), default=None)
     return (
         found
         | {"times as fast": best / median(times[last]) if best else None}
@@ -122,12 +131,15 @@ def row(name: str, runs: dict[str, list[Sample]]) -> lab.Row:
 
 
 def of_method(name: str, runs: Sequence[Sample]) -> dict[str, object]:
-    """Return the columns of one method alone."""
-    cost, paper = runs[0].cost, PAPER.get(name.split("_")[0])
+    """Return the columns that describe a single method."""
+    cost = runs[0].cost
+    paper = PAPER.get(name.split("_")[0])
     seconds = median(means(runs, "wall_time"))
     memory = min(run.cost["memory"] for run in runs) / cost["nodes"] / 1e3
-    products, times = means(runs, "products")[0], [run.cost["time"] for run in runs]
-    on_gpu = cost["device"] == "cuda"  # which is still at work when a launch returns
+    products = means(runs, "products")[0]
+    times = [run.cost["time"] for run in runs]
+    # a GPU still computes when a launch returns, which falsifies times within a cycle
+    on_gpu = cost["device"] == "cuda"
     finest = [time["fine"] / time["cycle"] for time in times if time.get("cycle") and not on_gpu]
     return {
         "cells": cost["cells"],
@@ -148,7 +160,7 @@ def of_method(name: str, runs: Sequence[Sample]) -> dict[str, object]:
 
 
 def rows(methods: dict[str, Method], args: Namespace) -> lab.Rows:
-    """Yield the rows that are asked for as they are run, the repeats of each method alternating with the others'."""
+    """Yield the selected rows as they are run; repeats alternate between the methods."""
     asked = (name for name in (*SCENES, *BEAMS) if any(word in name for word in args.only))
     names = [name for name in asked if name != LARGE or args.large]
     for name, law in product(names, args.laws or LAWS):
@@ -162,51 +174,48 @@ def rows(methods: dict[str, Method], args: Namespace) -> lab.Rows:
 
 
 def methods_of(args: Namespace) -> dict[str, Method]:
-    """Return what is run, the last of them held against the others."""
-    today = METHODS[TODAY]
-    more = (
-        {f"{TODAY}, {args.ranks} ranks": Method(today.words, args.ranks)} if args.ranks > 1 else {}
-    )
+    """Return the methods to run; the last is compared with the rest."""
+    newton = METHODS[NEWTON]
+    parallel = {}
+    if args.ranks > 1:
+        parallel = {f"{NEWTON}, {args.ranks} ranks": Method(newton.words, args.ranks)}
     if args.gpu:
-        return {TODAY: today, **more, "GPU": Method((*today.words, "--device", "cuda"))}
-    others = (
-        {} if args.alone else {name: method for name, method in METHODS.items() if name != TODAY}
-    )
-    return others | more | {TODAY: today}
+        return {NEWTON: newton, **parallel, "GPU": Method((*newton.words, "--device", "cuda"))}
+    rivals = {}
+    if not args.alone:
+        rivals = {name: method for name, method in METHODS.items() if name != NEWTON}
+    return rivals | parallel | {NEWTON: newton}
 
 
 def main() -> int:
+    """Print the table of the selected rows; return the exit status."""
     options = lab.parser(__doc__)
     options.add_argument(
         "--only",
         nargs="+",
         default=[""],
         metavar="NAME",
-        help="rows whose name contains one of these",
+        help="run only rows whose name contains NAME",
     )
     options.add_argument(
-        "--laws",
-        nargs="+",
-        metavar="LAW",
-        help="of materials; own, the scene's, and neo-hookean if absent",
+        "--laws", nargs="+", metavar="LAW", help="material laws: own, neo-hookean (both)"
     )
-    options.add_argument("--alone", action="store_true", help="no other methods beside newton")
-    options.add_argument(
-        "--frames", type=int, metavar="N", help="steps of each run; all of the scene's if absent"
-    )
+    options.add_argument("--alone", action="store_true", help="run no method except newton")
+    options.add_argument("--frames", type=int, metavar="N", help="number of steps (the scene's)")
     options.add_argument(
         "--repeats", type=int, default=5, metavar="N", help="runs of each method (%(default)s)"
     )
-    options.add_argument("--ranks", type=int, default=1, metavar="N", help="on so many ranks, too")
-    options.add_argument("--gpu", action="store_true", help="on a GPU beside the CPU")
-    options.add_argument("--large", action="store_true", help=f"{LARGE}, too, which takes hours")
+    options.add_argument("--ranks", type=int, default=1, metavar="N", help="also run on N ranks")
+    options.add_argument("--gpu", action="store_true", help="also run on a GPU")
+    options.add_argument("--large", action="store_true", help=f"also run {LARGE}, for hours")
     args = options.parse_args()
     if args.gpu and (lacking := device.what_is_missing()):
         print(f"bench: {lacking}", file=sys.stderr)
         return 2
     lab.heading()
     if args.gpu:
-        import cupy  # where there is a GPU
+        # only machines with a GPU have cupy
+        import cupy
 
         name = cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode()
         print(f"{name}, PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}")

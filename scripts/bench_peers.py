@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
-"""One lattice in two programs: time and trajectory error of ours and of NVIDIA's Newton.
+"""Compare time and trajectory error of msmpetsc and of NVIDIA's Newton on the same lattice.
 
     scripts/bench_peers.py [--cells X Y Z] [--frames N] [--only WORD]
 
-A beam of 40 x 15 x 15 cells of 25 mm (E = 5e5 Pa, 1000 kg/m^3), one end pinned, is let go under its weight; frames are
-of 1/60 s. Both programs get the same nodes, masses, springs and stiffnesses, and a process of their own on one core;
-reading positions is not timed. The trajectory error is the rms distance of all nodes in all frames from a
-run of our Verlet integrator with substeps of 50 us, relative to the rms displacement. Of ours the largest error of a
-step stands beside it. Gravity points along -z.
+A clamped beam is released under its weight along -z. It has 40 x 15 x 15 cells of 25 mm with
+E = 5e5 Pa and 1000 kg/m^3; frames last 1/60 s. Both programs get the same nodes, masses, springs
+and stiffnesses, and run in a process of their own on a single core. Reading positions is not timed.
+The trajectory error is the rms distance of all nodes in all frames from a reference run, relative
+to the rms displacement. The reference is our Verlet integrator with substeps of 50 us. For our runs
+the table also gives the largest step error.
 """
 
 import os
@@ -23,16 +24,19 @@ import numpy as np
 
 from msmpetsc.results.reader import Result
 
-SCENE, FOLDER = "studies/beam_soft", lab.OUT / "bench_peers"
-CELL, FRAME, G = 0.025, 1 / 60, 9.81  # [m], [s], [m/s^2]
+SCENE = "studies/beam_soft"
+FOLDER = lab.OUT / "bench_peers"
+# [m], [s], [m/s^2]
+CELL, FRAME, G = 0.025, 1 / 60, 9.81
 REFERENCE = ['time.integrator="verlet"', "time.substep=5e-5"]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 OURS = "msmpetsc"
-TIMEOUT = 600.0  # [s] of each program
+# time limit of a program [s]
+TIMEOUT = 600.0
 
 
 class Beam(NamedTuple):
-    """A lattice, as /lattice of a result has it; pinned (n,) bool, corner (n, 3) the nodes' indices in the grid."""
+    """A lattice as in /lattice of a result; pinned (n,) bool, corner (n, 3) indices in the grid."""
 
     nodes: np.ndarray
     mass: np.ndarray
@@ -63,7 +67,7 @@ class Newton:
     """NVIDIA's Newton on the CPU."""
 
     def __init__(self, beam: Beam, time_step: float, iterations: int):
-        """Make a model of the beam, stepped by VBD with so many iterations; by the semi-implicit scheme with 0."""
+        """Build a model of the beam with VBD, or with the semi-implicit scheme for 0 iterations."""
         import newton
 
         self.time_step = time_step
@@ -74,24 +78,30 @@ class Newton:
         )
         for (i, j), stiffness in zip(beam.springs.tolist(), beam.stiffness.tolist(), strict=True):
             builder.add_spring(i, j, ke=stiffness, kd=0.0, control=0.0)
-        colour = (
-            beam.corner % 2 @ [4, 2, 1]
-        )  # no spring joins two nodes of one; its own coloring does not see springs
+        # springs join no nodes of equal colour; Newton's own colouring ignores springs
+        colour = beam.corner % 2 @ [4, 2, 1]
         builder.set_coloring([np.flatnonzero(colour == of) for of in range(8)])
         model: Any = builder.finalize(device="cpu")
         model.spring_rest_length.assign(beam.rest_length)
-        model.particle_grid = None  # no contact between particles
-        vbd, semi_implicit = newton.solvers.SolverVBD, newton.solvers.SolverSemiImplicit
-        self.solver = vbd(model, iterations=iterations) if iterations else semi_implicit(model)
-        self.state, self.next, self.control = model.state(), model.state(), model.control()
+        # switches off contact between particles
+        model.particle_grid = None
+        if iterations:
+            self.solver = newton.solvers.SolverVBD(model, iterations=iterations)
+        else:
+            self.solver = newton.solvers.SolverSemiImplicit(model)
+        self.state = model.state()
+        self.next = model.state()
+        self.control = model.control()
 
     def advance(self, substeps: int) -> None:
+        """Take a number of substeps."""
         for _ in range(substeps):
             self.state.clear_forces()
             self.solver.step(self.state, self.next, self.control, None, self.time_step)
             self.state, self.next = self.next, self.state
 
     def positions(self) -> np.ndarray:
+        """Return the node positions (n, 3) [m]."""
         return self.state.particle_q.numpy().astype(float)
 
 
@@ -99,9 +109,9 @@ class Newton:
 
 
 class Case(NamedTuple):
-    """A way to step the beam: an integrator of ours, or substeps of Newton's.
+    """A method to step the beam: an integrator of msmpetsc, or substeps of Newton.
 
-    iterations : of VBD; 0 for the semi-implicit scheme
+    iterations : iterations of VBD; 0 for the semi-implicit scheme
     """
 
     program: str
@@ -112,7 +122,7 @@ class Case(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """What a run left: seconds (T,) of the frames' steps, positions (T + 1, n, 3) [m]."""
+    """The motion of a run: seconds (T,) spent on each frame, positions (T + 1, n, 3) [m]."""
 
     seconds: np.ndarray
     position: np.ndarray
@@ -121,7 +131,7 @@ class Trajectory(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What all cases share; changes are those of our runs, the lattice is that of the reference's result."""
+    """The common settings: changes of our scene, the reference's result, number of frames."""
 
     changes: list[str]
     reference: Path
@@ -140,13 +150,13 @@ CASES = [
 
 
 def use_one_core() -> None:
-    """Keep this process and those it starts to one core and one thread, whatever their pools would like."""
+    """Restrict this process and its children to a single core and thread."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     os.environ.update(dict.fromkeys(THREADS, "1"))
 
 
 def set_up(cells: list[int], frames: int) -> Setup:
-    """Run the reference, whose lattice all programs take."""
+    """Run the reference, whose lattice all programs use."""
     changes = [
         lab.box(FOLDER / "beam.obj", CELL * np.array(cells)),
         f"cages.cell_size={CELL}",
@@ -157,7 +167,7 @@ def set_up(cells: list[int], frames: int) -> Setup:
 
 
 def ours(case: Case, setup: Setup) -> Trajectory | str:
-    """Run a case of our own; why it failed if it did. Verlet's steps solve nothing and have no error."""
+    """Run a case of msmpetsc; return its motion, or why it failed. Verlet has no step error."""
     changes = [*setup.changes, f'time.integrator="{case.integrator}"']
     run = lab.run(SCENE, FOLDER / f"{case.integrator}.h5", (), changes, timeout=TIMEOUT)
     if run.failure:
@@ -172,7 +182,7 @@ def positions(path: Path) -> np.ndarray:
 
 
 def theirs(case: Case, setup: Setup) -> Trajectory | str:
-    """Run Newton in a process of its own; why it failed if it did."""
+    """Run Newton in a process of its own; return its motion, or why it failed."""
     path = FOLDER / "newton.npz"
     words = [
         "--frames",
@@ -186,15 +196,16 @@ def theirs(case: Case, setup: Setup) -> Trajectory | str:
     ended = lab.python([Path(__file__), *words], path.with_suffix(".log"), timeout=TIMEOUT)
     if ended.reason:
         return ended.reason
-    with np.load(path) as left:
-        return Trajectory(left["seconds"], left["position"], None, str(left["version"]))
+    with np.load(path) as saved:
+        return Trajectory(saved["seconds"], saved["position"], None, str(saved["version"]))
 
 
 def play(args: Namespace) -> None:
-    """Step the lattice of a result by Newton; its seconds, positions and version into a file."""
+    """Step a result's lattice with Newton; write seconds, positions and version to a file."""
     result, out, substeps, iterations = args.play
     peer = Newton(read_beam(Path(result)), FRAME / int(substeps), int(iterations))
-    positions, seconds = [peer.positions()], []
+    positions = [peer.positions()]
+    seconds = []
     for _ in range(args.frames):
         begin = perf_counter()
         peer.advance(int(substeps))
@@ -204,40 +215,42 @@ def play(args: Namespace) -> None:
 
 
 def rows(cases: list[Case], setup: Setup) -> lab.Rows:
-    """Yield a row of each case, of the frames after the first, in which kernels are compiled."""
+    """Yield a row for each case; its times leave out the first frame, which compiles kernels."""
     true = positions(setup.reference)
     for case in cases:
-        found = ours(case, setup) if case.program == OURS else theirs(case, setup)
-        if isinstance(found, str):
-            yield {"program": case.program, "method": case.method, "note": found}
+        motion = ours(case, setup) if case.program == OURS else theirs(case, setup)
+        if isinstance(motion, str):
+            yield {"program": case.program, "method": case.method, "note": motion}
             continue
         low, middle, high = (
-            float(time) for time in np.percentile(1e3 * found.seconds[1:], (10, 50, 90))
+            float(time) for time in np.percentile(1e3 * motion.seconds[1:], (10, 50, 90))
         )
         yield {
-            "program": f"{case.program} {found.version}".strip(),
+            "program": f"{case.program} {motion.version}".strip(),
             "method": case.method,
             "ms a frame": middle,
             "10%": low,
             "90%": high,
-            "step error": found.step_error,
+            "step error": motion.step_error,
             "trajectory error": float(
-                np.linalg.norm(found.position - true) / np.linalg.norm(true - true[0])
+                np.linalg.norm(motion.position - true) / np.linalg.norm(true - true[0])
             ),
             "note": "",
         }
 
 
 def main() -> None:
+    """Print the table, or play a case in a child process."""
     options = lab.parser(__doc__)
     options.add_argument(
         "--cells", type=int, nargs=3, default=[40, 15, 15], metavar="N", help="along x, y, z"
     )
     options.add_argument("--frames", type=int, default=30, metavar="N")
     options.add_argument(
-        "--only", default="", metavar="WORD", help="cases whose program or method has this word"
+        "--only", default="", metavar="WORD", help="run cases whose program or method contains WORD"
     )
-    options.add_argument("--play", nargs=4, help=SUPPRESS)  # what theirs() starts
+    # for the child process that theirs() starts
+    options.add_argument("--play", nargs=4, help=SUPPRESS)
     args = options.parse_args()
     if args.play:
         play(args)

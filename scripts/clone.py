@@ -1,4 +1,4 @@
-"""Runs a script of this folder by the clone's own Python and package, whatever Python started it: import this first."""
+"""Select the clone's own Python and package for a script; to be imported first."""
 
 import os
 import sys
@@ -6,12 +6,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PYTHON = ROOT / ".venv" / "bin" / "python"  # scripts/setup makes it
-NEEDED = ("numpy", "numba", "petsc4py", "mpi4py")  # what marks a Python that can run msmpetsc
+# created by scripts/setup
+PYTHON = ROOT / ".venv" / "bin" / "python"
+# packages without which a Python cannot run msmpetsc
+NEEDED = ("numpy", "numba", "petsc4py", "mpi4py")
 
 
 def _use_own_python() -> None:
-    """Start the script again by the clone's Python, if this one lacks what msmpetsc needs."""
+    """Restart the script with the clone's Python if the present Python lacks a package."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing and (not PYTHON.exists() or Path(sys.prefix) == PYTHON.parents[1]):
         sys.exit(f"{sys.argv[0]}: {', '.join(missing)} not installed: run scripts/setup first")
@@ -20,7 +22,6 @@ def _use_own_python() -> None:
 
 
 _use_own_python()
-sys.path.insert(
-    0, str(ROOT)
-)  # the clone's package goes before an installed one, here and in child processes
+# here and in child processes, the clone's package precedes an installed package
+sys.path.insert(0, str(ROOT))
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))

@@ -1,18 +1,24 @@
 #!/usr/bin/env python3
-"""Holds the error that steps say they have against their true one, on random hard scenes.
+"""Compare the error estimates of steps with their true errors on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--kinds any rub far touch] [--only K] [--set KEY=VALUE ...]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--kinds any rub far touch] [--only K]
+        [--set KEY=VALUE ...]
 
-Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
-or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
-friction, in parts of up to 1e6 to 1, pinned, led or free, in short and long steps, by any preset. Every step is solved
-a second time to rounding from where it ended: what it says of its error over that distance is the ratio.
+A scene is drawn from its seed and number. The body has 40 to 150 cells: a beam, cube, plate or
+ball, tilted or not, soft or stiff, of either law, in parts with a contrast of up to 1e6. It is
+squashed, stretched, twisted, scattered, spinning, thrown, or pressed between plates with friction.
+It is pinned, anchored or free; steps are short or long, and presets vary. Each step is solved again
+to rounding error from its end. The ratio of the estimate to that distance is reported.
 
---kinds takes turns between such scenes (any), bodies that rub on each other with friction (rub), starts that are
-mirrored, collapsed or scattered, or spin fast (far), and bodies that fall on an edge or a corner (touch).
+--kinds alternates between kinds of scenes:
 
-Exit status: 1 if a step that a run of status 0 took says less than a third of its true error, or a scene ends in a
-fault. --only K runs scene K alone, leaves it in out/error_study/SEED for `msmpetsc run`, and prints each step.
+    any   : the scenes above
+    rub   : bodies in sliding contact with friction
+    far   : starts that are mirrored, collapsed, scattered or in fast spin
+    touch : bodies that fall on an edge or a corner
+
+The exit status is 1 if a step's estimate is below a third of its true error, or if a scene ends in
+a fault. --only K runs scene K alone, keeps its files in out/error_study/SEED, and prints each step.
 """
 
 import json
@@ -29,18 +35,22 @@ import trimesh
 
 from msmpetsc.scene.reading import load_scene
 
-LEAST = 1 / 3  # a smaller ratio is bad
-SECONDS = 300  # a scene may take so long
+# ratio of estimate to true error below which an estimate is bad
+LEAST = 1 / 3
+# time limit of a scene [s]
+SECONDS = 300
 KINDS = ("any", "rub", "far", "touch")
-NOTHING = 1e-9  # true errors below it cannot be told from 0
+# true error below which rounding prevents a comparison
+ROUNDING = 1e-9
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-3, 1e-3, 1e-5)
-ENDS = {"done": 0, "stopped": 3, "refused": 2, "cut off": None}  # exit status; any other is a fault
+# exit status of each way to end; any other status is a fault
+ENDS = {"done": 0, "stopped": 3, "refused": 2, "cut off": None}
 FOLDER = lab.OUT / "error_study"
 Draw = np.random.Generator
 
 
 def draw_scene(seed: int, number: int, folder: Path, kind: str = "any") -> Path:
-    """Write scene ``number`` of a seed and its meshes; the path of the scene."""
+    """Write scene ``number`` of a seed with its meshes; return the scene's path."""
     folder.mkdir(parents=True, exist_ok=True)
     draw = np.random.default_rng([seed, number])
     path = folder / f"hard_{number}.toml"
@@ -54,6 +64,7 @@ def draw_scene(seed: int, number: int, folder: Path, kind: str = "any") -> Path:
 
 
 def any_scene(draw: Draw, path: Path) -> dict:
+    """Return a scene of a single body, and write its mesh."""
     sides = np.array(SIDES[draw.integers(len(SIDES))])
     scene: dict = {
         "mesh": {"source": mesh_of(draw, sides, path.with_suffix(".obj"))},
@@ -81,7 +92,7 @@ def any_scene(draw: Draw, path: Path) -> dict:
 
 
 def rubbing(draw: Draw, path: Path) -> dict:
-    """A block that is led down onto a slab, then along it or round."""
+    """Return a scene in which a block moves down onto a slab, then slides and turns on it."""
     step: float = log_uniform(draw, 1e-3, 2e-2)
     bodies: list[dict] = []
     for name, low, high in (("block", [-0.15, -0.15, 0.0015], [0.15, 0.15, 0.1515]), SLAB):
@@ -119,6 +130,7 @@ def rubbing(draw: Draw, path: Path) -> dict:
 
 
 def start_far(draw: Draw, scene: dict) -> None:
+    """Start a scene far from rest: mirrored or collapsed along an axis, scattered or spinning."""
     scale = [1.0, 1.0, 1.0]
     scale[draw.integers(3)] = float(draw.choice([-1.0, -0.5, 0.0, 0.01]))
     scene["start"] = {"scale": scale, "scatter": float(draw.choice([0.0, 0.1, 1.0]))}
@@ -127,11 +139,9 @@ def start_far(draw: Draw, scene: dict) -> None:
 
 
 def touch(draw: Draw, scene: dict, bounds: np.ndarray) -> None:
-    """The ground, which the lowest point of the body meets in one of the first two steps."""
-    speed, response = (
-        log_uniform(draw, 0.1, 10),
-        str(draw.choice(["penalty", "penalty", "reflect"])),
-    )
+    """Add a ground that the body's lowest point meets in the first or the second step."""
+    speed = log_uniform(draw, 0.1, 10)
+    response = str(draw.choice(["penalty", "penalty", "reflect"]))
     gap = float(draw.uniform(0.1, 2)) * speed * scene["time"]["step"]
     plane = {
         "shape": "plane",
@@ -149,26 +159,30 @@ SIDES = ([1, 0.25, 0.25], [1, 0.12, 0.12], [0.5, 0.5, 0.5], [1, 1, 0.15], [0.6, 
 
 
 def log_uniform(draw: Draw, low: float, high: float) -> float:
+    """Return a number whose logarithm is uniformly distributed."""
     return float(np.exp(draw.uniform(np.log(low), np.log(high))))
 
 
 def mesh_of(draw: Draw, sides: np.ndarray, path: Path) -> str:
+    """Write a box, or a ball in place of the last of ``SIDES``; return the file's name."""
     mesh = trimesh.creation.icosphere(2, 0.3) if sides[0] == 0.6 else trimesh.creation.box(sides)
-    if draw.random() < 0.5:  # a body along the grid hides much
+    # alignment with the grid would hide faults
+    if draw.random() < 0.5:
         mesh.apply_transform(trimesh.transformations.random_rotation_matrix(draw.random(3)))
     mesh.export(path)
     return path.name
 
 
 def material_of(draw: Draw) -> dict:
+    """Return a material with a random law and stiffness."""
     law = "linear" if draw.random() < 0.6 else "neo-hookean"
     return {"young_modulus": log_uniform(draw, 1e3, 1e9), "density": 1000.0, "law": law}
 
 
 def solver_of(draw: Draw) -> dict:
-    from msmpetsc.solve.presets import (
-        PRESETS,
-    )  # with PETSc, which runs must not find started when they are forked
+    """Return solver settings with a random preset and a random error or iteration budget."""
+    # imports PETSc, which must not run yet when processes are forked
+    from msmpetsc.solve.presets import PRESETS
 
     preset = str(draw.choice(list(PRESETS)))
     if draw.random() < 0.1:
@@ -177,11 +191,12 @@ def solver_of(draw: Draw) -> dict:
 
 
 def add_start(draw: Draw, scene: dict, _: np.ndarray) -> None:
+    """Add a random deformation, spin and velocity at the start."""
     start = scene["start"] = {}
     kind = draw.integers(5)
     if kind == 0:
-        share, start["scale"] = log_uniform(draw, 0.02, 0.9), [1.0, 1.0, 1.0]
-        start["scale"][draw.integers(3)] = share
+        start["scale"] = [1.0, 1.0, 1.0]
+        start["scale"][draw.integers(3)] = log_uniform(draw, 0.02, 0.9)
     elif kind == 1:
         start["scale"] = [float(s) for s in draw.uniform(0.3, 2.0, 3)]
     elif kind == 2:
@@ -197,11 +212,12 @@ def add_start(draw: Draw, scene: dict, _: np.ndarray) -> None:
 
 
 def add_pin(draw: Draw, scene: dict, _: np.ndarray) -> None:
+    """Pin the body's end at low x."""
     scene["pin"] = [{"region": {"box": [[-0.1, -0.1, -0.1], [0.15, 1.1, 1.1]], "relative": True}}]
 
 
 def add_plates(draw: Draw, scene: dict, sides: np.ndarray) -> None:
-    """The ground, and for one in two a plate that comes down."""
+    """Add the ground and, in half of the scenes, a plate that comes down."""
     half = 0.5 * sides[2] if sides[0] != 0.6 else 0.3
     response = "reflect" if draw.random() < 0.15 else "penalty"
     ground: dict = {
@@ -226,6 +242,7 @@ def add_plates(draw: Draw, scene: dict, sides: np.ndarray) -> None:
 
 
 def add_part(draw: Draw, scene: dict, _: np.ndarray) -> None:
+    """Make half of the body stiffer, by a contrast of up to 1e6."""
     contrast = log_uniform(draw, 1, 1e6)
     region = {"half_space": {"point": [0.5, 0.5, 0.5], "normal": [1.0, 0.0, 0.0]}, "relative": True}
     stiff = min(contrast * scene["material"]["young_modulus"], 1e12)
@@ -233,22 +250,27 @@ def add_part(draw: Draw, scene: dict, _: np.ndarray) -> None:
 
 
 def add_anchor(draw: Draw, scene: dict, sides: np.ndarray) -> None:
-    """The far end is led inwards or aside."""
+    """Move the body's end at high x by an anchor."""
     by = [float(x) for x in draw.normal(0, 0.3, 3) * sides[0]]
     region = {"box": [[0.85, -0.1, -0.1], [1.1, 1.1, 1.1]], "relative": True}
     scene["anchor"] = [{"region": region, "path": [{"time": scene["time"]["duration"], "by": by}]}]
 
 
 def measured(seed: int, changes: list[str], kinds: list[str], number: int) -> dict:
-    """What became of one scene, some keys changed: ``status``, its words, each step's error as said and in truth."""
+    """Run a scene with changed keys; return its status, message and errors of its steps.
+
+    ``steps`` has a pair for each step: the estimate and the true error.
+    """
     scene = draw_scene(seed, number, FOLDER / str(seed), kinds[number % len(kinds)])
     result = scene.with_suffix(".h5")
     result.unlink(missing_ok=True)
     run = lab.run(
         scene, result, ["--true-error", 1, "--quiet"], changes, timeout=SECONDS, warm=True
     )
-    solver, steps = load_scene(scene).solver, []
-    if result.exists():  # of a run that failed, the steps before
+    solver = load_scene(scene).solver
+    steps: list = []
+    # a run that failed has the steps before the failure
+    if result.exists():
         frames = run.frames("step_error", "true_error")
         steps = np.transpose([frames["step_error"], frames["true_error"]]).tolist()
     row = {"number": number, "preset": solver.preset, "goal": solver.error, "status": run.status}
@@ -256,25 +278,24 @@ def measured(seed: int, changes: list[str], kinds: list[str], number: int) -> di
 
 
 def ratios_of(rows: list[dict]) -> np.ndarray:
-    """Said over true, of the steps whose truth is known and more than nothing."""
+    """Return estimate over true error for the steps whose true error is above rounding."""
     pairs = np.array([step for row in rows for step in row["steps"]]).reshape(-1, 2)
-    known = pairs[np.isfinite(pairs[:, 1]) & (pairs[:, 1] > NOTHING)]
+    known = pairs[np.isfinite(pairs[:, 1]) & (pairs[:, 1] > ROUNDING)]
     return known[:, 0] / known[:, 1]
 
 
 def row_of(name: str, rows: list[dict]) -> lab.Row:
-    """Return the row of a preset: how its scenes ended, and said over true."""
-    statuses, ratios = [row["status"] for row in rows], ratios_of(rows)
+    """Return the row of a preset: numbers of ends, and quantiles of estimate over true error."""
+    statuses = [row["status"] for row in rows]
+    ratios = ratios_of(rows)
     found: dict[str, object] = {"preset": name} | {
         word: statuses.count(status) for word, status in ENDS.items()
     }
     found["faults"] = len(rows) - sum(statuses.count(status) for status in ENDS.values())
-    within = ratios[np.isfinite(ratios)]
-    lowest = (
-        [f"{share:.2g}" for share in np.quantile(within, (0, 0.05, 0.5))]
-        if len(within)
-        else ["", "", ""]
-    )
+    finite = ratios[np.isfinite(ratios)]
+    lowest = ["", "", ""]
+    if len(finite):
+        lowest = [f"{quantile:.2g}" for quantile in np.quantile(finite, (0, 0.05, 0.5))]
     found |= {"steps": len(ratios)} | dict(
         zip(("least ratio", "5%", "median"), lowest, strict=True)
     )
@@ -282,10 +303,12 @@ def row_of(name: str, rows: list[dict]) -> lab.Row:
 
 
 def bad(row: dict) -> bool:
+    """Return whether a scene ended in a fault or has a step with a bad estimate."""
     return row["status"] not in ENDS.values() or bool((ratios_of([row]) < LEAST).any())
 
 
 def main() -> int:
+    """Print the table of all scenes, or the steps of a scene; return the exit status."""
     options = lab.parser(__doc__)
     options.add_argument("--scenes", type=int, default=500)
     options.add_argument("--seed", type=int, default=1)

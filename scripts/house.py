@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""The measures of a tree of msmpetsc: rooms, functions, names, density of lines.
+"""Measure the source of msmpetsc: rooms, functions, names, density of lines.
 
     scripts/house.py [FOLDER]
 
-FOLDER is a clone, this one if none is given. A walk counts the functions, and the modules that they stand in, which
-take a value of such a type: a Scene, or the request as Namespace or Request.
+FOLDER is a clone, by default this clone. A walk counts the functions, and their modules, that take
+a certain type of argument: a Scene, or a request of type Namespace or Request.
 """
 
 import ast
@@ -17,8 +17,10 @@ from pathlib import Path
 import lab
 from clone import ROOT
 
-WALKS = {"scene": r"\bScene\b", "request": r"\bNamespace\b|Request\b"}  # types of what is handed on
-LONGEST, MOST_ARGUMENTS, WIDE = 35, 6, 100  # lines of a function without its docstring; columns
+# pattern of the argument's type of each walk
+WALKS = {"scene": r"\bScene\b", "request": r"\bNamespace\b|Request\b"}
+# limits: lines of a function without its docstring, arguments, columns
+LONGEST, MOST_ARGUMENTS, WIDE = 35, 6, 100
 Facts = Iterator[tuple[str, object]]
 
 
@@ -26,7 +28,8 @@ class Tree:
     """The package of a clone: its modules by dotted name, without "msmpetsc."."""
 
     def __init__(self, folder: Path):
-        self.folder, package = folder, folder / "msmpetsc"
+        self.folder = folder
+        package = folder / "msmpetsc"
         self.paths = {
             ".".join(path.relative_to(package).with_suffix("").parts): path
             for path in sorted(package.rglob("*.py"))
@@ -36,35 +39,35 @@ class Tree:
 
     @cached_property
     def functions(self) -> list[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-        """All functions with their modules."""
+        """All functions, each with its module's name."""
         kinds = ast.FunctionDef | ast.AsyncFunctionDef
         return [(name, node) for name, node in self.nodes() if isinstance(node, kinds)]
 
     @cached_property
     def imports(self) -> dict[str, set[str]]:
-        """The modules of the package that each imports, those inside functions and of TYPE_CHECKING included."""
+        """The package's modules that each module imports, also in functions and TYPE_CHECKING."""
         found: dict[str, set[str]] = {name: set() for name in self.modules}
         for name, node in self.nodes():
             if isinstance(node, ast.ImportFrom):
                 words = {f"{node.module}.{alias.name}" for alias in node.names} | {str(node.module)}
+            elif isinstance(node, ast.Import):
+                words = {alias.name for alias in node.names}
             else:
-                words = (
-                    {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
-                )
+                continue
             found[name] |= {word.removeprefix("msmpetsc.") for word in words} & set(
                 self.modules
             ) - {name}
         return found
 
     def nodes(self) -> Iterator[tuple[str, ast.AST]]:
-        """Yield all nodes of all modules."""
+        """Yield each syntax node of the package with its module's name."""
         for name, module in self.modules.items():
             for node in ast.walk(module):
                 yield name, node
 
 
 def listed(names: Iterable[object]) -> str:
-    """Return how many there are, and the first ten."""
+    """Return the number of names, and the first ten names."""
     every = list(names)
     return f"{len(every)} {', '.join(map(str, every[:10]))}".strip()
 
@@ -73,7 +76,7 @@ def listed(names: Iterable[object]) -> str:
 
 
 def rooms(tree: Tree) -> Facts:
-    """Yield facts of folders and files."""
+    """Yield measures of folders and files."""
     own = [name for name in tree.paths if not name.endswith("__init__")]
     of_rooms: Counter[str] = Counter()
     for name in tree.paths:
@@ -97,19 +100,22 @@ def rooms(tree: Tree) -> Facts:
 
 
 def arguments(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.arg]:
-    """Return the arguments but self and cls."""
-    of = function.args
+    """Return the arguments of a function except self and cls."""
+    given = function.args
     return [
-        arg for arg in (*of.posonlyargs, *of.args, *of.kwonlyargs) if arg.arg not in ("self", "cls")
+        arg
+        for arg in (*given.posonlyargs, *given.args, *given.kwonlyargs)
+        if arg.arg not in ("self", "cls")
     ]
 
 
 def height_of(node: ast.stmt) -> int:
+    """Return the number of lines of a statement."""
     return (node.end_lineno or node.lineno) - node.lineno + 1
 
 
 def shape(tree: Tree) -> Facts:
-    """Yield facts of functions and classes."""
+    """Yield measures of functions and classes."""
     long = []
     for module, function in tree.functions:
         documented = ast.get_docstring(function) is not None
@@ -139,7 +145,7 @@ def shape(tree: Tree) -> Facts:
 
 
 def is_number(node: ast.stmt) -> bool:
-    """Return whether a statement names a number, or a tuple of numbers."""
+    """Return whether a statement assigns a number, or a tuple of numbers."""
     if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
         return False
     try:
@@ -151,7 +157,7 @@ def is_number(node: ast.stmt) -> bool:
 
 
 def density(tree: Tree) -> Facts:
-    """Yield how dense the lines are."""
+    """Yield measures of the density of lines."""
     lines = [line for of_file in tree.lines.values() for line in of_file]
     tuples = choices = 0
     for _, node in tree.nodes():
@@ -169,6 +175,7 @@ def density(tree: Tree) -> Facts:
 
 
 def main() -> None:
+    """Print the table of all measures."""
     options = lab.parser(__doc__)
     options.add_argument(
         "folder", nargs="?", type=Path, default=ROOT, metavar="FOLDER", help="a clone (this one)"

@@ -1,4 +1,4 @@
-"""What the studies of this folder share: runs of scenes in processes of their own, repeats, tables in Markdown."""
+"""Common parts of the studies: runs of scenes in child processes, repeats, Markdown tables."""
 
 import atexit
 import datetime
@@ -23,12 +23,15 @@ from msmpetsc.backend.machine import machine
 from msmpetsc.results.reader import Result
 from msmpetsc.study.process import Ended, Processes
 
-SCENES, OUT = ROOT / "scenes", ROOT / "out"
-DAY = 86_400.0  # [s]
-PROCESSES = Processes()  # of all that a script runs
+SCENES = ROOT / "scenes"
+OUT = ROOT / "out"
+# [s]
+DAY = 86_400.0
+PROCESSES = Processes()
 atexit.register(PROCESSES.close)
 T = TypeVar("T")
-Row = Mapping[str, object]  # of a table: cells by column
+# cells of a table's row, by column
+Row = Mapping[str, object]
 Rows = Iterator[Row]
 
 
@@ -39,8 +42,8 @@ Rows = Iterator[Row]
 class Run:
     """A run that ended.
 
-    failure : why it did not come to its end; empty if it did
-    status  : its exit status; None where time ran out
+    failure : why the run failed, "" if it did not
+    status  : exit status; None after a timeout
     """
 
     path: Path
@@ -49,11 +52,11 @@ class Run:
 
     @cached_property
     def cost(self) -> dict[str, Any]:
-        """What `run --measure` says of it."""
+        """The contents of the file that `run --measure` has written."""
         return json.loads(self.path.with_suffix(".json").read_text())
 
     def frames(self, *names: str, start: int = 1) -> dict[str, np.ndarray]:
-        """Return values of the frames from ``start`` on, (frames, ...) each."""
+        """Return columns of the frames from ``start`` on, each (frames, ...)."""
         with Result(self.path) as result:
             return {name: result.frames[name][start:] for name in names}
 
@@ -67,10 +70,13 @@ def run(
     timeout: float = DAY,
     warm: bool = False,
 ) -> Run:
-    """Run a scene, named or a file, in a process of its own, and say so; its log and its cost lie beside ``path``.
+    """Run a scene in a child process and report it on standard error.
 
-    words : options of `msmpetsc run`, and of PETSc; changes : those of --set
-    warm  : spare it the start of the program, where no time is asked
+    scene   : name of a scene in scenes/, or a scene file
+    path    : result file; log and measure file get the same name with another suffix
+    words   : options of `msmpetsc run` and of PETSc
+    changes : overrides for --set
+    warm    : save the start-up of the program; then times are not comparable
     """
     file = file_of(scene)
     command: list[object] = ["-m", "msmpetsc", "run", file, "-o", path, "--overwrite", *words]
@@ -88,22 +94,21 @@ def run(
 
 
 def file_of(scene: str | Path) -> Path:
-    """Return the file of a scene of scenes/ by its name, or of a path."""
+    """Return the file of a scene, given its name in scenes/ or its path."""
     return Path(scene) if Path(scene).suffix == ".toml" else SCENES / f"{scene}.toml"
 
 
 def python(
     words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False
 ) -> Ended:
-    """Run Python with these words to its end, what it says into ``log``."""
-    launcher = (
-        ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
-    )  # study.cases' starts PETSc where it is imported
+    """Run Python with these arguments to its end; ``log`` gets all output."""
+    # study.cases has a launcher, but its import starts PETSc
+    launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
     return PROCESSES.run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
 
 
 def box(path: Path, sides: Sequence[float] | np.ndarray) -> str:
-    """Write a box with a corner at the origin; return the change that makes it the mesh of a scene."""
+    """Write a box with a corner at the origin; return the override that makes it a scene's mesh."""
     path.parent.mkdir(parents=True, exist_ok=True)
     trimesh.creation.box(bounds=np.array([np.zeros(3), sides])).export(path)
     return f'mesh.source="{path}"'
@@ -113,34 +118,37 @@ def box(path: Path, sides: Sequence[float] | np.ndarray) -> str:
 
 
 def alternated(kinds: Mapping[str, Callable[[], T | None]], repeats: int) -> dict[str, list[T]]:
-    """Do each kind so often, no one twice in a row while there are others; one that gives None is not done again."""
-    found: dict[str, list[T]] = {name: [] for name in kinds}
+    """Call each function ``repeats`` times in turn; return the values of each by its name.
+
+    After a function has returned None, it is not called again, and its list is empty.
+    """
+    values: dict[str, list[T]] = {name: [] for name in kinds}
     failed = set()
     for name in [*kinds] * repeats:
         value = None if name in failed else kinds[name]()
         if value is None:
             failed.add(name)
         else:
-            found[name].append(value)
-    return {name: [] if name in failed else values for name, values in found.items()}
+            values[name].append(value)
+    return {name: [] if name in failed else kept for name, kept in values.items()}
 
 
 def spread(values: Sequence[float]) -> str:
-    """Return the median, and the least and the greatest where there are several."""
+    """Return the median, with the least and the greatest of several values in brackets."""
     ends = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
     return shown(median(values)) + ends
 
 
-# ---- what is printed
+# ---- output
 
 
 def slope(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> float:
-    """Return the slope of a line fitted to log |error| over log size."""
+    """Return the slope of the line fitted to log |error| over log size."""
     return np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
 
 
 def shown(value: object) -> str:
-    """Return a cell of a table: three digits of a float, commas in an int, nothing of None."""
+    """Return a value as a table's cell: three digits of a float, "" for None."""
     if value is None:
         return ""
     if isinstance(value, float):
@@ -154,7 +162,7 @@ def percent(share: float, digits: int = 1) -> str:
 
 
 def table(rows: Iterable[Row]) -> None:
-    """Print rows as they come, under the columns of the first; one that has more columns begins a table of its own."""
+    """Print rows as they come, and a new heading whenever a row has a new column."""
     columns: list[str] = []
     for row in rows:
         if not set(row) <= set(columns):
@@ -164,19 +172,20 @@ def table(rows: Iterable[Row]) -> None:
 
 
 def parser(documentation: str | None) -> ArgumentParser:
-    """Return a parser that prints a script's documentation for --help."""
+    """Return a parser that prints a script's docstring for --help."""
     return ArgumentParser(description=documentation, formatter_class=RawDescriptionHelpFormatter)
 
 
 def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) -> None:
-    """Print the tables of a study that the command line names, or all."""
+    """Print the tables of a study that the command line names, or all of them."""
     options = parser(documentation)
     options.add_argument(
-        "tables", nargs="*", metavar="TABLE", help=f"of {', '.join(tables)}; all if none is named"
+        "tables", nargs="*", metavar="TABLE", help=f"{', '.join(tables)}; all by default"
     )
     args = options.parse_args()
     if unknown := set(args.tables) - set(tables):
-        options.error(f"no table {', '.join(sorted(unknown))}: {', '.join(tables)}")
+        known = ", ".join(tables)
+        options.error(f"no table {', '.join(sorted(unknown))}; the tables are {known}")
     heading()
     for name in args.tables or tables:
         print(f"\n## {name}")
@@ -184,7 +193,7 @@ def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) 
 
 
 def heading() -> None:
-    """Print the command of a script, the day and the machine, below which its tables stand."""
+    """Print a script's command, the date and the machine as heading of its tables."""
     name, *words = sys.argv
     print(
         f"# {Path(name).name}\n\n```sh\n{shlex.join([f'scripts/{Path(name).name}', *words])}\n```\n"

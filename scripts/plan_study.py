@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Holds what `plan --surface-error` chooses against finer runs. Needs the meshes.
+"""Compare the choices of `plan --surface-error` with finer runs. Needs the meshes.
 
     scripts/plan_study.py [SCENE...] [--errors 0.1 0.03 0.01] [--cells N] [--frames N] [--limit S]
 
-The finer run has 32 times the cells of the choice, or 8 times where that takes longer than the limit, and a quarter
-more than the plan's finest trial at least. It takes explicit substeps or a quarter of the step; a static one is static.
-Where no choice meets the error, the best one is held against a finer run. SCENE is a name of the study or a scene file.
+The finer run has 32 times the cells of the choice, or 8 times if that exceeds the time limit. It
+has at least a quarter more cells than the plan's finest trial. Its steps are explicit substeps, or
+a quarter of the choice's step; a static scene remains static. If no choice meets the error, the
+choice of least error is compared. SCENE is a name of the study or a scene file.
 """
 
 import json
@@ -23,16 +24,21 @@ from msmpetsc.scene.time import STATIC
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.sizing.choice import Candidate, overrides, tables
 
-ERRORS, LIMIT = (0.1, 0.03, 0.01), 900.0  # [s] a finer run
-FINER = 32, 8  # times the cells: 8 are half the edge, and err by half as much where the order is 1
-MORE = 1.25  # times the cells of the plan's finest trial, at least
-SHORTER = 4  # times, of implicit steps
-NOT_MET = 3  # exit status of a plan that is there all the same
+ERRORS = (0.1, 0.03, 0.01)
+# time limit of a finer run [s]
+LIMIT = 900.0
+# ratios of cells of the finer run; 8 halves the edge, and a first-order error
+FINER = (32, 8)
+# least ratio of cells to the plan's finest trial
+MORE = 1.25
+# ratio of implicit steps of the choice and of the finer run
+SHORTER = 4
+# exit status of a plan that does not meet the error
+NOT_MET = 3
 FOLDER = lab.OUT / "plan_study"
 Setting = tuple[tuple[int | None, ...], tuple[int, ...]]
-STUDIES: dict[
-    str, Setting
-] = {  # for each of ERRORS: first frames, that are tried, and cells of the finest trial
+# for each of ERRORS: number of frames, and cells of the finest trial
+STUDIES: dict[str, Setting] = {
     "armadillo_forehead": ((2, 2, 2), (1000, 4000, 8000)),
     "armadillo_leg": ((4, 2, 2), (1000, 4000, 8000)),
     "armadillo_palm": ((4, 2, 2), (1000, 4000, 8000)),
@@ -45,14 +51,15 @@ STUDIES: dict[
     "studies/beam_stiff": ((10, 10, 10), (2000, 2000, 8000)),
     "studies/atlas/press": ((6, 6, 6), (512, 2000, 4000)),
 }
-ANOTHER: Setting = ((None, None, None), (1000, 2000, 4000))  # of a scene file
+# the same for a scene file
+DEFAULT: Setting = ((None, None, None), (1000, 2000, 4000))
 
 
 class Planned(NamedTuple):
-    """What the plan of a scene file chose on its first frames.
+    """The choice of a plan for a scene file.
 
-    frames  : None for all
-    seconds : that the plan took
+    frames  : number of frames tried; None for all frames
+    seconds : time that the plan took
     """
 
     file: Path
@@ -63,7 +70,7 @@ class Planned(NamedTuple):
     seconds: float
 
     def run(self, method: Candidate, cells: int, limit: float) -> lab.Run:
-        """Run so many cells by a method, with the surface at the scene's own frames."""
+        """Run the scene with a method and cells, with the surface at the scene's own frames."""
         step = load_scene(self.file).time.step
         changes = overrides(
             self.file, {**tables(method), "cages": {"count": cells, "cell_size": None}}
@@ -75,11 +82,13 @@ class Planned(NamedTuple):
         return lab.run(self.file, path, ["--quiet"], changes, timeout=limit)
 
     def finer(self) -> Iterator[tuple[int, Candidate]]:
-        """Yield cells and methods of finer runs."""
-        method, finest = self.method, max(each["cells"] for each in self.answer["tried"])
+        """Yield cells and methods of finer runs, the finest first."""
+        method = self.method
+        finest = max(each["cells"] for each in self.answer["tried"])
         if method.integrator == STATIC:
             method = replace(method, step_error=1e-3)
-        elif method.integrator != "verlet":  # whose substeps are as short as the cells ask
+        # verlet's substeps shrink with the cells by themselves
+        elif method.integrator != "verlet":
             method = Candidate(
                 "bdf2", method.time_step / SHORTER, "newton", min(1e-3, method.step_error or 1e-3)
             )
@@ -88,7 +97,7 @@ class Planned(NamedTuple):
 
 
 def planned(file: Path, target: float, frames: int | None, cells: int) -> Planned | str:
-    """Return what `msmpetsc plan` chooses; or why there is nothing."""
+    """Run `msmpetsc plan` and return its choice, or why it failed."""
     words = [
         "--surface-error",
         target,
@@ -103,7 +112,8 @@ def planned(file: Path, target: float, frames: int | None, cells: int) -> Planne
     ended = lab.python(["-m", "msmpetsc", "plan", file, *words], log)
     if ended.status not in (0, NOT_MET):
         return ended.reason
-    answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])  # behind what was tried
+    # trials are reported before the answer
+    answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])
     choice = answer["choice"]
     return Planned(
         file, frames, Candidate(**choice["method"]), choice["cells"], answer, perf_counter() - begin
@@ -111,7 +121,7 @@ def planned(file: Path, target: float, frames: int | None, cells: int) -> Planne
 
 
 def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
-    """Return the error of a choice against the first finer run that ends in time, or why there is none."""
+    """Return the error against the first finer run within the limit and its cells; or why not."""
     choice = plan.run(plan.method, plan.cells, limit)
     if choice.failure:
         return None, f"the choice: {choice.failure}"
@@ -125,19 +135,18 @@ def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
 
 
 def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row:
-    """Return the row of the plan of a scene."""
-    found: dict[str, object] = {"scene": scene, "asked": f"{100 * target:g}%"}
+    """Return the row of a scene's plan."""
+    asked: dict[str, object] = {"scene": scene, "asked": f"{100 * target:g}%"}
     if isinstance(plan, str):
-        return found | {"chosen, cells": plan}
+        return asked | {"chosen, cells": plan}
     error, why = true_error(plan, limit)
-    method, choice = plan.method, plan.answer["choice"]
-    step = (
-        ""
-        if method.step_error is None
-        else f", {1000 * method.time_step:.3g} ms to {method.step_error:g}"
-    )
+    method = plan.method
+    choice = plan.answer["choice"]
+    step = ""
+    if method.step_error is not None:
+        step = f", {1000 * method.time_step:.3g} ms to {method.step_error:g}"
     bounds = [*([] if plan.answer["met"] else ["**not met**"]), why, *plan.answer["bounds"]]
-    return found | {
+    return asked | {
         "chosen, cells": f"{method.integrator}{step}, {plan.cells}",
         "expected: cells + time + step": " + ".join(
             f"{100 * value:.2g}%" for value in choice["budget"].values()
@@ -151,13 +160,13 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
 
 
 def rows(args: Namespace) -> lab.Rows:
-    """Yield the rows, as they are run."""
+    """Yield the rows as they are run."""
     for target in args.errors:
         number = next(
             (number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1
         )
         for scene in args.scenes or STUDIES:
-            tried, finest = STUDIES.get(scene, ANOTHER)
+            tried, finest = STUDIES.get(scene, DEFAULT)
             plan = planned(
                 lab.file_of(scene),
                 target,
@@ -168,11 +177,12 @@ def rows(args: Namespace) -> lab.Rows:
 
 
 def main() -> None:
+    """Print the table of the scenes that the command line names, or of all."""
     options = lab.parser(__doc__)
     options.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(STUDIES))
     options.add_argument("--errors", nargs="+", type=float, default=ERRORS)
-    options.add_argument("--cells", type=int, help="of the finest trial")
-    options.add_argument("--frames", type=int, help="the first ones, that are tried")
+    options.add_argument("--cells", type=int, help="cells of the finest trial")
+    options.add_argument("--frames", type=int, help="number of frames that the trials run")
     options.add_argument("--limit", type=float, default=LIMIT, help="seconds of a finer run")
     args = options.parse_args()
     if unknown := {

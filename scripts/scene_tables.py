@@ -1,18 +1,22 @@
 #!/usr/bin/env python3
-"""Tables of the shipped scenes. Needs the meshes.
+"""Print tables of the shipped scenes. Needs the meshes.
 
-    scripts/scene_tables.py table1|tissue|touching [SCENE...] [--frames N] [--set KEY=VALUE ...]
+    scripts/scene_tables.py table1|tissue|touching [SCENE...] [--frames N] [--shorter N]
+        [--set KEY=VALUE ...]
 
-table1   : the paper's Table 1 beside ours, the paper's figures in brackets: with its own springs, and as its twin, a
-           neo-Hookean solid of the same Young's modulus and Poisson's ratio 1/4. Frames a second are those of the
-           steps alone, as each frame's wall_time has them: the mean, and the slowest tenth of the frames. Products
-           with the Hessian are a frame's. The error is the largest relative error of a step that the runs report.
-tissue   : neo-Hookean solids of Poisson's ratio 0.47. The volume is what the drawn surface encloses, against rest:
-           the most that is lost and gained in any frame, and at the end. "Inside out" is the most cells in any frame.
-touching : surfaces that meet themselves; a SCENE may be a file. Crossed: pairs of an edge and a triangle that cross,
-           over all frames, by a test that shares nothing with the contact's own, of the surface that meets itself;
-           drawn: of the one that is drawn, over 20 frames. CPU is of the process, by the share of its steps, with
-           contact and of the scene without [self_contact]. --shorter 16 takes steps, and frames, of a sixteenth.
+table1 has the paper's Table 1 with our figures, the paper's in brackets. Each scene runs with its
+springs, and as neo-Hookean solid of the same Young's modulus and Poisson's ratio 1/4. Frames a
+second count the steps alone: the mean, and the mean of the slowest tenth. Products with the Hessian
+are per frame. The error is the largest relative step error that the runs report.
+
+tissue has neo-Hookean solids of Poisson's ratio 0.47. The volume is that within the drawn surface
+relative to rest: the largest loss and gain of any frame, and at the end. "Inside out" is the
+largest number of inverted cells of any frame.
+
+touching has surfaces in self-contact; a SCENE may be a file. "Crossed" counts edges that cross
+triangles of the collision surface in any frame, by a test independent of the contact code. "Drawn"
+counts crossings of the drawn surface in 20 frames. CPU is the process's time spent on steps, with
+contact and without [self_contact]. --shorter 16 divides steps and frames by 16.
 """
 
 import re
@@ -41,8 +45,9 @@ OUT = lab.OUT / "scene_tables"
 
 
 def run(name: str, scene: str | Path, args: Namespace, *changes: str) -> Path:
-    """Run a scene; its result, whose frames count if the run fails, too."""
-    changes, file = (*changes, *args.set), lab.file_of(scene)
+    """Run a scene and return its result file; after a failure the frames before it count."""
+    changes = (*changes, *args.set)
+    file = lab.file_of(scene)
     if args.shorter > 1:
         changes += (f"time.step={load_scene(file).time.step / args.shorter!r}",)
     words = ["--quiet", *(["--frames", args.frames] if args.frames else [])]
@@ -50,7 +55,7 @@ def run(name: str, scene: str | Path, args: Namespace, *changes: str) -> Path:
 
 
 def mean(result: Result, *names: str) -> dict[str, float]:
-    """Return means of what a frame after the first has."""
+    """Return the means of columns over all frames but the first."""
     return {name: float(result.frames[name][1:].mean()) for name in names}
 
 
@@ -80,49 +85,50 @@ def slowest_tenth(seconds: np.ndarray) -> float:
 
 
 def table1(scene: str, args: Namespace) -> lab.Row:
-    """Return a row of Table 1, of both laws."""
+    """Return the row of a scene in Table 1, with both laws."""
     *counts, cpu, _ = PAPER[scene.split("_")[0]]
-    found: dict[str, object] = {"scene": scene}
+    row: dict[str, object] = {"scene": scene}
     worst = 0.0
     for law, changes in LAWS.items():
         with Result(run(f"table1_{law}", scene, args, *changes)) as result:
             ours = [len(result[name]) for name in ARRAYS.values()]
             seconds, products = result.frames.wall_time[1:], result.frames.products[1:]
             worst = max(worst, float(result.frames.step_error[1:].max()))
-        if len(found) == 1:
-            beside = zip(ARRAYS, ours, counts, strict=True)
-            found |= {name: f"{own:,} ({paper:,})" for name, own, paper in beside}
+        if len(row) == 1:
+            pairs = zip(ARRAYS, ours, counts, strict=True)
+            row |= {name: f"{own:,} ({paper:,})" for name, own, paper in pairs}
         paper = f" ({cpu})" if law == "springs" else ""
-        found[f"{law}: frames a second"] = f"{1 / seconds.mean():.3g}{paper}"
-        found[f"{law}: slowest tenth"] = 1 / slowest_tenth(seconds)
-        found[f"{law}: products"] = float(products.mean())
-    return found | {"step error": worst}
+        row[f"{law}: frames a second"] = f"{1 / seconds.mean():.3g}{paper}"
+        row[f"{law}: slowest tenth"] = 1 / slowest_tenth(seconds)
+        row[f"{law}: products"] = float(products.mean())
+    return row | {"step error": worst}
 
 
 # ---- tissue
 
 
 def volumes(result: Result) -> np.ndarray:
-    """Return the volume (frames,) within the surface, over that at rest, less 1."""
+    """Return the relative change (frames,) of the volume within the surface since rest."""
     triangles = result["surface/triangles"][:]
     shapes = (result["surface/points"][:], *result.frames.surface)
-    found = np.array(
+    values = np.array(
         [trimesh.Trimesh(points, triangles, process=False).volume for points in shapes]
     )
-    return found[1:] / found[0] - 1
+    return values[1:] / values[0] - 1
 
 
 def tissue(scene: str, args: Namespace) -> lab.Row:
     """Return the row of a scene as tissue."""
     law = "material.law=neo-hookean", "material.poisson_ratio=0.47", "output.surface=true"
     with Result(run("tissue", scene, args, *law)) as result:
-        change, of = volumes(result), mean(result, "iterations", "ksp_its", "products", "wall_time")
+        change = volumes(result)
+        means = mean(result, "iterations", "ksp_its", "products", "wall_time")
         return {
             "scene": scene,
             "cells": len(result["lattice/cells"]),
             "frames": len(change) - 1,
-            "frames a second": 1 / of.pop("wall_time"),
-            **of,
+            "frames a second": 1 / means.pop("wall_time"),
+            **means,
             "inside out": int(result.frames.inverted[:].max()),
             "volume": ", ".join(
                 lab.percent(value, 2) for value in (change.min(), change.max(), change[-1])
@@ -130,16 +136,18 @@ def tissue(scene: str, args: Namespace) -> lab.Row:
         }
 
 
-# ---- surfaces that meet themselves
+# ---- surfaces in self-contact
 
-COUNTED = 20  # frames whose crossings of the surface that is drawn are counted
+# number of frames in which crossings of the drawn surface are counted
+COUNTED = 20
 
 
 def cost(name: str, scene: str | Path, args: Namespace) -> tuple[Path, float]:
-    """Return the result of a scene, and the CPU time of a frame [ms]."""
+    """Run a scene; return its result file and the CPU time of a frame [ms]."""
     began = sum(getrusage(RUSAGE_CHILDREN)[:2])
     path = run(name, scene, args)
-    time, cpu = lab.Run(path).cost["time"], sum(getrusage(RUSAGE_CHILDREN)[:2]) - began
+    time = lab.Run(path).cost["time"]
+    cpu = sum(getrusage(RUSAGE_CHILDREN)[:2]) - began
     with Result(path) as result:
         frames = len(result.frames.time) - 1
     return path, 1e3 * cpu * time["stepping"] / (
@@ -148,7 +156,7 @@ def cost(name: str, scene: str | Path, args: Namespace) -> tuple[Path, float]:
 
 
 def without_contact(file: Path) -> Path:
-    """Return a copy of a scene without [self_contact], its meshes beside it."""
+    """Return a copy of a scene without [self_contact], with its meshes."""
     copy = OUT / "without" / file.name
     copy.parent.mkdir(parents=True, exist_ok=True)
     for mesh in file.parent.glob("*.ply"):
@@ -158,13 +166,11 @@ def without_contact(file: Path) -> Path:
 
 
 def touching(scene: str, args: Namespace) -> lab.Row:
-    """Return the row of a scene that touches itself."""
+    """Return the row of a scene with self-contact."""
     path, cpu = cost("touching", scene, args)
-    file, others = (
-        lab.file_of(scene),
-        [change for change in args.set if not change.startswith("self_contact")],
-    )
-    _, without = cost("without", without_contact(file), Namespace(**vars(args) | {"set": others}))
+    file = lab.file_of(scene)
+    kept = [change for change in args.set if not change.startswith("self_contact")]
+    _, without = cost("without", without_contact(file), Namespace(**vars(args) | {"set": kept}))
     model = build_model(MPI.COMM_SELF, load_scene(file, args.set))
     assert (
         isinstance(model.collision, CollisionSurface) and model.collision.surface and model.surface
@@ -173,7 +179,8 @@ def touching(scene: str, args: Namespace) -> lab.Row:
         whole = [*map(model.collision.points, result.frames.position, result.frames.time[:])]
         counted = np.unique(np.linspace(0, len(whole) - 1, COUNTED).round().astype(int))
         drawn = (result.embedding @ result.frames.position[index] for index in counted)
-        least, products = np.nanmin(result.frames.self_distance[:]), result.frames.products[1:]
+        least = np.nanmin(result.frames.self_distance[:])
+        products = result.frames.products[1:]
         return {
             "scene": f"`{file.stem}`",
             "cells": len(model.lattice.cells),
@@ -192,7 +199,7 @@ def touching(scene: str, args: Namespace) -> lab.Row:
         }
 
 
-# ---- by name: the row of a scene, and the scenes if none is named
+# ---- function of a row, and default scenes, of each table
 
 TABLES = {
     "table1": (table1, SCENES),
@@ -202,21 +209,19 @@ TABLES = {
 
 
 def main() -> None:
+    """Print the table that the command line names."""
     options = lab.parser(__doc__)
     options.add_argument("table", choices=TABLES)
     options.add_argument(
-        "scenes",
-        nargs="*",
-        metavar="SCENE",
-        help="of scenes/; those that the table is of, if absent",
+        "scenes", nargs="*", metavar="SCENE", help="names in scenes/ (the table's own)"
     )
     options.add_argument(
-        "--frames", type=int, metavar="N", help="steps of each scene; all of them if absent"
+        "--frames", type=int, metavar="N", help="number of steps of each scene (all)"
     )
     options.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="changes of every scene"
     )
-    options.add_argument("--shorter", type=int, default=1, metavar="N", help="times, the steps")
+    options.add_argument("--shorter", type=int, default=1, metavar="N", help="divisor of the steps")
     args = options.parse_args()
     row, scenes = TABLES[args.table]
     lab.heading()

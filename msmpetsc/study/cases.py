@@ -1,4 +1,4 @@
-"""The cases of a study: what defines a run, its command, and the products of sweeps and maps."""
+"""Cases of a study: the settings of each run, expanded from the sweeps and maps of its file."""
 
 import hashlib
 import json
@@ -18,7 +18,8 @@ from msmpetsc.scene.toml import toml_value
 from msmpetsc.study.forkserver import COLD
 from msmpetsc.study.study_file import Axis, Length, Map, MapCase, Study, StudyScene, Sweep
 
-OVERRIDES = {  # values of a case that stand in tables of its scene
+# table and key of the scene file that hold a field of Case
+OVERRIDES = {
     "integrator": ("time", "integrator"),
     "preset": ("solver", "preset"),
     "time_step": ("time", "step"),
@@ -26,22 +27,17 @@ OVERRIDES = {  # values of a case that stand in tables of its scene
     "error": ("solver", "error"),
     "max_iterations": ("solver", "max_iterations"),
 }
-IN_TABLE = (
-    "scene",
-    "options",
-    "label",
-    "ranks",
-    "repeats",
-    "cells",
-    *OVERRIDES,
-)  # values that are columns
-SURFACE = "output.surface=true"  # the override of a case whose surface is compared
-NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference")
+# fields of Case that are columns of table.csv
+CASE_COLUMNS = ("scene", "options", "label", "ranks", "repeats", "cells", *OVERRIDES)
+# override of a case whose surface is compared with its reference
+SURFACE = "output.surface=true"
+# fields of Case that leave the result as it is, or enter ``id`` in another form
+OUTSIDE_ID = ("file", "label", "timeout", "reference")
 
 
 @dataclass(frozen=True)
 class MapPoint:
-    """A point of a map, and whether its body should be in its rest shape at the end."""
+    """A point (x, y) of a stability map; ``recovers`` asks for the rest shape at the end."""
 
     map: str
     x: str | float
@@ -51,55 +47,65 @@ class MapPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A run and its repeats; the scene or the program decides what is None."""
+    """The settings of a run and its repeats; None leaves a choice to the scene or the program.
+
+    content    : digest of the scene file and of the files that it names
+    set        : all overrides of the scene, "key.path=value"; the fields below repeat some of
+                 them as columns of the table
+    preset     : "" for verlet
+    substep    : upper limit [s] of verlet's substeps
+    true_error : number of steps between measurements of the true step error
+    reference  : run whose motion is taken as exact
+    point      : point of the map; None for a case of a sweep
+    """
 
     scene: str
     file: Path
-    content: str  # digest of the scene file and of the files that it names
-    set: tuple[str, ...]  # all overrides, "key.path=value"; what follows repeats them for the table
+    content: str
+    set: tuple[str, ...]
     integrator: str
-    time_step: float  # [s]
-    preset: str = ""  # as for verlet
+    time_step: float
+    preset: str = ""
     options: str = ""
     cells: int | None = None
-    substep: float | None = None  # [s]
+    substep: float | None = None
     error: float | None = None
     max_iterations: int | None = None
     ranks: int = 1
     repeats: int = 1
-    true_error: int | None = None  # every so many steps the true step error is measured
+    true_error: int | None = None
     label: str = ""
-    timeout: float = 300.0  # [s]
-    reference: "Case | None" = None  # the run its motion is measured against
-    point: MapPoint | None = None  # of a map; None for the case of a sweep
+    timeout: float = 300.0
+    reference: "Case | None" = None
+    point: MapPoint | None = None
 
     @property
     def id(self) -> str:
-        """Digest of what defines the run, without its label and its time limit."""
-        what = {name: value for name, value in asdict(self).items() if name not in NOT_ITS_IDENTITY}
-        what |= {"version": __version__, "reference": self.reference and self.reference.id}
-        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
+        """Digest of the settings and the program's version; label and time limit do not enter."""
+        settings = {name: value for name, value in asdict(self).items() if name not in OUTSIDE_ID}
+        settings |= {"version": __version__, "reference": self.reference and self.reference.id}
+        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def stores_surface(self) -> bool:
-        """Whether surfaces are compared with the reference, rather than nodes."""
+        """Whether the surface, not the nodes, is compared with the reference."""
         return SURFACE in self.set
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns of the table that are known before the case runs."""
-        row = {name: getattr(self, name) for name in IN_TABLE}
+        """Columns of the table that are known before the run."""
+        row = {name: getattr(self, name) for name in CASE_COLUMNS}
         if self.point:
             row |= {"map": self.point.map, "x": str(self.point.x), "y": str(self.point.y)}
         return row | {"case": self.id}
 
     def changed(self, *changes: str) -> "Case":
-        """Return the same run with further overrides of its scene."""
+        """Return a copy of the case with further overrides of its scene."""
         return replace(self, set=(*self.set, *changes))
 
 
 def run_arguments(case: Case) -> list[str]:
-    """Return the arguments of ``msmpetsc`` for a case, without its outputs."""
+    """Return the command line arguments of ``msmpetsc`` for a case, without output options."""
     changes = [word for change in case.set for word in ("--set", change)]
     if case.true_error is not None:
         changes += ["--true-error", str(case.true_error)]
@@ -107,15 +113,16 @@ def run_arguments(case: Case) -> list[str]:
 
 
 def launcher(ranks: int) -> list[str]:
-    """Return the words that start a program on so many ranks."""
+    """Return the words that start a program on this number of ranks."""
     return ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
 
 
 def command(case: Case, result: Path, measure: Path) -> list[str]:
-    """Return the command of one run: its frames go to ``result``, its figures to ``measure``."""
-    name, scene, *rest = run_arguments(
-        case
-    )  # the last of which may be an option of PETSc's without a value
+    """Return the command of a run that writes its frames to ``result``, its costs to ``measure``.
+
+    PETSc's options come last, because a flag without a value would take the next word as its value.
+    """
+    name, scene, *rest = run_arguments(case)
     outputs = ["-o", str(result), "--overwrite", "--measure", str(measure)]
     return [*launcher(case.ranks), *COLD, name, scene, *outputs, *rest]
 
@@ -135,9 +142,9 @@ def digest(file: Path, scene: Scene) -> str:
 
 
 def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the tables time and solver of a scene with a case's values; a key that is None is absent.
+    """Return a case's values as the scene tables "time" and "solver"; None stands for no key.
 
-    Verlet solves nothing, so it has no solver table; implicit Euler is what a scene means that names no integrator.
+    Verlet has no solver table. Implicit Euler is the default, so its name is left out.
     """
     values = {
         **values,
@@ -169,7 +176,12 @@ def with_tables(
 
 
 def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
-    """Return the distinct cases of a study in the order of its file. Raises InputError."""
+    """Return the distinct cases of a study in the order of its file.
+
+    full : include sweeps, scenes and maps that are marked ``full``
+
+    Raises InputError if a scene with its overrides is not valid.
+    """
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:
@@ -177,7 +189,7 @@ def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
                 not full and (sweep.full or scene.full)
             ):
                 continue
-            for own in of_laws(scene, sweep):
+            for own in with_laws(scene, sweep):
                 for case in sweep_cases(study, *own, folder):
                     by_id.setdefault(case.id, case)
     for map in study.map:
@@ -187,12 +199,12 @@ def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
 
 
 def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
-    """Yield the Cartesian product of lists as dictionaries by their names; the last list changes fastest."""
+    """Yield the Cartesian product of named lists as dictionaries; the last list varies fastest."""
     return (dict(zip(lists, values, strict=True)) for values in product(*lists.values()))
 
 
-def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
-    """Yield a scene and its reference with each material law of a sweep, and the sweep labelled by the law."""
+def with_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
+    """Yield scene and sweep for each material law of the sweep, with the law in the label."""
     if not sweep.laws:
         yield scene, sweep
     for law in sweep.laws:
@@ -204,26 +216,25 @@ def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep
 
 
 def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> Iterator[Case]:
-    """Yield the cases of a sweep over a scene, the product of its lists."""
+    """Yield the cases of a sweep over a scene. Raises InputError if the scene is not valid."""
     file = folder / scene.file
     changes = (*scene.set, *sweep.set)
     as_given = load_scene(file, changes, by_user=False)
     for cells, integrator in product(sweep.cells or (None,), sweep.integrators):
         base = Case(
-            scene=scene.name, file=file, content=digest(file, as_given), integrator=integrator, cells=cells,
-            set=(*changes, *((f"cages.count={cells}",) if cells else ())), time_step=as_given.time.step,
-            repeats=study.repeats, timeout=study.timeout,
+            scene=scene.name, file=file, content=digest(file, as_given), integrator=integrator,
+            set=(*changes, *((f"cages.count={cells}",) if cells else ())), cells=cells,
+            time_step=as_given.time.step, repeats=study.repeats, timeout=study.timeout,
         )  # fmt: skip
         base = replace(base, reference=_reference(base, scene, as_given))
         for case in _methods(base, scene, sweep, as_given):
-            load_scene(
-                file, case.set, by_user=False
-            )  # what is wrong is said before anything is run
+            # an error in a scene must appear before the first run
+            load_scene(file, case.set, by_user=False)
             yield case
 
 
 def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Iterator[Case]:
-    """Yield the cases of one lattice and integrator."""
+    """Yield the cases with the lattice and the integrator of ``base``."""
     steps = sweep.time_steps or (as_given.time.step,)
     if base.integrator == "verlet":
         lists: dict[str, Sequence[Any]] = {"time_step": steps, "substep": sweep.substeps or (None,)}
@@ -242,7 +253,7 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 
 
 def _label(sweep: Sweep, case: Case) -> str:
-    integrator = case.integrator.removeprefix("implicit-euler")  # the usual one
+    integrator = case.integrator.removeprefix("implicit-euler")
     name = sweep.label or " ".join(filter(None, (integrator, case.preset, case.options)))
     return (
         name if case.ranks == 1 or sweep.ranks == (case.ranks,) else f"{name}, {case.ranks} ranks"
@@ -250,9 +261,9 @@ def _label(sweep: Sweep, case: Case) -> str:
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
-    """Return a case with its time table, and output at the times that are compared.
+    """Return a case with its duration, and with output at the times of the reference's frames.
 
-    Nothing is measured beyond its end.
+    ``true_error`` is cut to the number of steps, so that a run measures it at least once.
     """
     length = Length(steps=sweep.steps) if sweep.steps else scene
     duration = length.seconds(case.time_step, as_given.time.duration)
@@ -266,10 +277,11 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 
 
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
-    """Return the reference run of a case, with tiny steps and output at times compared.
+    """Return the reference run of a case, or None if the scene has no reference.
 
-    It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in
-    it, but for the law, if it names none.
+    The reference has short steps and writes frames at the times that are compared. It runs on the
+    case's lattice, unless the reference has its own ``cells``: then only the scene's overrides and
+    the law apply to it, and surfaces are compared.
     """
     reference = scene.reference
     if reference is None:
@@ -293,7 +305,8 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     surface = reference.cells is not None
     if reference.integrator == "verlet":
         return with_tables(replace(case, substep=reference.substep), duration, 1, as_given, surface)
-    step = reference.step or frame  # the schema asks for it
+    # the schema has refused an implicit reference without a step
+    step = reference.step or frame
     every = round(frame / step)
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
         raise InputError(
@@ -304,7 +317,7 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
 
 
 def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
-    """Yield the cases of a map, each method at each of its points. Raises InputError."""
+    """Yield the cases of a map: each method at each point. Raises InputError."""
     for x, y, run in map_points(map):
         file = folder / run.file
         scene = load_scene(file, run.set, by_user=False)
@@ -321,14 +334,15 @@ def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
             case = Case(
                 scene=map.name, file=file, content=digest(file, scene), set=(*run.set, *method.set),
                 integrator=method.integrator, time_step=step, preset=preset, options=options,
-                error=method.error, max_iterations=method.max_iterations, label=method.label, timeout=study.timeout,
+                error=method.error, max_iterations=method.max_iterations, label=method.label,
                 point=MapPoint(map.name, method.label if x is None else x, y, run.recovers),
+                timeout=study.timeout,
             )  # fmt: skip
             yield with_tables(case, max(duration, step), 1, scene)
 
 
 def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
-    """Yield the points x, y of a map and the run of each; of a named case x is None and y the name."""
+    """Yield x, y and the run of each point of a map; for a named case x is None and y its name."""
     for case in map.case:
         length = case if case.steps or case.duration else map
         own = {"set": (*map.set, *case.set), "steps": length.steps, "duration": length.duration}
@@ -350,7 +364,7 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
-    """Yield the overrides of an axis, with the duration where the axis is the time step."""
+    """Yield the overrides of an axis; a time step as axis also sets the duration."""
     yield from axis.changes(value)
     if axis.key == "time.step":
         yield f"time.duration={max(length.seconds(value, value), value)!r}"

@@ -1,8 +1,8 @@
-"""Commands of the program without its start: a process that has imported it carries out one after another.
+"""Fork server of ``msmpetsc`` processes that execute several commands each, without start-up.
 
-A start takes 1.5 s of a core, which is most of a small case; a fork of the server 0.4 s, and a further command of the
-same process none. What such a run costs says less of the program than a run of its own does, so only cases are run
-like this of which no time is asked.
+Start-up (imports, MPI, PETSc) takes most of the time of a small case. A forked process has executed
+other commands before, so its times do not represent a run on its own. Therefore only cases whose
+times are not reported are run in this way.
 """
 
 import ctypes
@@ -20,20 +20,22 @@ from pathlib import Path
 from typing import NoReturn
 
 PROGRAM = "msmpetsc.cli.main"
-COLD = [sys.executable, "-m", "msmpetsc"]  # a command that starts it begins with this
+# first words of a command that starts the program in a new interpreter
+COLD = [sys.executable, "-m", "msmpetsc"]
 SERVER = multiprocessing.get_context("forkserver")
+# the modules that a run imports, except PETSc
 SERVER.set_forkserver_preload(
     [
-        "msmpetsc.study.preloaded", PROGRAM, "msmpetsc.cli.commands.run", "msmpetsc.app.resume", "msmpetsc.build",
-        "msmpetsc.geometry.readers",
+        "msmpetsc.study.preloaded", PROGRAM, "msmpetsc.cli.commands.run", "msmpetsc.app.resume",
+        "msmpetsc.build", "msmpetsc.geometry.readers",
     ]
-)  # fmt: skip  # all but PETSc
+)  # fmt: skip
 
 
 class Forked:
-    """A process in a session of its own that carries out commands; one that fails is its last.
+    """A forked process, leader of its own session, that executes commands until a command fails.
 
-    environment : all that it has; its folder is the current one
+    environment : all environment variables of the process; it starts in the current folder
     """
 
     def __init__(self, environment: Mapping[str, str]):
@@ -47,10 +49,11 @@ class Forked:
     def begin(
         self, arguments: Sequence[str], log: Path, errors: Path | None = None, last: bool = False
     ) -> None:
-        """Begin a command of ``msmpetsc``.
+        """Send a command of ``msmpetsc`` to the process and return at once.
 
-        log, errors : where its output goes, and its errors, if not there too
-        last        : no other will follow; so it may have options that PETSc reads at its start
+        log    : file to which standard output is appended
+        errors : file to which standard error is appended; ``log`` if None
+        last   : no command will follow, so PETSc may read options at its start
         """
         self._commands.send((list(arguments), (str(log), str(errors or log)), last))
 
@@ -60,20 +63,21 @@ class Forked:
             raise subprocess.TimeoutExpired("msmpetsc", timeout or 0.0)
         try:
             return int(self._commands.recv())
-        except EOFError:  # the command has ended its process
+        except EOFError:
+            # the command has ended its process
             self.process.join()
             return int(self.process.exitcode or 0)
 
     def poll(self) -> int | None:
-        """Return the exit status of the process; None while it lives."""
+        """Return the exit status of the process, or None while it runs."""
         return self.process.exitcode
 
     def kill(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
         self.process.kill()
 
     def close(self) -> None:
-        """Let the process end, which waits for a command."""
+        """Close the connection and wait until the process ends."""
         self._commands.close()
         self.process.join()
 
@@ -84,17 +88,18 @@ def _serve(commands: Connection, folder: str, environment: dict[str, str]) -> No
 
     from msmpetsc.solve.petsc.initialise import start_for_runs
 
-    gc.freeze()  # what was imported is not looked through again
+    # the collector then skips the objects of the imports
+    gc.freeze()
     status = 0
-    with suppress(EOFError):  # no more commands
+    # EOFError: the parent has closed the connection
+    with suppress(EOFError):
         while status == 0:
             arguments, files, last = commands.recv()
-            speak_into(files)
+            redirect_output(files)
             _forget()
             if not last:
-                start_for_runs(
-                    MPI.COMM_WORLD, []
-                )  # options are then lent to a run, and no later one has them
+                # PETSc starts without options, so that each command gets only its own
+                start_for_runs(MPI.COMM_WORLD, [])
             sys.argv = ["msmpetsc", *arguments]
             status = import_module(PROGRAM).main()
             sys.stdout.flush()
@@ -104,12 +109,13 @@ def _serve(commands: Connection, folder: str, environment: dict[str, str]) -> No
 
 
 def enter(folder: str, environment: Mapping[str, str]) -> None:
-    """Make of a fork of the server a process in a session of its own, with MPI started.
+    """Make a forked process leader of its own session, with its own environment, and start MPI.
 
-    environment : all that it has
+    environment : all environment variables of the process
     """
     os.setsid()
-    for number in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
+    # undo the handlers inherited from the fork server
+    for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
     os.chdir(folder)
     os.environ.clear()
@@ -119,8 +125,8 @@ def enter(folder: str, environment: Mapping[str, str]) -> None:
     MPI.Init()
 
 
-def speak_into(files: Iterable[str | Path]) -> None:
-    """Let standard output and error go to two files."""
+def redirect_output(files: Iterable[str | Path]) -> None:
+    """Append standard output and standard error to two files."""
     for stream, path in enumerate(files, 1):
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(file, stream)
@@ -128,7 +134,7 @@ def speak_into(files: Iterable[str | Path]) -> None:
 
 
 def leave(status: int) -> NoReturn:
-    """End such a process, its PETSc and its MPI."""
+    """Finalise PETSc and MPI, and exit with this status."""
     from mpi4py import MPI
 
     from msmpetsc.solve.petsc.initialise import finalise
@@ -139,7 +145,7 @@ def leave(status: int) -> NoReturn:
 
 
 def _forget() -> None:
-    """Collect the garbage of the command before, and let Linux count the most memory from now on."""
+    """Collect the garbage of the previous command, and reset Linux's record of the peak memory."""
     gc.collect()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

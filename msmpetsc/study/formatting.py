@@ -1,13 +1,14 @@
-"""Formatting of measured numbers: 34 ms, 1.2e-3, 9,897."""
+"""Formatting of measured numbers with digits, prefixes and units: 34 ms, 1.2e-3, 9,897."""
 
 from typing import Any
 
 PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
-GAP = "\N{NO-BREAK SPACE}"  # a unit stays with its number
+# between number and unit; so that no line breaks there
+GAP = "\N{NO-BREAK SPACE}"
 
 
 def prefixed(value: float, unit: str = "") -> str:
-    """Return a number to three digits with the prefix of its unit: 34100 Pa -> 34.1 kPa."""
+    """Return a number with three digits and a prefix to its unit: 34100, "Pa" -> 34.1 kPa."""
     power = int(f"{value:.2e}".partition("e")[2]) // 3 * 3
     power = min(max(power, min(PREFIXES)), max(PREFIXES))
     gap = GAP if unit else ""
@@ -15,23 +16,23 @@ def prefixed(value: float, unit: str = "") -> str:
 
 
 def seconds(value: float) -> str:
-    """Return a time with its prefix: 0.0341 -> 34.1 ms; no kiloseconds."""
+    """Return a time in seconds or smaller units: 0.0341 -> 34.1 ms, 5432.1 -> 5,430 s."""
     return prefixed(value, "s") if value < 999.5 else f"{float(f'{value:.3g}'):,.0f}{GAP}s"
 
 
 def error(value: float) -> str:
-    """Return a relative error: 0.00123 -> 1.2e-3, 0.001 -> 1e-3."""
+    """Return a relative error with two digits: 0.00123 -> 1.2e-3, 0.001 -> 1e-3."""
     mantissa, _, exponent = f"{value:.1e}".partition("e")
     return f"{mantissa.removesuffix('.0')}e{int(exponent)}"
 
 
 def count(value: float) -> str:
-    """Return a count: 9897 -> 9,897; a mean keeps one digit."""
+    """Return a count with thousands separated, 9897 -> 9,897; a mean keeps a decimal digit."""
     return f"{value:,.0f}" if value == int(value) else f"{value:,.1f}"
 
 
 def plain(value: float | str | None) -> str:
-    """Return an entry of the table with four digits; an empty text for None and NaN."""
+    """Return a table entry as text with four digits; "" for None and NaN."""
     if isinstance(value, str):
         return value
     if value is None or value != value:
@@ -39,11 +40,12 @@ def plain(value: float | str | None) -> str:
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e15 else f"{value:.4g}"
 
 
-TIMES = ("least", "greatest", "step", "substep", "seconds")  # beside the columns time_...
+# columns in seconds; names that begin with time_ need no entry
+TIMES = ("least", "greatest", "step", "substep", "seconds")
 
 
 def worded(column: str, value: Any) -> str:
-    """Return an entry formatted by the name of its column: an error, a time, memory, a count or a text."""
+    """Return an entry as text; the column's name decides between error, bytes, time and count."""
     if isinstance(value, str) or value is None or value != value:
         return plain(value)
     if column.endswith("error"):
@@ -56,6 +58,6 @@ def worded(column: str, value: Any) -> str:
 
 
 def entry(row: dict[str, Any], column: str) -> str:
-    """Return an entry of a row with the name of its column; empty where it has none."""
+    """Return "name value" of an entry of a row, "" if the entry is missing."""
     text = worded(column, row[column])
     return f"{column.replace('_', ' ')} {text}" if text else ""

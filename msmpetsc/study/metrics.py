@@ -1,4 +1,4 @@
-"""Metrics of a run: its costs, its errors against a reference, and its outcome."""
+"""Metrics of a run: its cost, its errors against a reference, and its outcome."""
 
 import json
 import warnings
@@ -17,9 +17,11 @@ from msmpetsc.results.comparison import common_times, compare_surfaces, refuse_d
 from msmpetsc.results.reader import Result
 from msmpetsc.study.table import Row
 
-COUNTED = ("iterations", "ksp_its", "products")  # of the steps; an older file lacks the last
+# sums per frame in a result file; files of older versions lack "products"
+COUNTED = ("iterations", "ksp_its", "products")
 
-MEANING = {  # of the outcomes of a run of a map, from the worst to the best
+# outcomes of a run of a map and their legend, from the worst to the best
+MEANING = {
     "crashed": "the program itself broke",
     "timeout": "took too long",
     "refused": "the program would not begin",
@@ -32,17 +34,21 @@ MEANING = {  # of the outcomes of a run of a map, from the worst to the best
     "ok": "none of these",
 }
 OUTCOMES = tuple(MEANING)
-STEP_FAILED, REFUSED = 3, 2  # exit statuses
-OWN_NAME = ("not finite", "energy", "refused")  # kinds of failure that are outcomes
-RECOVERED = 0.02  # shape error
-SLOW = 30  # iterations a step
+# exit statuses of msmpetsc
+STEP_FAILED, REFUSED = 3, 2
+# kinds of failure in the measure file that are outcomes under the same name
+NAMED_FAILURES = ("not finite", "energy", "refused")
+# largest shape error [-] of a body in its rest shape
+RECOVERED = 0.02
+# iterations per step above which a run is "slow"
+SLOW = 30
 
 
-# The measure file, which ``msmpetsc run --measure`` leaves
+# ---- the measure file, written by ``msmpetsc run --measure``
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return the contents of a measure file, empty if the run was killed before writing it."""
+    """Return the contents of a measure file, or {} if the run was killed before writing it."""
     try:
         return dict(json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
@@ -50,7 +56,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def costs(record: dict[str, Any]) -> Row:
-    """Return counts, times, memory, machine and versions of a measure file."""
+    """Return counts, times, memory, machine and versions from a measure file's contents."""
     names = ("cells", "nodes", "unknowns", "springs", "memory")
     row = {name: record.get(name) for name in names}
     for part in ("setup", "factor", "local", "ksp", "output"):
@@ -67,16 +73,18 @@ def costs(record: dict[str, Any]) -> Row:
     return row | {"machine": ", ".join(str(part) for part in parts if part), "versions": versions}
 
 
-def of_frames(result: Path, time_step: float) -> Row:
-    """Return metrics of a result; times and iterations are means after the first frame."""
+def frame_metrics(result: Path, time_step: float) -> Row:
+    """Return metrics of a result file; times and iterations are means per step after start-up."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
         shape = {"shape_error": shape_error(run, count - 1)} if count else {}
     if count < 2:
         return {"frames": count, "steps": 0} | shape
-    steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames
-    start = 2 if count > 2 else 1  # what is only done once shows in the first frame
+    # steps between consecutive frames
+    steps = np.rint(np.diff(series["time"]) / time_step).astype(int)
+    # frame 0 is the initial state; frame 1 contains work that is done only once
+    start = 2 if count > 2 else 1
     known = [name for name in ("wall_time", *COUNTED) if name in series]
     mean = {name: float(series[name][start:].sum() / steps[start - 1 :].sum()) for name in known}
     row = {"frames": count, "steps": int(steps.sum()), "time_frame": mean.pop("wall_time"), **mean}
@@ -85,7 +93,7 @@ def of_frames(result: Path, time_step: float) -> Row:
 
 
 def _soundness(series: dict[str, Floats]) -> Row:
-    """Return counts of failures, inverted cells at the end, and the energy left where no load acts."""
+    """Return counts of failures, final inverted cells, and, without loads, the energy left."""
     row: Row = {
         name: float(np.nansum(series[name][1:]))
         for name in ("substeps", "fallbacks", "energy_gained")
@@ -104,10 +112,11 @@ def _soundness(series: dict[str, Floats]) -> Row:
 
 
 def _errors(series: dict[str, Floats]) -> Row:
-    """Return root mean squares over the steps whose true error was measured, or over all."""
+    """Return rms errors over the steps whose true error was measured, or else over all steps."""
     estimated, true = series["step_error"][1:], series["true_error"][1:]
     where = np.isfinite(true) if np.isfinite(true).any() else ~np.isnan(estimated)
-    return {  # of a step with no minimum near the estimate is infinite: then there is none of the run
+    # without a minimum nearby a step's estimate is infinite: the run has no estimate
+    return {
         "estimated_error": None if np.isinf(estimated[where]).any() else _rms(estimated[where]),
         "true_error": _rms(true[where]),
         "energy_error": _rms(series["energy_error"][1:][where]),
@@ -119,10 +128,10 @@ def _rms(values: Floats) -> float | None:
     return float(np.sqrt((values**2).mean())) if len(values) else None
 
 
-def together(runs: Sequence[Row]) -> Row:
-    """Return one row for all repeats: medians of times, and the range of the time of a step.
+def merge_repeats(runs: Sequence[Row]) -> Row:
+    """Return a row for all repeats: medians of times, range of the time of a step, least memory.
 
-    Memory is that of the leanest: the first run may have measured errors beside its work.
+    The least memory counts because the first run may store data for measuring true errors.
     """
     row = dict(runs[0])
     for name in row:
@@ -137,22 +146,22 @@ def together(runs: Sequence[Row]) -> Row:
     return row
 
 
-# How a run of a map went, in a word
+# ---- outcome of a run of a map
 
 
 def outcome(status: int | None, kind: str, row: Row, recovers: bool) -> str:
-    """Return the worst outcome of a run.
+    """Return the worst outcome of a run, a key of ``MEANING``.
 
-    status   : exit status, None where time ran out
-    kind     : of the failure that the run records, "" for none
-    recovers : whether it should have ended in its rest shape
+    status   : exit status, None after a timeout
+    kind     : kind of failure in the measure file, "" if there is none
+    recovers : whether the body should end in its rest shape
     """
     if status is None:
         return "timeout"
     if status == REFUSED:
         return "refused"
     if status == STEP_FAILED:
-        return kind if kind in OWN_NAME else "diverged"
+        return kind if kind in NAMED_FAILURES else "diverged"
     if status != 0 or not row.get("frames"):
         return "crashed"
     shape = row.get("shape_error")
@@ -162,23 +171,24 @@ def outcome(status: int | None, kind: str, row: Row, recovers: bool) -> str:
         return "not recovered"
     if (row.get("inverted") or 0) > 0:
         return "inverted"
-    solved = row.get("integrator") != "verlet"  # whose iterations are substeps
+    # a verlet run reports substeps in place of iterations
+    solved = row.get("integrator") != "verlet"
     return "slow" if solved and (row.get("iterations") or 0) > SLOW else "ok"
 
 
 def counted(outcomes: Iterable[Any]) -> str:
-    """Return the number of each outcome, best first: 20 ok, 3 slow."""
+    """Return the number of runs with each outcome, best first: 20 ok, 3 slow."""
     counts = Counter(outcomes)
     return ", ".join(f"{counts[name]} {name}" for name in reversed(OUTCOMES) if counts[name])
 
 
-# Distances of motions: from the rest shape, and from the true motion
+# ---- distances from the rest shape and from the reference motion
 
 
 def shape_error(run: Result, frame: int) -> float | None:
-    """Return the distance of a frame from the rest shape; None where a position is not finite.
+    """Return the largest distance of any body from its rest shape in a frame [-].
 
-    Of several bodies it is that of the one that is farthest from its shape.
+    Returns None if a position is not finite.
     """
     position = run.frames.position[frame]
     if not np.isfinite(position).all():
@@ -189,36 +199,37 @@ def shape_error(run: Result, frame: int) -> float | None:
 
 
 def distance_of_shapes(x: Floats, rest: Floats, mass: Floats) -> float:
-    """Return the distance of x (n, 3) from ``rest`` (n, 3) after the best rigid motion, over the longest side.
+    """Return the distance of x (n, 3) from ``rest`` (n, 3) after the best rigid motion [-].
 
-        min over R, c of sqrt( sum_i m_i |x_i - R rest_i - c|^2 / sum_i m_i ) / side    [-]
+        min over R, c of sqrt( sum_i m_i |x_i - R rest_i - c|^2 / sum_i m_i ) / side
 
-    R is a rotation: a mirrored body is not in its rest shape. (Kabsch 1976, as scipy has it.)
+    R is a rotation without reflection, so that a mirrored body has a distance. ``side`` is the
+    longest side of the rest shape's bounding box. Source: Kabsch 1976, as implemented by scipy.
     """
     side = np.ptp(rest, axis=0).max()
-    if side == 0:  # one node
+    # a single node has no shape
+    if side == 0:
         return 0.0
     x, rest = (points - mass @ points / mass.sum() for points in (x, rest))
-    size = max(np.abs(x).max(), side)  # what has flown apart must not overflow
+    # scaled, so that the squares of a diverged motion do not overflow
+    size = max(np.abs(x).max(), side)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", UserWarning
-        )  # of a flat body several rotations are the best: any will do
+        # scipy warns if the best rotation is not unique, as for a flat body
+        warnings.simplefilter("ignore", UserWarning)
         rotation, _ = Rotation.align_vectors(x / size, rest / size, weights=mass / mass.sum())
-    squared = ((x - rotation.apply(rest)) ** 2).sum(
-        axis=1
-    ) / size**2  # scipy's own figure ends at 1e-8
+    # computed here, because scipy's own residual is accurate to 1e-8 only
+    squared = ((x - rotation.apply(rest)) ** 2).sum(axis=1) / size**2
     return float(np.sqrt(mass @ squared / mass.sum()) * size / side)
 
 
 def trajectory_error(result: Path, reference: Path) -> float:
-    """Return the distance of a run from a reference run, relative to how far the reference has moved [-].
+    """Return the distance of a run from a reference run, relative to the reference's motion [-].
 
         sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
 
-    Sums over the times that both files have; x_ref stands for the limit of the time step to zero. A
-    body that flies as a whole counts its flight as motion. Raises InputError if the files have
-    fewer than two times in common or different lattices, or nothing moves.
+    The sums run over the times that both files have. x_ref stands for the limit of the time step to
+    zero. Rigid motion of the reference counts as motion. Raises InputError if the files have fewer
+    than two common times or different lattices, or if nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         refuse_different_lattices(run, true)
@@ -239,12 +250,12 @@ def trajectory_error(result: Path, reference: Path) -> float:
 
 
 def surface_error(result: Path, reference: Path) -> float:
-    """Return the distance of a run's surface from that of a reference run, of any lattice of the same mesh [-].
+    """Return the distance of a run's surface from a reference run's surface [-].
 
         sqrt( mean over times and area of |s - s_ref|^2 ) / greatest |s_ref - s_rest|
 
-    The reference stands for the body itself. Raises InputError if the meshes differ, a surface was not stored, there is
-    no common time, or nothing moves.
+    The lattices may differ, the mesh may not. Raises InputError if the meshes differ, a file has no
+    surface, the files have no common time, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         _, mean = compare_surfaces(run, true).fields

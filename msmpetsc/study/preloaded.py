@@ -1,8 +1,9 @@
-"""The first import of the fork server, which keeps MPI from starting in the server itself."""
+"""First import of the fork server: keep MPI from starting in the server, and prepare numba."""
 
 import mpi4py
 from numba.core.registry import cpu_target
 
 mpi4py.rc.initialize = False
-cpu_target.typing_context.refresh()  # what each run's first kernel would wait for
+# otherwise each forked process repeats this before its first kernel
+cpu_target.typing_context.refresh()
 cpu_target.target_context.refresh()

@@ -1,4 +1,4 @@
-"""Processes with all their children: run to the end or to a time limit, with the last error of their log."""
+"""Child processes with time limits, ended with their descendants; the last error of their log."""
 
 import os
 import signal
@@ -14,37 +14,39 @@ import psutil
 from msmpetsc.app.ranks import environment, last_error
 from msmpetsc.study.forkserver import COLD, Forked
 
-GRACE = 3.0  # [s] between the request to end and the end
+# time [s] between SIGTERM and SIGKILL
+GRACE = 3.0
 
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a process."""
+    """The end of a process: exit status, None after a timeout; reason, "" for status 0."""
 
-    status: int | None  # exit status, None where time ran out
-    reason: str  # the last line of trouble, "" if status is 0
+    status: int | None
+    reason: str
 
     @property
     def word(self) -> str:
-        """Whether it ended well: ok, failed or timeout."""
+        """The status column of table.csv: ok, failed or timeout."""
         if not self.reason:
             return "ok"
         return "timeout" if self.status is None else "failed"
 
 
 class Processes:
-    """The running processes; once ``stopped``, no new one is started."""
+    """The child processes that run at present; after ``close`` no process is started."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes] | Forked] = set()
-        self._idle: list[Forked] = []  # that wait for another command
+        # forked processes that wait for another command
+        self._idle: list[Forked] = []
         self.stopped = False
         self._lock = Lock()
 
     def run(self, command: Sequence[str], log: Path, timeout: float, warm: bool = False) -> Ended:
-        """Run to the end, or for ``timeout`` seconds; ``log`` gets what it says.
+        """Run a command to its end, or for ``timeout`` seconds, with all output in ``log``.
 
-        warm : spare it the start of the program, if it is one
+        warm : run in a forked process without start-up, if the command starts ``msmpetsc``
         """
         process = self._start(command, log, warm and list(command[:3]) == COLD)
         if process is None:
@@ -64,9 +66,11 @@ class Processes:
         return Ended(status, reason)
 
     def close(self) -> None:
-        """End all running processes."""
+        """End all running processes and start no more."""
         with self._lock:
-            self.stopped, running, idle = True, list(self._running), self._idle
+            self.stopped = True
+            running = list(self._running)
+            idle = self._idle
             self._idle = []
         for process in running:
             end(process)
@@ -97,7 +101,7 @@ class Processes:
             return process
 
     def _put_away(self, process: subprocess.Popen[bytes] | Forked, status: int | None) -> None:
-        """Keep a process whose command went well for another one; end any other, with what it may have left running."""
+        """Keep a forked process whose command succeeded for reuse; end any other process."""
         serves = (
             isinstance(process, Forked)
             and status == 0
@@ -113,14 +117,19 @@ class Processes:
 
 
 def too_long(timeout: float) -> str:
+    """Return the reason of a run that reached its time limit."""
     return f"took longer than {timeout:g} s"
 
 
 def end(process: subprocess.Popen[bytes] | Forked) -> None:
-    """End a process and all of its session: mpiexec gives each rank a process group of its own."""
+    """End a process and all processes of its session.
+
+    A process group is not enough, because mpiexec gives each rank its own group.
+    """
     if process.poll() is None:
         with suppress(ProcessLookupError):
-            os.kill(process.pid, signal.SIGTERM)  # mpiexec tells its ranks
+            # mpiexec passes SIGTERM on to its ranks
+            os.kill(process.pid, signal.SIGTERM)
         with suppress(subprocess.TimeoutExpired):
             process.wait(GRACE)
     for pid in session(process.pid):
@@ -131,6 +140,7 @@ def end(process: subprocess.Popen[bytes] | Forked) -> None:
 
 
 def session(leader: int) -> list[int]:
+    """Return the ids of the processes in the session of this leader."""
     members = []
     for pid in psutil.pids():
         with suppress(OSError):

@@ -1,6 +1,6 @@
-"""The report of a study: one page with charts, all numbers and the commands that repeat them.
+"""HTML report of a study: charts, all numbers, and the commands that repeat the runs.
 
-What stands where is in report.html.j2; this file says what it is.
+The layout is in report.html.j2; this module computes the values that the template shows.
 """
 
 import tomllib
@@ -30,17 +30,24 @@ from msmpetsc.study.table import (
     timed,
 )
 
-FIRST = ["scene", "label", "status"]  # columns of the whole table; the last is the command
+# leading columns of the table of all cases
+FIRST = ["scene", "label", "status"]
+# columns that the report shows above its charts
 ABOVE = ["study", "machine", "versions"]
-OF_FAILURES = ["scene", "label", "time_step", "error", "status", "reason", "command"]
+# columns of the table of failed cases
+FAILURE_COLUMNS = ["scene", "label", "time_step", "error", "status", "reason", "command"]
 
 
 def write_report(folder: Path) -> Path:
-    """Draw a folder's table as PNG files and report.html; return its path. Raises InputError."""
+    """Write the charts of a folder's table.csv as PNG files and report.html; return its path.
+
+    Raises InputError if the table is missing or not readable.
+    """
     table = read_table(folder)
     file = folder / "study.toml"
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    styles, sweeps = curve_styles(table["label"]), swept(table)
+    styles = curve_styles(table["label"])
+    sweeps = swept(table)
     charts = [
         *stability_charts(table, study),
         *size_charts(sweeps, styles),
@@ -57,7 +64,7 @@ def write_report(folder: Path) -> Path:
 
 
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
-    """Return the whole page, which is self-contained."""
+    """Return the report as a self-contained HTML page."""
     environment = Environment(
         autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True
     )
@@ -66,14 +73,14 @@ def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
     tables = {
         "table": table[[*FIRST, *filled, "command"]],
-        "failures": failed(swept(table))[OF_FAILURES],
+        "failures": failed(swept(table))[FAILURE_COLUMNS],
     }
     template = environment.get_template("report.html.j2")
     return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
 
 
 def facts(table: DataFrame) -> dict[str, Any]:
-    """Return machine, versions and how many cases there are."""
+    """Return the template's values: machines, versions, numbers of cases and of repeats."""
     plain = swept(table)
     maps = {
         name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()
@@ -84,9 +91,8 @@ def facts(table: DataFrame) -> dict[str, Any]:
     }
     counts = {"cases": len(plain), "failed": len(failed(plain)), "empty": table.empty}
     rows = timed(plain)
-    often = " or ".join(
-        map(str, sorted(set(rows["repeats"].fillna(1).astype(int))))
-    )  # nothing without cases
+    # empty if no case succeeded
+    often = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))
     note = often and f"{often}. {ONCE_NOTE}"
     if not rows.empty and is_repeated(rows):
         note = f"{often}: times are medians, ranges and whiskers from the least to the greatest"
@@ -94,7 +100,7 @@ def facts(table: DataFrame) -> dict[str, Any]:
 
 
 def html(table: DataFrame) -> Markup:
-    """Return a table as HTML that is sorted by a click on a heading."""
+    """Return a table as HTML; a click on a column's heading sorts it."""
     with option_context("display.max_colwidth", None):
         return Markup(
             table.map(formatting.plain).to_html(index=False, border=0, classes="sortable")

@@ -1,4 +1,4 @@
-"""The study runner: runs each case and writes the table after each."""
+"""Study runner: run the cases, compare them with their references, and keep the table current."""
 
 import os
 import shutil
@@ -18,36 +18,46 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
 from msmpetsc.study.metrics import (
     costs,
-    of_frames,
+    frame_metrics,
+    merge_repeats,
     outcome,
     read_record,
     surface_error,
-    together,
     trajectory_error,
 )
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, records, require_extra, write_table
 
-PARTS = "parts"  # folder of the parts' folders
+# folder of the parts' folders
+PARTS = "parts"
 
 
 @dataclass
 class Bench:
-    """Runs cases in a folder, which keeps the results of references only."""
+    """Runner of cases in a folder, which keeps the result files of references.
+
+    study  : name of the study, a column of the table
+    warm   : run every case without start-up of the program; points of maps always do, because their
+             times are not reported
+    _locks : a lock for each reference, by its id
+    """
 
     folder: Path
     processes: Processes
     study: str = ""
-    warm: bool = False  # spare each the start of the program; so it is of points of maps, of which no time is asked
-    _locks: dict[str, Lock] = field(default_factory=dict)  # by reference
+    warm: bool = False
+    _locks: dict[str, Lock] = field(default_factory=dict)
 
     def result_of(self, case: Case) -> Path:
-        """Return the path of the result of a case."""
+        """Return the path of a case's result file."""
         return self.folder / "runs" / f"{case.id}.h5"
 
     def measure(self, case: Case, keep: bool = False) -> Row:
-        """Run a case with its repeats; return its row, with the reason if it failed."""
+        """Run a case with its repeats; return its row of the table, with the reason of a failure.
+
+        keep : keep the result file, unless the run fails
+        """
         runs: list[Row] = []
         path = self.result_of(case)
         known = case.columns | {"study": self.study, "command": shown_command(case)}
@@ -67,7 +77,7 @@ class Bench:
             if ended.reason:
                 break
             why = why or problem
-        row = known | together(runs) | {"status": ended.word, "reason": ended.reason or why}
+        row = known | merge_repeats(runs) | {"status": ended.word, "reason": ended.reason or why}
         if case.point:
             kind = (record.get("failure") or {}).get("kind", "")
             row["outcome"] = outcome(ended.status, kind, row, case.point.recovers)
@@ -82,7 +92,7 @@ class Bench:
         return self.processes.run(words, path.with_suffix(".log"), case.timeout, warm)
 
     def _reference(self, case: Case) -> tuple[Path | None, str]:
-        """Return the result of the reference of a case, run if need be, or the reason why there is none."""
+        """Return the result of a case's reference, run on first use; or None and the reason."""
         if case.reference is None:
             return None, ""
         path = self.folder / "references" / f"{case.reference.id}.h5"
@@ -102,19 +112,20 @@ class Bench:
 
 
 def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
-    """Return the metrics of a run, and the reason why some are missing."""
+    """Return the metrics of a run, and the reason if some are missing."""
     row = costs(record)
     try:
-        row |= of_frames(path, case.time_step)
+        row |= frame_metrics(path, case.time_step)
     except (OSError, ValueError, InputError) as error:
         return row, f"no figures: {error}"
     if case.integrator == "verlet":
-        row["estimated_error"] = None  # nothing is solved
+        # verlet solves no system, so there is no estimate
+        row["estimated_error"] = None
     return row, ""
 
 
 def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
-    """Return the error of a run against its reference, by its column, or why there is none."""
+    """Return the error of a run against its reference as a column, or {} and the reason."""
     name, measure = (
         ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
     )
@@ -125,14 +136,14 @@ def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
 
 
 def _remove_files(path: Path, log: bool) -> None:
-    """Remove the files of a run, and its log if ``log``."""
+    """Remove the files of a run, including its log if ``log`` is True."""
     for suffix in (".h5", ".xdmf", ".json", *((".log",) if log else ())):
         path.with_suffix(suffix).unlink(missing_ok=True)
 
 
 @dataclass
 class StudyResults:
-    """The rows of a study so far, written in the order of its cases."""
+    """The rows of a study that are known, written to table.csv in the order of its cases."""
 
     folder: Path
     order: Sequence[str]
@@ -140,29 +151,31 @@ class StudyResults:
     _lock: Lock = field(default_factory=Lock)
 
     def add(self, row: Row) -> None:
-        """Add the row of a case and write all, of several threads one after the other."""
+        """Add the row of a case and write the table; safe to call from several threads."""
         with self._lock:
             self.rows[row["case"]] = row
             self.write()
 
     def write(self) -> None:
-        """Write the table, replaced whole."""
+        """Replace table.csv by the present rows."""
         write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
 
 
 @dataclass(frozen=True)
 class StudyPart:
-    """A part of a study: consecutive cases, ``index`` of ``count`` from 1."""
+    """Part ``index`` of ``count`` parts of a study's cases, counted from 1."""
 
     index: int
     count: int
 
     def of(self, cases: Sequence[str]) -> Sequence[str]:
+        """Return the consecutive cases of this part."""
         return cases[
             len(cases) * (self.index - 1) // self.count : len(cases) * self.index // self.count
         ]
 
     def folder(self, study: Path) -> Path:
+        """Return the folder of this part's table and results."""
         return study / PARTS / f"{self.index}-of-{self.count}"
 
 
@@ -175,11 +188,15 @@ def run_study(
     restart: bool = False,
     part: StudyPart | None = None,
 ) -> list[Row]:
-    """Run the cases of a study file that are not done, ``jobs`` at a time; return all rows.
+    """Run the cases of a study file that are not done, and return the rows of all cases.
 
-    The folder gets table.csv, study.toml, references/. Cases that are done and still in the
-    file are kept, those of its parts too; ``restart`` forgets them. With a ``part`` only that is run, in a folder of
-    its own, and only its rows are returned. Raises InputError before anything is run.
+    full    : include sweeps, scenes and maps that are marked ``full``
+    jobs    : number of cases at a time; the study file's if None
+    restart : discard the rows and references of earlier runs
+    part    : run and return only the cases of this part, in a folder of its own
+
+    ``folder`` gets table.csv, study.toml and references/. Rows of earlier runs and of parts are
+    kept if their cases are still in the file. Raises InputError before the first run.
     """
     require_extra()
     study = load_study(path)
@@ -202,7 +219,7 @@ def run_study(
 
 
 def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case, bool]]:
-    """Return the cases of a study file and whether each is done, without running any."""
+    """Return each case of a study file and whether it is done, without running any."""
     require_extra()
     every, wanted = _cases(load_study(path), path, full)
     rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
@@ -210,7 +227,7 @@ def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case,
 
 
 def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Sequence[str]]:
-    """Return all cases by their id, and the ids of those to run."""
+    """Return all cases by their id, and the ids of the cases to run."""
     every = {case.id: case for case in study_cases(study, path.parent, True)}
     return every, [case.id for case in study_cases(study, path.parent, full)]
 
@@ -218,26 +235,28 @@ def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Seque
 def _carry_out(
     bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int
 ) -> None:
-    """Run cases and add their results, with a progress bar that begins at ``done``."""
+    """Run cases and add their rows, with a progress bar that starts at ``done``."""
     bar = tqdm(total=done + len(todo), initial=done, unit="case", dynamic_ncols=True, disable=None)
     pool = ThreadPoolExecutor(jobs)
     try:
         with bar:
-            futures = [pool.submit(_carry_out_one, bench, case, results) for case in todo]
+            futures = [pool.submit(_run_and_add, bench, case, results) for case in todo]
             for count, future in enumerate(as_completed(futures), done + 1):
                 bar.write(
                     f"case {count}/{bar.total}  {described(future.result())}", file=sys.stderr
                 )
                 bar.update()
-    finally:  # what ends this early ends the runs under way
+    finally:
+        # after an exception or an interrupt runs may be in progress
         bench.processes.close()
         pool.shutdown(cancel_futures=True)
-        with suppress(OSError):  # logs of cases that failed are in it
+        # the folder is not empty if a failed case has left its log
+        with suppress(OSError):
             (bench.folder / "runs").rmdir()
 
 
-def _carry_out_one(bench: Bench, case: Case, results: StudyResults) -> Row:
-    """Run a case and add its row, so that its row is in the file when the next one begins."""
+def _run_and_add(bench: Bench, case: Case, results: StudyResults) -> Row:
+    """Run a case and write its row before the thread takes its next case."""
     row = bench.measure(case)
     if not bench.processes.stopped:
         results.add(row)
@@ -245,19 +264,20 @@ def _carry_out_one(bench: Bench, case: Case, results: StudyResults) -> Row:
 
 
 def described(row: Row) -> str:
-    """Return a line with the name of a case and its outcome."""
+    """Return a line of progress: a case's name and its outcome."""
     if row.get("map"):
         return f"{row['map']} {row['label']} at {row['x']}, {row['y']}: {row['outcome']}"
     return f"{row['scene']} {row['label']}: {row['status']} {row['reason']}".rstrip()
 
 
-# What earlier runs left
+# ---- results of earlier runs
 
 
 def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
-    """Return the results of these cases in earlier runs, under their present labels, for the first folder.
+    """Return the rows of these cases from earlier runs, with their present labels.
 
-    Of a case in several of them the first row counts that need not be run again.
+    If several folders have a row of a case, the first row that is done is taken. The results belong
+    to the first folder.
     """
     results = StudyResults(folders[0], list(by_id))
     for folder in dict.fromkeys(folders):
@@ -280,7 +300,7 @@ def _earlier_rows(folder: Path) -> list[Row]:
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
-    """Return whether a case need not be run; one that timed out is run again with a longer limit."""
+    """Return whether a case has a valid row; a timeout is valid only under the same time limit."""
     row = rows.get(case.id)
     return row is not None and not (
         row["status"] == "timeout" and row["reason"] != too_long(case.timeout)

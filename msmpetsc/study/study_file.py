@@ -1,4 +1,8 @@
-"""The schema of a study file (TOML): its scenes, sweeps, methods and maps."""
+"""The schema of a study file (TOML): its scenes, sweeps, methods and maps.
+
+Paths are relative to the study file; times are in seconds. In every table ``set`` holds overrides
+of scenes, ``error`` is a target of the relative step error, and ``full`` means only with --full.
+"""
 
 import shlex
 from collections.abc import Iterable
@@ -30,51 +34,56 @@ from msmpetsc.solve.petsc.words import unsafe_word
 from msmpetsc.solve.presets import preset_names
 
 Error = Annotated[float, Field(gt=0, lt=1)]
-Override = Annotated[str, Field(min_length=3)]  # of the scene, as of --set: "key.path=value"
+# an override of the scene as in --set: "key.path=value"
+Override = Annotated[str, Field(min_length=3)]
 Name = Annotated[str, Field(min_length=1)]
 
 
-def _words(options: str) -> str:
+def _solver_options(options: str) -> str:
     try:
         refused = unsafe_word(shlex.split(options))
     except ValueError as error:
-        raise rule(f"cannot be taken apart: {str(error).lower()}") from None
+        raise rule(f"cannot be split into words: {str(error).lower()}") from None
     if refused is not None:
-        raise rule(
-            f"has {refused!r}: only options of solvers, and plain values, may stand in a file"
-        )
+        raise rule(f"has {refused!r}: a file may hold only solver options with plain values")
     return options
 
 
-def _differ(names: list[str], what: str) -> None:
+def _check_unique(names: list[str], kind: str) -> None:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise rule(f"must not have two {what} of the name {twice!r}")
+        raise rule(f"must not have two {kind} named {twice!r}")
 
 
-def _known(wanted: Iterable[str], what: str, names: list[str]) -> None:
+def _check_known(wanted: Iterable[str], kind: str, names: list[str]) -> None:
     unknown = next((name for name in wanted if name not in names), None)
     if unknown is not None:
-        raise rule(f"names a {what} {unknown!r} that is not there{did_you_mean(unknown, names)}")
+        raise rule(f"names an unknown {kind} {unknown!r}{did_you_mean(unknown, names)}")
 
 
-Options = Annotated[str, AfterValidator(_words)]
+Options = Annotated[str, AfterValidator(_solver_options)]
 
 
 class ReferenceRun(Table):
-    """The reference run of a scene, with steps so short that it stands for the true motion.
+    """The reference run of a scene, whose short steps stand for the true motion.
 
-    With cells of its own, many more than the cases have, it stands for the body itself, and surfaces are compared.
+    With its own ``cells``, many more than the cases have, the run stands for the continuous body,
+    and surfaces are compared.
+
+    step    : time step [s] of implicit integrators
+    substep : upper limit [s] of verlet's substeps; the stability limit if absent
+    cells   : the case's own lattice if absent
+    law     : material law; the case's own if absent
     """
 
     integrator: IntegratorName = "verlet"
-    step: Positive | None = None  # [s] of what is not verlet
-    substep: Positive | None = None  # [s] of verlet, the longest; the stability limit's if absent
-    cells: Count | None = None  # the case's own lattice if absent
-    law: Name | None = None  # of the material; the case's own if absent
+    step: Positive | None = None
+    substep: Positive | None = None
+    cells: Count | None = None
+    law: Name | None = None
     preset: PresetName = "newton"
-    error: Error = 1e-6  # of a step, relative
-    timeout: Positive = 600.0  # [s]
+    error: Error = 1e-6
+    timeout: Positive = 600.0
 
     @model_validator(mode="after")
     def _fits_together(self) -> "ReferenceRun":
@@ -84,7 +93,7 @@ class ReferenceRun(Table):
 
 
 class Length(Table):
-    """The length of a run: time steps, or simulated time [s]; the scene's if both are absent."""
+    """The length of a run: a number of steps, or a simulated time [s]; by default the scene's."""
 
     steps: Count | None = None
     duration: Positive | None = None
@@ -97,42 +106,54 @@ class Length(Table):
         return duration
 
     def seconds(self, step: float, usual: float) -> float:
-        """Return the simulated time [s] of steps so long; the usual one where neither is given."""
+        """Return the simulated time [s] for a step [s]; ``usual`` if no length is given."""
         return self.steps * step if self.steps else self.duration or usual
 
 
 class StudyScene(Length):
-    """A scene of the study, with its length, reference and measurements."""
+    """A scene of the study, with its length, reference and measurements.
+
+    frame      : time [s] between comparisons with the reference; the scene's time step if absent
+    true_error : number of steps between measurements of the true step error
+    """
 
     name: Name
-    file: FileName  # a path from the study file
+    file: FileName
     set: ListOf[Override] = ()
-    frame: Positive | None = (
-        None  # [s] between moments compared with the reference; the scene's time step if absent
-    )
+    frame: Positive | None = None
     reference: ReferenceRun | None = None
-    true_error: Count | None = None  # every so many steps the true step error is measured
-    full: bool = False  # only with --full
+    true_error: Count | None = None
+    full: bool = False
 
 
 class Sweep(Table):
-    """The product of lists of options, run for every scene; an empty list stands for the scene's own value."""
+    """The product of lists of options for every scene; an empty list means the scene's value.
 
-    scenes: ListOf[str] = ()  # names; all if absent
+    scenes         : names of scenes; all scenes if empty
+    options        : PETSc options, each set a string: "-pc_type icc"
+    laws           : material laws of cases and references; labels of curves name them
+    time_steps     : [s]; for verlet the time between frames
+    substeps       : upper limits [s] of verlet's substeps; the stability limit if empty
+    max_iterations : iteration budgets, run in addition to ``errors``
+    steps          : number of steps in place of the scene's
+    label          : label of curves in place of preset and options
+    """
+
+    scenes: ListOf[str] = ()
     integrators: ListOf[IntegratorName] = ("implicit-euler",)
     presets: ListOf[PresetName] = ()
-    options: ListOf[Options] = ("",)  # of PETSc, each one string: "-pc_type icc"
-    laws: ListOf[Name] = ()  # of the material and of references; curves are called by them
+    options: ListOf[Options] = ("",)
+    laws: ListOf[Name] = ()
     cells: ListOf[Count] = ()
-    time_steps: ListOf[Positive] = ()  # [s]; of verlet, what is between two frames
-    substeps: ListOf[Positive] = ()  # [s] of verlet, the longest; the stability limit's if absent
-    errors: ListOf[Error] = ()  # of a step, aimed at
-    max_iterations: ListOf[Count] = ()  # budgets, beside those errors
+    time_steps: ListOf[Positive] = ()
+    substeps: ListOf[Positive] = ()
+    errors: ListOf[Error] = ()
+    max_iterations: ListOf[Count] = ()
     ranks: ListOf[Count] = (1,)
-    steps: Count | None = None  # in place of the scene's
-    set: ListOf[Override] = ()  # further changes of the scenes
-    label: str = ""  # what curves are called, in place of preset and options
-    full: bool = False  # only with --full
+    steps: Count | None = None
+    set: ListOf[Override] = ()
+    label: str = ""
+    full: bool = False
 
     @model_validator(mode="after")
     def _has_cases(self) -> "Sweep":
@@ -142,74 +163,95 @@ class Sweep(Table):
 
 
 class Method(Table):
-    """A way to step and solve the scenes of maps; verlet has no use for a preset."""
+    """An integrator with its solver settings, run at every point of the maps.
+
+    Verlet does not use the preset. Without an ``error`` the preset's holds.
+    """
 
     label: Name
     integrator: IntegratorName = "implicit-euler"
     preset: PresetName = "newton"
-    error: Error | None = None  # of a step, aimed at; the preset's if absent
+    error: Error | None = None
     max_iterations: Count | None = None
     options: Options = ""
-    set: ListOf[Override] = ()  # changes of every scene, as to another law of the material
+    set: ListOf[Override] = ()
 
 
 class Axis(Table):
-    """An axis of a map: a key of the scene, or a template of overrides that contain {value}."""
+    """An axis of a map: a key of the scene, or a template of overrides that contain {value}.
+
+    key      : "material.young_modulus"
+    template : "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"
+    values   : in the order of the axis
+    unit     : unit of the labels; "%" shows 0.2 as 20%, "s" shows 0.01 as 10 ms
+    """
 
     one_of: ClassVar[tuple[str, ...]] = ("key", "template")
-    name: Name  # for the reader
-    key: str | None = Field(default=None, min_length=1)  # what is set: "material.young_modulus"
-    template: ListOf[Override] = ()  # or: "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"
-    values: ListOf[float] = Field(min_length=1)  # in the order of the axis
-    unit: str = ""  # for the reader; "%" shows 0.2 as 20% and "s" as 10 ms
+    name: Name
+    key: str | None = Field(default=None, min_length=1)
+    template: ListOf[Override] = ()
+    values: ListOf[float] = Field(min_length=1)
+    unit: str = ""
 
     def changes(self, value: float) -> tuple[str, ...]:
-        """Return overrides of the scene at this value."""
+        """Return the overrides of the scene for this value."""
         templates = (f"{self.key}={{value}}",) if self.key else self.template
         return tuple(text.replace("{value}", repr(value)) for text in templates)
 
 
 class MapCase(Length):
-    """A named case of a map whose columns are the methods."""
+    """A named case, a row of a map whose columns are the methods.
+
+    recovers : whether the body should end in its rest shape
+    options  : PETSc options of all methods except verlet
+    """
 
     name: Name
-    file: FileName  # a path from the study file
+    file: FileName
     set: ListOf[Override] = ()
-    recovers: bool = False  # the body should be in its rest shape at the end
-    options: Options = ""  # of PETSc, for all methods that solve
+    recovers: bool = False
+    options: Options = ""
 
 
 class Map(Length):
-    """A stability map of a scene over two axes, or of named cases."""
+    """A stability map of a scene over two axes, or of named cases.
+
+    methods : labels of methods; all methods if empty
+    x, y    : axes from left to right and from bottom to top
+    """
 
     one_of: ClassVar[tuple[str, ...]] = ("file", "case")
     name: Name
-    title: str = ""  # for the reader; the name if absent
-    file: FileName | None = None  # a path from the study file
+    title: str = ""
+    file: FileName | None = None
     set: ListOf[Override] = ()
-    methods: ListOf[str] = ()  # labels; all if absent
-    x: Axis | None = None  # from left to right
-    y: Axis | None = None  # from bottom to top
+    methods: ListOf[str] = ()
+    x: Axis | None = None
+    y: Axis | None = None
     case: ListOf[MapCase] = ()
-    full: bool = False  # only with --full
+    full: bool = False
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Map":
         if self.file and not (self.x and self.y):
             raise rule("needs x and y beside file")
         if self.case and (self.x or self.y):
-            raise rule("has cases: x and y are of no use")
-        _differ([case.name for case in self.case], "cases")
+            raise rule("has named cases, so it must not have x and y")
+        _check_unique([case.name for case in self.case], "cases")
         return self
 
 
 class Study(Table):
-    """A study file."""
+    """A study file: scenes with sweeps, or methods with maps.
 
-    title: str = ""  # for the reader
-    repeats: Count = 1  # of each case, of which medians are taken
-    timeout: Positive = 300.0  # [s] of a run
-    jobs: Count = 1  # cases at a time, unless --jobs says otherwise
+    repeats : runs of each case; the report gives medians of their times
+    jobs    : cases at a time, unless --jobs is given
+    """
+
+    title: str = ""
+    repeats: Count = 1
+    timeout: Positive = 300.0
+    jobs: Count = 1
     scene: ListOf[StudyScene] = ()
     sweep: ListOf[Sweep] = ()
     method: ListOf[Method] = ()
@@ -218,21 +260,21 @@ class Study(Table):
     @model_validator(mode="after")
     def _fits_together(self) -> "Study":
         if not self.map and not (self.scene and self.sweep):
-            raise rule("needs scene and sweep, or map: one of them is required")
+            raise rule("needs tables scene and sweep, or map: one of them is required")
         if self.map and not self.method:
-            raise rule("needs methods for its maps: [[method]]")
+            raise rule("has maps, so it needs at least one table [[method]]")
         scenes = [scene.name for scene in self.scene]
         methods = [method.label for method in self.method]
-        _differ(scenes, "scenes")
-        _differ(methods, "methods")
-        _differ([map.name for map in self.map], "maps")
-        _known((name for sweep in self.sweep for name in sweep.scenes), "scene", scenes)
-        _known((name for map in self.map for name in map.methods), "method", methods)
+        _check_unique(scenes, "scenes")
+        _check_unique(methods, "methods")
+        _check_unique([map.name for map in self.map], "maps")
+        _check_known((name for sweep in self.sweep for name in sweep.scenes), "scene", scenes)
+        _check_known((name for map in self.map for name in map.methods), "method", methods)
         return self
 
 
 def load_study(path: Path) -> Study:
-    """Read and check a study file. Raises InputError naming every problem, one a line."""
+    """Return the checked contents of a study file. Raises InputError that names every problem."""
     text, data = read_toml(path, "study")
     if {"mesh", "body"} & data.keys() and OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a scene, no study: msmpetsc run {shlex.quote(str(path))}")

@@ -1,6 +1,6 @@
-"""The table of a study: one row for each case, written as CSV and read as a pandas DataFrame.
+"""The table of a study: a row for each case, stored as CSV and read as a pandas DataFrame.
 
-pandas is imported where it is used: the commands that need no table do not wait for it.
+Functions import pandas themselves, because commands without a table should not wait for it.
 """
 
 import math
@@ -15,8 +15,9 @@ from msmpetsc.results.disk import write_whole
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Row = dict[str, Any]  # one case, by column; None where nothing was measured
-# units and meanings stand in scenes/studies/README.md
+# a case by column; None for a value that was not measured
+Row = dict[str, Any]
+# scenes/studies/README.md gives units and meanings
 COLUMNS = (
     "study", "case", "scene", "map", "x", "y", "integrator", "preset", "options", "label",
     "ranks", "repeats", "time_step", "substep", "error", "max_iterations", "status", "reason",
@@ -40,14 +41,14 @@ ONCE_NOTE = (
 
 
 def require_extra() -> None:
-    """Raise InputError where a package of a study is missing: before hours of runs."""
+    """Raise InputError if a package for studies is missing, before any run starts."""
     for name in EXTRAS["study"]:
         if find_spec(name) is None:
             raise missing_package(name)
 
 
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
-    """Write table.csv, with columns of counts as integers and empty entries for what was not measured."""
+    """Write table.csv: counts as integers, an empty entry for a value that was not measured."""
     table = (
         as_table(rows).replace([math.inf, -math.inf], math.nan).convert_dtypes(convert_string=False)
     )
@@ -55,7 +56,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def read_table(folder: Path) -> "DataFrame":
-    """Return the rows of table.csv. Raises InputError without such a table."""
+    """Return the rows of table.csv. Raises InputError if the file is missing or not readable."""
     import pandas
 
     path = folder / "table.csv"
@@ -63,15 +64,17 @@ def read_table(folder: Path) -> "DataFrame":
         raise InputError(f"no table.csv in {folder}: it is no folder of a study")
     try:
         texts = pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna("")
-    except ValueError as error:  # of pandas' parser, of text that is not UTF-8
+    except ValueError as error:
+        # from pandas' parser, or for text that is not UTF-8
         raise InputError(
             f"{path} is not the table of a study: {str(error).splitlines()[0]}"
         ) from None
-    return typed(texts.to_dict("records"))  # type: ignore[arg-type]  # columns are called by text
+    # mypy cannot know that the columns' names are strings
+    return typed(texts.to_dict("records"))  # type: ignore[arg-type]
 
 
 def as_table(rows: Sequence[Row]) -> "DataFrame":
-    """Return rows as a table with all columns; a number that is missing is NaN, a text empty."""
+    """Return rows as a DataFrame with all columns; a missing number is NaN, a missing text ""."""
     from pandas import DataFrame
 
     table = DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(NUMBERS, float))
@@ -79,20 +82,21 @@ def as_table(rows: Sequence[Row]) -> "DataFrame":
 
 
 def typed(texts: Iterable[Mapping[str, str]]) -> "DataFrame":
-    """Return rows of text as a table; a number that is missing, infinite or unreadable is NaN."""
+    """Return rows of text as a DataFrame; numbers that are not finite or readable are NaN."""
     return as_table(
         [{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts]
     )
 
 
 def records(table: "DataFrame") -> list[Row]:
-    """Return the rows of a table one by one, None for what is missing."""
+    """Return the rows of a table as dictionaries, with None for NaN."""
     plain = table.astype(object)
-    return plain.where(plain.notna(), None).to_dict("records")  # type: ignore[return-value]  # columns are called by text
+    # mypy cannot know that the columns' names are strings
+    return plain.where(plain.notna(), None).to_dict("records")  # type: ignore[return-value]
 
 
 def _number(text: str) -> float:
-    """Return a finite number exactly as Python reads it, or NaN."""
+    """Return a finite number as Python reads it, or NaN."""
     try:
         value = float(text)
     except ValueError:
@@ -101,19 +105,22 @@ def _number(text: str) -> float:
 
 
 def succeeded(table: "DataFrame") -> "DataFrame":
+    """Return the rows of cases that succeeded."""
     return table[table["status"] == "ok"]
 
 
 def failed(table: "DataFrame") -> "DataFrame":
+    """Return the rows of cases that failed."""
     return table[table["status"] != "ok"]
 
 
 def swept(table: "DataFrame") -> "DataFrame":
-    """Return the rows of sweeps, without those of maps, where a failed run is an answer."""
+    """Return the rows of sweeps; in a row of a map, failure is a result."""
     return table[table["map"] == ""]
 
 
 def mapped(table: "DataFrame") -> dict[str, "DataFrame"]:
+    """Return the rows of each map by its name."""
     return grouped(table[table["map"] != ""], "map")
 
 
@@ -123,6 +130,7 @@ def measured(table: "DataFrame", *columns: str) -> "DataFrame":
 
 
 def timed(table: "DataFrame") -> "DataFrame":
+    """Return the rows of cases that succeeded and have a time per step."""
     return measured(succeeded(table), "time_frame")
 
 
@@ -132,13 +140,13 @@ def grouped(table: "DataFrame", *columns: str) -> dict[Any, "DataFrame"]:
     return dict(iter(table.groupby(by, sort=False, dropna=False)))
 
 
-# The spread of the repeats of a case; from one run alone nothing is known of it
+# ---- the spread of a case's repeats, unknown after a single run
 
 
 def spread(table: "DataFrame", cost: str) -> "DataFrame":
-    """Return the least and the greatest of the repeats of a cost, as columns; NaN where they are not known.
+    """Return columns "least" and "greatest" of a cost over the repeats; NaN if not repeated.
 
-    cost : a column in proportion to the time of a step, or "fps", in inverse proportion
+    cost : a column proportional to the time of a step, or "fps", its inverse
     """
     ends = (table["time_frame_min"], table["time_frame_max"])
     if cost == "fps":
@@ -152,4 +160,5 @@ def spread(table: "DataFrame", cost: str) -> "DataFrame":
 
 
 def is_repeated(table: "DataFrame") -> bool:
+    """Return whether every case was run more than once."""
     return bool(table["time_frame_min"].notna().all())

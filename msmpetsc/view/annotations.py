@@ -1,4 +1,4 @@
-"""Text in pictures: captions, labels and the legend, all in one typeface."""
+"""Text in pictures: captions and the legend, in a common typeface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,22 +14,20 @@ from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK,
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
 
-CAPTION, LINES = (
-    68,
-    ((21, 22), (16, 50)),
-)  # [px]: height of a caption; of its lines, size and middle
+# height of a caption, and size and middle of each of its lines [px]
+CAPTION, LINES = 68, ((21, 22), (16, 50))
 
 
 @cache
 def typeface(size: int) -> ImageFont.FreeTypeFont:
-    """Return the font DejaVu Sans, which comes with matplotlib, in a size [px]."""
+    """Return the font DejaVu Sans, which matplotlib contains, in a size [px]."""
     return ImageFont.truetype(
         str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size
     )
 
 
 def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
-    """Return the picture (height, width, 3) of two centred lines; letters: their size, 1 in a sheet."""
+    """Return the picture (height, width, 3) of two centred lines; ``letters`` scales the type."""
     picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
         at = width / 2, letters * middle
@@ -37,20 +35,22 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
     return np.array(picture)
 
 
-LINE, GAP, LETTERS = 34, 36, 15  # [px]: a line's height, between entries, of type
-# Widths of the signs in front of a text [px]
+# a legend's line height, gap between entries, and type size [px]
+LINE, GAP, TYPE_SIZE = 34, 36, 15
+# width of the symbol in front of an entry's text [px]
 WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30, "note": 0}
-# Rows of a bar, rows of a tick, middle and size of a tick's number [px]
+# first and last row of a bar and of a tick, middle and size of a tick's number [px]
 BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)
-FINE = 3  # a legend is drawn so many times larger, and shrunk
+# factor by which a legend is drawn larger and then reduced, for smooth edges
+SUPERSAMPLING = 3
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A legend entry: a bar of colours, a swatch, or an arrow in front of a text.
+    """A legend entry: a symbol and a text.
 
-    kind  : "bar", "swatch", "glass", "arrow" or, for a text alone, "note"
-    ticks : of a bar, shares of its width and the numbers there
+    kind  : "bar" of colours, "swatch", "glass", "arrow", or "note" for a text alone
+    ticks : position in [0, 1] and number of each tick of a bar
     """
 
     kind: str
@@ -61,7 +61,8 @@ class Entry:
 
 def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]:
     """Return the legend's entries for some stills."""
-    scene, colouring = composition.subject.scene, composition.colouring
+    scene = composition.subject.scene
+    colouring = composition.colouring
     entries: list[Entry] = []
     if colouring.classes:
         pairs = enumerate(colouring.classes)
@@ -75,10 +76,10 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
         Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds
     ]
     if any(composition.subject.fixed(still.index).any() for still in (stills[0], stills[-1])):
-        held = [
+        words = [
             word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))
         ]
-        entries.append(Entry("swatch", " or ".join(held), FIXED))
+        entries.append(Entry("swatch", " or ".join(words), FIXED))
     if any(still.overlays.arrows for still in stills):
         entries.append(Entry("arrow", "force", ARROW))
     if entries and any(len(still.overlays.obstacles) for still in stills):
@@ -89,11 +90,11 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
 
 
 def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> Array:
-    """Return the picture (height, width, 3) of legend entries side by side, in as many lines as they need.
+    """Return the picture (height, width, 3) of legend entries, wrapped into lines.
 
-    letters : their size, 1 in a sheet
+    letters : scale of the type, 1 in a contact sheet
     """
-    room = FINE * round(width / letters)
+    room = SUPERSAMPLING * round(width / letters)
     lines: list[list[Image.Image]] = []
     for entry in map(_entry_picture, entries):
         if not lines or sum(each.width for each in (*lines[-1], entry)) > room:
@@ -101,11 +102,11 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
         lines[-1].append(entry)
     if not lines:
         return np.empty((0, width, 3), np.uint8)
-    picture = Image.new("RGB", (room, FINE * LINE * len(lines)), "white")
+    picture = Image.new("RGB", (room, SUPERSAMPLING * LINE * len(lines)), "white")
     for number, line in enumerate(lines):
         left = (room - sum(each.width for each in line)) // 2
         for entry in line:
-            picture.paste(entry, (left, FINE * LINE * number))
+            picture.paste(entry, (left, SUPERSAMPLING * LINE * number))
             left += entry.width
     return np.array(
         picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS)
@@ -113,32 +114,35 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
 
 def _entry_picture(entry: Entry) -> Image.Image:
-    """Return the picture of a legend entry in fine pixels, with half a gap on either side."""
-    font, middle, left = typeface(FINE * LETTERS), FINE * LINE / 2, FINE * GAP / 2
-    half, gap = 8 * FINE, (18 if entry.ticks else 8) * FINE  # beside the number of the last tick
-    width = FINE * WIDTHS[entry.kind]
+    """Return the enlarged picture of a legend entry, with half a gap on either side."""
+    fine = SUPERSAMPLING
+    font = typeface(fine * TYPE_SIZE)
+    middle, left, half = fine * LINE / 2, fine * GAP / 2, 8 * fine
+    # a bar's last number needs room
+    gap = (18 if entry.ticks else 8) * fine
+    width = fine * WIDTHS[entry.kind]
     right = left + width
     picture = Image.new(
-        "RGB", (round(right + gap + font.getlength(entry.text) + left), FINE * LINE), "white"
+        "RGB", (round(right + gap + font.getlength(entry.text) + left), fine * LINE), "white"
     )
     draw = ImageDraw.Draw(picture)
     box = (left, middle - half, right, middle + half)
     if entry.kind == "bar":
-        top, bottom = (FINE * row for row in BAR)
+        top, bottom = (fine * row for row in BAR)
         for pixel in range(round(left), round(right)):
             colour = tuple(SCALE_TABLE[int(255 * (pixel - left) / width)].tolist())
             draw.line((pixel, top, pixel, bottom), colour)
-        row, size = (FINE * number for number in NUMBER)
+        row, size = (fine * number for number in NUMBER)
         for share, number in entry.ticks:
             at = left + share * width
-            draw.line((at, FINE * TICK[0], at, FINE * TICK[1]), INK, FINE)
+            draw.line((at, fine * TICK[0], at, fine * TICK[1]), INK, fine)
             draw.text((at, row), number, INK, typeface(size), anchor="mm")
     elif entry.kind == "swatch":
         draw.rectangle(box, entry.colour)
     elif entry.kind == "glass":
-        draw.rectangle(box, "#e3e9ed", GLASS_EDGE, FINE)
+        draw.rectangle(box, "#e3e9ed", GLASS_EDGE, fine)
     elif entry.kind == "arrow":
-        draw.line((left, middle, right - half, middle), entry.colour, 2 * FINE)
+        draw.line((left, middle, right - half, middle), entry.colour, 2 * fine)
         draw.polygon(
             [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)],
             entry.colour,

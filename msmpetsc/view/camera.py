@@ -1,4 +1,4 @@
-"""The orthographic camera of a picture, in which all lengths can be compared."""
+"""The orthographic camera of a picture, under which lengths compare across the picture."""
 
 import math
 from collections.abc import Sequence
@@ -9,18 +9,17 @@ from numpy.typing import ArrayLike
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 
-YAW, ELEVATION = (
-    math.radians(25),
-    math.radians(14),
-)  # how far the eye stands to the side, and above, if nothing is said
+# default position of the eye, to the side and above [rad]
+YAW = math.radians(25)
+ELEVATION = math.radians(14)
 
 
 @dataclass(frozen=True)
 class Camera:
     """The axes of an upright observer who faces the body, and the elevation of the view.
 
-    right, away, up : (3,) each, unit vectors
-    elevation       : of the eye above that person's horizon [rad]
+    right, away, up : unit vectors (3,)
+    elevation       : angle of the eye above the observer's horizon [rad]
     """
 
     right: Floats
@@ -39,16 +38,17 @@ class Camera:
         return math.cos(self.elevation) * self.up + math.sin(self.elevation) * self.away
 
     def flat(self, points: Positions) -> Rows:
-        """Return the projection (n, 2) of points (n, 3) to the right and upwards [m]."""
+        """Return points (n, 3) [m] projected onto the picture's axes, (n, 2) right and up [m]."""
         return points @ np.stack([self.right, self.upward], axis=1)
 
 
 def camera_facing(
     points: Positions, gravity: Sequence[float] | None, eye: Sequence[float] | None = None
 ) -> Camera:
-    """Return a camera in direction `eye` (3,) of points (n, 3); up is against gravity, z without it.
+    """Return a camera that looks at points (n, 3) from the direction ``eye`` (3,).
 
-    Without eye, or with one straight above or below, the longer horizontal extent lies across the picture.
+    Up is opposite to gravity, or z without gravity. If ``eye`` is missing or vertical, the longer
+    horizontal extent lies across the picture.
     """
     up = unit(-np.array(gravity)) if gravity and any(gravity) else np.array([0.0, 0.0, 1.0])
     axes = np.delete(np.eye(3), np.argmax(abs(up)), axis=0)
@@ -68,7 +68,6 @@ def camera_facing(
 def unit(vector: ArrayLike) -> Floats:
     """Return a vector (3,) normalised to length 1."""
     given: Floats = np.asarray(vector, float)
-    scaled: Floats = (
-        given / np.abs(given).max()
-    )  # squares of very large or small components leave the range
+    # scaled first, so that squares neither overflow nor underflow
+    scaled: Floats = given / np.abs(given).max()
     return np.divide(scaled, np.linalg.norm(scaled))

@@ -1,4 +1,4 @@
-"""Colours of pictures: fixed colours, and fields on the surface in a colour scale."""
+"""Colours of pictures: fixed colours, and scalar fields on the surface in a colour scale."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -14,13 +14,16 @@ from msmpetsc.view.drawable import Drawable
 FIXED, ARROW, INK = "#46566b", "#cf5a3c", "#333a42"
 GROUND, SHADOW = "#efece6", "#cdc7bb"
 GLASS, GLASS_EDGE = "#a3b6c4", "#667e90"
-BOUNDARY_CELL, INTERIOR_CELL = "#c8372d", "#2f5fb3"  # Figure 2 of the paper: red and blue
-# ColorBrewer's YlGnBu from a neutral grey, so that nothing at zero is tinted
+# red and blue, as in the paper's Figure 2
+BOUNDARY_CELL, INTERIOR_CELL = "#c8372d", "#2f5fb3"
+# ColorBrewer's YlGnBu with a neutral grey at 0, so that zero looks uncoloured
 SCALE = ("#dcdcdc", "#b9ddb9", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
-CLASSES = (  # of bodies and of a body's parts
-    "#8fabc6", "#e0a13a", "#5aa469", "#b56aa8", "#c9625a", "#6f7fc4", "#9c8b5e", "#4fa3a5", "#d98cb3", "#7d6b5d",
+# colours of bodies and of parts, used cyclically
+CLASSES = (
+    "#8fabc6", "#e0a13a", "#5aa469", "#b56aa8", "#c9625a", "#6f7fc4", "#9c8b5e", "#4fa3a5",
+    "#d98cb3", "#7d6b5d",
 )  # fmt: skip
-# red, green and blue (256, 3), 0 to 255: along the scale, and of classes over and over
+# red, green and blue (256, 3) in 0 to 255, of the scale and of the classes
 ALONG_SCALE = LinearSegmentedColormap.from_list("", SCALE)(np.arange(256))[:, :3]
 SCALE_TABLE: Array = np.rint(255 * ALONG_SCALE).astype(np.uint8)
 CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256, 3))).astype(
@@ -28,11 +31,14 @@ CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256
 )
 
 
-# Fields on the surface
+# ---- fields on the surface
 
-# A scale ends at most at BEYOND times the value that this share of the area stays below.
-BELOW, BEYOND = 0.99, 1.25
-ROUNDING = 1e-12  # share of a field's natural size; a smaller field is rounding error
+# share of the area below the value that determines the scale; so that few points do not
+QUANTILE = 0.99
+# largest ratio of the scale's end to that value
+HEADROOM = 1.25
+# ratio to a field's natural size below which the field is rounding error
+ROUNDING = 1e-12
 PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
 
@@ -41,12 +47,12 @@ class Colouring:
     """A scalar field on the surface points, with its colour scale.
 
     title   : name of the field
-    unit    : "m", "Pa", "%"; "" for numbers of classes
-    values  : number of a frame -> (v,)
-    high    : end of the scale, which begins at 0
-    classes : names of the classes that the numbers mean; the legend has those that are not ""
-    most    : greatest value, 0 if unknown; above `high` if the scale is clipped
-    natural : size that the field takes if a body moves as far as it is large; 0 if there is none
+    unit    : "m", "Pa", "%"; "" for class numbers
+    values  : function from a frame's number to the values (v,)
+    high    : upper end of the scale, which begins at 0
+    classes : name of each class number; the legend omits a class named ""
+    most    : greatest value, 0 if unknown; above ``high`` if the scale is clipped
+    natural : size of the field if a body moves by its own length; 0 if unknown
     """
 
     title: str
@@ -59,11 +65,11 @@ class Colouring:
 
     @property
     def table(self) -> Array:
-        """Red, green and blue (256, 3) of the colours by their numbers, 0 to 255."""
+        """Red, green and blue (256, 3) in 0 to 255 of each colour number."""
         return CLASS_TABLE if self.classes else SCALE_TABLE
 
     def numbers(self, index: int) -> Array:
-        """Return the numbers (v,) of a frame's colours; beyond an end of the scale it is that end's."""
+        """Return the colour numbers (v,) of a frame, clipped to the scale."""
         step = 1.0 if self.classes else (self.high or 1.0) / 255
         return np.clip(np.rint(np.nan_to_num(self.values(index) / step)), 0, 255).astype(np.uint8)
 
@@ -77,7 +83,7 @@ class Colouring:
 
     @property
     def ticks(self) -> tuple[tuple[float, str], ...]:
-        """Shares of the scale in [0, 1] at round numbers, with the numbers of the label's unit."""
+        """Position on the scale in [0, 1] and number of each tick, in the label's unit."""
         if self.high == 0:
             return ((0.0, "0"),)
         high = self.high / self._size
@@ -86,29 +92,26 @@ class Colouring:
 
     @property
     def _size(self) -> float:
-        """One unit of the ticks, in the unit of the values."""
-        return (
-            0.01
-            if self.unit == "%"
-            else next((size for size in PREFIXES if self.high >= size), 1.0)
-        )
+        """Size of the ticks' unit in units of the values."""
+        if self.unit == "%":
+            return 0.01
+        return next((size for size in PREFIXES if self.high >= size), 1.0)
 
 
 def colouring_of(subject: Drawable, name: str | None) -> Colouring:
-    """Return a field by name; that of the bodies' numbers for None. Raises InputError."""
+    """Return a field by its name, or the body numbers for None. Raises InputError."""
     if name is None:
         number = subject.rest.body_of_point.astype(float)
         return Colouring("body", "", lambda _: number, classes=("",) * len(CLASSES))
     if name not in COLOURINGS:
         near = did_you_mean(name, COLOURINGS)
-        raise InputError(
-            f"--colour {name}: there is no such field, but {', '.join(COLOURINGS)}{near}"
-        )
+        fields = ", ".join(COLOURINGS)
+        raise InputError(f"--colour {name}: no such field; the fields are {fields}{near}")
     return COLOURINGS[name](subject)
 
 
 def _displacement(subject: Drawable) -> Colouring:
-    """Return the field of distances from the points at rest."""
+    """Return the field of distances [m] of the points from their rest positions."""
     rest = subject.rest.points
     return Colouring(
         "displacement",
@@ -119,7 +122,7 @@ def _displacement(subject: Drawable) -> Colouring:
 
 
 def _speed(subject: Drawable) -> Colouring:
-    """Return the field of mean speeds between the frames before and after."""
+    """Return the field of mean speeds [m/s] between the previous and the next frame."""
     last = len(subject.times) - 1
 
     def values(index: int) -> Floats:
@@ -140,8 +143,9 @@ def _speed(subject: Drawable) -> Colouring:
 
 
 def _strain(subject: Drawable) -> Colouring:
-    """Return the field of the springs' relative change of length, root mean square around a node."""
-    springs, rest_length = subject.array("lattice/springs"), subject.array("lattice/rest_length")
+    """Return the field of spring strains: rms of the springs at each node, interpolated."""
+    springs = subject.array("lattice/springs")
+    rest_length = subject.array("lattice/rest_length")
     count = np.maximum(1, np.bincount(springs.ravel(), minlength=len(subject.rest.nodes)))
 
     def values(index: int) -> Floats:
@@ -156,7 +160,7 @@ def _strain(subject: Drawable) -> Colouring:
 
 
 def _stress(subject: Drawable) -> Colouring:
-    """Return the field of von Mises' stress at the nodes, carried by the embedding."""
+    """Return the field of von Mises stresses [Pa] of the nodes, interpolated to the surface."""
     von_mises = subject.von_mises
     if von_mises is None:
         if subject.scene.material.poisson is None:
@@ -164,7 +168,8 @@ def _stress(subject: Drawable) -> Colouring:
                 f"--colour stress: {subject.name} is of springs, whose law has no stress"
             )
         raise InputError(
-            f"--colour stress: {subject.name} has no stress: run its scene with output.stress = true"
+            f"--colour stress: {subject.name} stores no stress: "
+            "run its scene with output.stress = true"
         )
     young = subject.scene.material.young_modulus or 0.0
     return Colouring(
@@ -173,8 +178,9 @@ def _stress(subject: Drawable) -> Colouring:
 
 
 def _part(subject: Drawable) -> Colouring:
-    """Return the field of the scene's part to which the nearest cell belongs last."""
-    rest, parts = subject.rest, list(subject.scene.tables("part"))
+    """Return the field of part numbers; a cell belongs to the last part that contains it."""
+    rest = subject.rest
+    parts = list(subject.scene.tables("part"))
     if not parts:
         raise InputError(f"--colour part: the scene of {subject.name} has no part")
     number = np.zeros(len(rest.cells))
@@ -196,7 +202,7 @@ COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {
 
 
 def scaled(colouring: Colouring, subject: Drawable, frames: Iterable[int]) -> Colouring:
-    """Return a field with a scale for these frames that few points do not stretch."""
+    """Return a field with a scale for these frames that a few extreme points do not stretch."""
     a, b, c = subject.rest.points[subject.triangles].swapaxes(0, 1)
     area = np.repeat(np.linalg.norm(np.cross(b - a, c - a), axis=1), 3)
     weight = np.bincount(subject.triangles.ravel(), area, len(subject.rest.points))
@@ -205,8 +211,9 @@ def scaled(colouring: Colouring, subject: Drawable, frames: Iterable[int]) -> Co
         values = np.nan_to_num(colouring.values(index))
         order = np.argsort(values)
         below = np.cumsum(weight[order])
-        usual = float(values[order[np.searchsorted(below, BELOW * below[-1])]])
-        most, high = max(most, float(values.max())), max(high, BEYOND * usual)
+        usual = float(values[order[np.searchsorted(below, QUANTILE * below[-1])]])
+        most = max(most, float(values.max()))
+        high = max(high, HEADROOM * usual)
     if most <= ROUNDING * colouring.natural:
         return replace(colouring, high=0.0)
     return replace(colouring, high=min(most, high) or most, most=most)

@@ -1,4 +1,4 @@
-"""The composition of pictures, films and pages: one camera, scale and extent for all."""
+"""The composition of pictures, films and pages: a common camera, colour scale and extent."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,17 +18,18 @@ from msmpetsc.view.drawable import FARTHEST, Drawable
 from msmpetsc.view.mesh import Cut, cut_open
 from msmpetsc.view.overlays import MARGIN, Overlays, overlays_at
 
-LEAST_MARGIN = 0.01  # share of the longer side in view; else MARGIN of each side
+# smallest margin around the view, relative to its longer side
+LEAST_MARGIN = 0.01
 
 
 @dataclass(frozen=True)
 class Style:
-    """The look of a picture, film or page as ``msmpetsc render`` is asked for it.
+    """The appearance of a picture, film or page, as the options of ``msmpetsc render`` set it.
 
     eye    : direction (3,) from the body to the eye; the scene's picture.eye if None
     colour : name of a field
-    size   : width and height [px] of a film, a still, or a panel
-    cells  : whether the body is cut open
+    size   : width and height [px] of a film, a still or a panel
+    cells  : whether to cut the body open and show its cells
     """
 
     eye: Sequence[float] | None = None
@@ -39,7 +40,7 @@ class Style:
 
 @dataclass(frozen=True)
 class Still:
-    """One picture: number of its frame, obstacles and forces, a caption of two lines, and cells shown."""
+    """A picture to draw: frame number, obstacles and forces, two lines of caption, cells."""
 
     index: int
     overlays: Overlays
@@ -49,13 +50,12 @@ class Still:
 
 @dataclass(frozen=True)
 class Composition:
-    """All frames to be drawn of a subject, with the camera, colours and extent that they share.
+    """The frames of a subject to be drawn, with their common camera, colours and extent.
 
-    extremes  : (e, 3) points in view that reach farthest in some direction at some frame [m]
-    bounds    : corners (2, 3) of the box around all frames, with parts that have left the view [m]
-    camera    : of all stills
-    colouring : with its scale
-    note      : says which parts fly out of the picture; "" if none do
+    extremes  : outermost points (e, 3) in view of all frames, in a set of directions [m]
+    bounds    : corners (2, 3) of the box around all frames, including parts out of view [m]
+    colouring : field with its scale
+    note      : text about parts that leave the view; "" if none do
     """
 
     subject: Drawable
@@ -68,11 +68,11 @@ class Composition:
 
     @property
     def box(self) -> Positions:
-        """Corners (2, 3) of the box around all that stays in view [m]."""
+        """Corners (2, 3) of the box around everything that stays in view [m]."""
         return around(self.extremes)
 
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
-        """Return the still of each frame, with its time and `words` in the caption."""
+        """Return the still of each frame, with its time and ``words`` as caption."""
         cut = cut_open(self.subject, self.camera) if self.style.cells else None
         stills = []
         for index in frames:
@@ -83,13 +83,15 @@ class Composition:
         return stills
 
     def room(self, stills: Sequence[Still]) -> tuple[Floats, Floats, float]:
-        """Return lower left (2,) and upper right (2,) of all stills in the picture's plane, and their depth [m].
+        """Return the corners (2,), (2,) of the picture that contains all stills, and its depth [m].
 
-        With a margin. Of a ground only the shadows of the bodies count.
+        The corners are lower left and upper right in the picture's plane, margin included. Grounds
+        count only as far as the bodies' shadows reach.
         """
         sides = np.ptp(self.camera.flat(self.extremes), axis=0)
         margin = np.maximum(MARGIN * sides, LEAST_MARGIN * sides.max())
-        ends, corners = [], [self.extremes]
+        ends = []
+        corners = [self.extremes]
         for still in stills:
             shown = still.overlays
             below = [ground.below(self.extremes) for ground in shown.grounds]
@@ -103,9 +105,9 @@ class Composition:
 
 
 def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Composition:
-    """Return the composition of frames, which are read one at a time. Raises InputError."""
+    """Return the composition of frames, which are read in turn. Raises InputError."""
     colouring = colouring_of(subject, style.colour)
-    # The points farthest out in these directions stand for all of a part.
+    # a part's outermost points in these directions represent its extent
     directions = np.concatenate([np.eye(3), -np.eye(3), pv.Icosphere(nsub=1).points]).T
     parts = parts_of(subject)
     extremes: list[list[Positions]] = []
@@ -141,7 +143,8 @@ def around(points: Positions) -> Positions:
 
 def parts_of(subject: Drawable) -> list[Indices]:
     """Return the numbers of the surface points of each connected part of each body."""
-    rest, triangles = subject.rest, subject.triangles
+    rest = subject.rest
+    triangles = subject.triangles
     labels = part_labels(Surface(rest.points, triangles)) * (rest.body_of_point.max() + 1)
     labels += rest.body_of_point[triangles[:, 0]]
     return [np.unique(triangles[labels == label]) for label in np.unique(labels)]
@@ -150,16 +153,16 @@ def parts_of(subject: Drawable) -> list[Indices]:
 def staying(boxes: Positions) -> Mask:
     """Return which parts (p,) stay in view.
 
-    Half of the parts stay: the parts that go least far from the box in which all begin. A part
-    leaves the view if it goes farther from that box and from that half than both reach.
+    The half of the parts that moves least out of the initial box stays. Another part leaves if it
+    moves farther from the box around this half than the longest side of that box.
 
-    boxes : (T, p, 2, 3) around each part at each frame [m]
+    boxes : corners (T, p, 2, 3) of the box around each part at each frame [m]
     """
     begin = around(boxes[0].reshape(-1, 3))
-    way = np.maximum(begin[0] - boxes[:, :, 0], boxes[:, :, 1] - begin[1]).max(axis=(0, 2))
-    nearest = np.argsort(way, kind="stable")[: max(1, len(way) // 2)]
+    excess = np.maximum(begin[0] - boxes[:, :, 0], boxes[:, :, 1] - begin[1]).max(axis=(0, 2))
+    nearest = np.argsort(excess, kind="stable")[: max(1, len(excess) // 2)]
     home = around(np.concatenate([begin, boxes[:, nearest].reshape(-1, 3)]))
-    reach = np.ptp(home, axis=0).max()
+    limit = np.ptp(home, axis=0).max()
     return np.asarray(
-        ((boxes[:, :, 0] >= home[0] - reach) & (boxes[:, :, 1] <= home[1] + reach)).all(axis=(0, 2))
+        ((boxes[:, :, 0] >= home[0] - limit) & (boxes[:, :, 1] <= home[1] + limit)).all(axis=(0, 2))
     )

@@ -1,4 +1,4 @@
-"""Bodies to be drawn: of a result in time, or of a scene before its first step."""
+"""Bodies to be drawn: from a result's frames, or from a scene before its first step."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from msmpetsc.build import Model
     from msmpetsc.scene.reading import Scene
 
-DRAWN = (
+# datasets without which a result cannot be drawn
+REQUIRED = (
     "lattice/cells",
     "surface/points",
     "surface/triangles",
@@ -29,14 +30,15 @@ DRAWN = (
     "frames/elastic",
     "frames/potential",
 )
-FARTHEST = 1e15  # [m]: what is drawn has single precision, and its squares must be numbers, too
+# largest coordinate [m]; VTK squares coordinates in single precision
+FARTHEST = 1e15
 
 
 @dataclass(frozen=True)
 class BodiesAtRest:
     """Bodies at rest: nodes (n, 3) [m], cells (c, 8) and surface points (v, 3) [m].
 
-    body_of_node, body_of_point : numbers (n,), (v,) of their bodies
+    body_of_node, body_of_point : body numbers (n,), (v,)
     """
 
     nodes: Positions
@@ -55,13 +57,12 @@ class BodiesAtRest:
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
     def find(self, table: OfBody) -> Mask:
-        """Return which nodes (n,) lie in a table's region; none if the result does not say which."""
+        """Return which nodes (n,) lie in a table's region; none if the result lacks the region."""
         region = table.table.region
         if region.is_of_mesh:
             return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
-        low, high = np.moveaxis(
-            self.bounds[self.body_of_node], 1, 0
-        )  # what sticks out is where its body is
+        # nodes outside the surface count with the nearest point of the body's box
+        low, high = np.moveaxis(self.bounds[self.body_of_node], 1, 0)
         return inside_bodies(
             region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body
         )
@@ -72,7 +73,7 @@ class BodiesAtRest:
         return np.asarray(self.nodes[self.cells].mean(axis=1))
 
     def find_cells(self, table: OfBody) -> Mask:
-        """Return which cells (c,) lie in a table's region; none if the result does not say which."""
+        """Return which cells (c,) lie in a table's region; none if the result lacks the region."""
         region = table.table.region
         if region.is_of_mesh:
             return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
@@ -81,21 +82,24 @@ class BodiesAtRest:
         )
 
     def _painted_cells(self, table: OfBody) -> Indices:
-        """Return the numbers of the cells of a table's body around its painted points."""
-        painted, number = table.table.region.painted, table.body or 0
-        if not isinstance(painted, tuple):  # a file or a group, which the result does not hold
+        """Return the numbers of the cells that contain the painted points of a table's region."""
+        painted = table.table.region.painted
+        number = table.body or 0
+        # a result does not contain a region that is a file or a group
+        if not isinstance(painted, tuple):
             return np.empty(0, int)
         points = self.points[self.body_of_point == number][list(painted)]
         return self.cells_around(points, np.full(len(points), number))
 
     def cells_around(self, points: Positions, body: Indices) -> Indices:
         """Return the numbers (k,) of the cells that contain points (k, 3) of bodies (k,)."""
-        of_cell, around = self.body_of_node[self.cells[:, 0]], np.empty(len(points), int)
+        of_cell = self.body_of_node[self.cells[:, 0]]
+        around = np.empty(len(points), int)
         for number in np.unique(body):
-            own, inside = np.flatnonzero(of_cell == number), body == number
-            around[inside] = own[
-                KDTree(self.middles[own]).query(points[inside], p=np.inf)[1]
-            ]  # cubes: the nearest
+            own = np.flatnonzero(of_cell == number)
+            inside = body == number
+            # cells are cubes: the nearest centre is nearest in the max norm
+            around[inside] = own[KDTree(self.middles[own]).query(points[inside], p=np.inf)[1]]
         return around
 
 
@@ -103,15 +107,15 @@ class BodiesAtRest:
 class Drawable:
     """Bodies in time, and the scene with their obstacles and forces.
 
-    name      : of its file, for messages
-    pinned    : (n,) which nodes are
-    triangles : (f, 3) of the surface points
-    times     : (T,) of its frames [s]
-    nodes     : number of a frame -> node positions (n, 3) [m]
+    name      : name of the file, for messages
+    pinned    : which nodes (n,) are pinned
+    triangles : (f, 3) surface points of each triangle
+    times     : times of the frames (T,) [s]
+    nodes     : function from a frame's number to node positions (n, 3) [m]
     embedding : W (v, n): surface points = W @ node positions
-    array     : name of a dataset of a result, "lattice/springs" -> its numbers
-    solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
-    von_mises : number of a frame -> stress at the nodes (n,) [Pa]; None where none was stored
+    array     : function from the name of a result's dataset to its values
+    solids    : surfaces at time 0 of obstacles that have a mesh, by obstacle number
+    von_mises : function from a frame's number to nodal stress (n,) [Pa]; None if not stored
     """
 
     name: str
@@ -132,11 +136,11 @@ class Drawable:
         return self.scene.title or Path(self.name).stem
 
     def surface(self, index: int) -> Positions:
-        """Return the surface points (v, 3) [m] at a frame."""
+        """Return the surface points (v, 3) [m] of a frame."""
         return np.asarray(self.embedding @ self.nodes(index))
 
     def fixed(self, index: int) -> Floats:
-        """Return the pinned or led share (v,) in [0, 1] of each surface point at a frame."""
+        """Return how far each surface point is pinned or anchored at a frame, (v,) in [0, 1]."""
         fixed = self.pinned.copy()
         for anchor in self.scene.tables("anchor"):
             if within(float(self.times[index]), 0.0, anchor.table.stop):
@@ -144,18 +148,18 @@ class Drawable:
         return self.on_surface(fixed.astype(float), 1.0)
 
     def on_surface(self, numbers: Floats, most: float = np.inf) -> Floats:
-        """Return numbers (n,) of nodes interpolated to the surface points, (v,) in [0, most]."""
+        """Return nodal values (n,) interpolated to surface points (v,), clipped to [0, most]."""
         return np.asarray(np.clip(self.embedding @ numbers, 0, most))
 
 
 def drawable_of_result(run: Result) -> Drawable:
-    """Return the bodies of a result. Raises InputError where they cannot be drawn."""
+    """Return the bodies of a result. Raises InputError if they cannot be drawn."""
     scene = read_scene(run)
     if "embedding/weights" not in run:
         raise InputError(
             f"{run.path} has no surface to draw: its scene says output.surface = false"
         )
-    for name in DRAWN:
+    for name in REQUIRED:
         if len(run[name]) == 0:
             raise InputError(f"{run.path} is damaged, or has no finished frame: {name} is empty")
     nodes = run.lattice.nodes[:]
@@ -181,13 +185,14 @@ def drawable_of_result(run: Result) -> Drawable:
 
 
 def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
-    """Return the bodies of a scene before its first step, from a model on one process."""
-    lattice, surface, embedding, owned = (
-        model.lattice,
-        model.surface,
-        model.embedding,
-        model.lattice.owned,
-    )
+    """Return the bodies of a scene before its first step, from a model on a single process.
+
+    Raises InputError if the model has no surface.
+    """
+    lattice = model.lattice
+    surface = model.surface
+    embedding = model.embedding
+    owned = lattice.owned
     if surface is None or embedding is None:
         raise InputError(f"{path} has no surface to draw: it says output.surface = false")
     start = np.asarray(model.start[0])[:owned]
@@ -212,32 +217,25 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
 
 
 def solids_of(run: Result) -> dict[int, Surface]:
-    """Return the obstacle surfaces stored in a result. Raises InputError for damaged ones."""
+    """Return the obstacle surfaces of a result, by obstacle number. Raises InputError."""
     if "obstacle/points" not in run:
         return {}
-    points, triangles, numbers = (
-        run["obstacle/points"][:],
-        run.indices("obstacle/triangles"),
-        run["obstacle/number"][:],
-    )
+    points = run["obstacle/points"][:]
+    triangles = run.indices("obstacle/triangles")
+    numbers = run["obstacle/number"][:]
     if not (np.abs(points) < FARTHEST).all():
-        raise InputError(f"{run.path} is damaged: the surfaces of its obstacles are none")
+        raise InputError(f"{run.path} is damaged: the points of its obstacles are not finite")
     return {
         int(number): compact(points, triangles[numbers == number]) for number in np.unique(numbers)
     }
 
 
 def read_scene(run: Result) -> SceneFile:
-    """Return the scene of a result with its keys checked. Raises InputError."""
+    """Return the validated scene of a result. Raises InputError."""
     try:
         return SceneFile.model_validate(run.scene)
-    except (
-        InputError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ) as error:  # pydantic's among them
+    # ValueError includes pydantic's ValidationError
+    except (InputError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(
             f"{run.path} was run by another version, with a scene unknown to this one"
         ) from error

@@ -1,4 +1,4 @@
-"""Films of a result: its frames as MP4, GIF or WebP, and the speed at which they play."""
+"""Films of a result: its frames as MP4, GIF or WebP, and the speed of playback."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
@@ -21,22 +21,27 @@ from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
 
-# Sides of a film above its caption, if none are given [px]; the shortest have legible captions
-LONGEST, SHORTEST = 960, np.array([240, 96])
-# Sides from which on letters have their usual size [px], and the least share of that size
-USUAL, SMALLEST = np.array([480, 720]), 0.5
-FASTEST = 30.0  # pictures a second
-LENGTHS = 3.0, 8.0  # [s] that a film lasts, where nothing is said
-STEPS = (1, 2, 5)  # times powers of ten: how much slower or faster
+# default longer side of the view, and least sides that keep captions legible [px]
+LONGEST = 960
+SHORTEST = np.array([240, 96])
+# sides from which on type has full size [px], and smallest scale of type
+FULL_TYPE_SIDES = np.array([480, 720])
+SMALLEST_TYPE = 0.5
+# highest frame rate [1/s]
+MAX_FPS = 30.0
+# range of a film's default length [s]
+LENGTHS = (3.0, 8.0)
+# factors times powers of ten of the default speed
+STEPS = (1, 2, 5)
 
 
 @dataclass(frozen=True)
 class Playback:
-    """The frames and the speed at which a film plays.
+    """The frames and the speed of a film.
 
-    numbers : which of the frames each picture shows
-    fps     : pictures a second
-    speed   : simulated seconds a second; 0 where they are not in order of time
+    numbers : position in the list of frames of each picture's frame
+    fps     : pictures per second
+    speed   : simulated seconds per second; 0 if the frames are not in order of time
     """
 
     numbers: Indices
@@ -45,7 +50,7 @@ class Playback:
 
     @property
     def words(self) -> str:
-        """Speed in words: "10 times slower than real"; "" in real time."""
+        """The speed in words, "10 times slower than real"; "" in real time."""
         if self.speed in (0.0, 1.0):
             return ""
         if self.speed < 1:
@@ -54,7 +59,7 @@ class Playback:
 
 
 def usual_speed(span: float) -> float:
-    """Return the round simulated seconds a second at which a time span [s] takes 3 to 8 s."""
+    """Return the round speed [simulated s/s] at which a time span [s] lasts 3 to 8 s."""
     if not 0 < span < np.inf:
         return 1.0
     factors = np.outer(10.0 ** np.arange(20), STEPS).ravel()
@@ -65,17 +70,18 @@ def usual_speed(span: float) -> float:
 
 
 def playback_of(times: Floats, speed: float | None = None) -> Playback:
-    """Return the playback of frames at these times (k,) [s], which lasts 3 to 8 s unless a speed is given.
+    """Return the playback of frames at times (k,) [s], each picture with the nearest frame.
 
-    Each picture shows the frame nearest to its time. Raises InputError where time does not go on.
+    Without a speed the film lasts 3 to 8 s. Raises InputError if a speed is given and the times do
+    not increase.
     """
     steps = np.diff(times)
     if len(times) == 1 or not (steps > 0).all():
         if speed is not None:
             raise InputError("--speed needs frames in order of time, more than one")
-        return Playback(np.arange(len(times)), FASTEST / 3, 0.0)
+        return Playback(np.arange(len(times)), MAX_FPS / 3, 0.0)
     speed = speed or usual_speed(float(times[-1] - times[0]))
-    fps = max(1.0, min(FASTEST, speed / float(np.median(steps))))
+    fps = max(1.0, min(MAX_FPS, speed / float(np.median(steps))))
     shown = times[0] + np.arange(
         0, (times[-1] - times[0]) * (1 + 1e-9) + speed / fps / 2, speed / fps
     )
@@ -85,49 +91,48 @@ def playback_of(times: Floats, speed: float | None = None) -> Playback:
 def write_film(
     subject: Drawable, path: Path, frames: Sequence[int], style: Style, playback: Playback
 ) -> None:
-    """Write a film of some frames. Raises InputError where it cannot be drawn or written."""
+    """Write a film of some frames. Raises InputError if it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
     composition = composition_of(drawn(subject), played, style)
     stills = composition.stills(played, playback.words)
     if playback.speed:
         seconds = len(played) / playback.fps
         log.info("the film lasts %.2g s, %s", seconds, playback.words or "in real time")
-    size = style.size or _usual_size(composition, stills)
+    size = style.size or _default_size(composition, stills)
     write_pictures(path, _pictures(composition, stills, size), size, playback.fps)
 
 
-def _usual_size(composition: Composition, stills: list[Still]) -> tuple[int, int]:
-    """Return the even width and height [px] that the view fills, above caption and legend."""
+def _default_size(composition: Composition, stills: list[Still]) -> tuple[int, int]:
+    """Return the even width and height [px] for the view, the caption and the legend."""
     low, high, _ = composition.room(stills)
     width, height = np.maximum((high - low) * LONGEST / (high - low).max(), SHORTEST)
-    letters = _letters(width, height)
-    below = letters * CAPTION + len(
-        legend_picture(entries_of(composition, stills), round(width), letters)
-    )
+    letters = _type_scale(width, height)
+    legend = legend_picture(entries_of(composition, stills), round(width), letters)
+    below = letters * CAPTION + len(legend)
     return 2 * round(width / 2), 2 * round((height + below) / 2)
 
 
-def _letters(width: float, height: float) -> float:
-    """Return the size of letters in a film of some width and height [px], 1 in a sheet."""
-    return float(np.clip(((width, height) / USUAL).min(), SMALLEST, 1.0))
+def _type_scale(width: float, height: float) -> float:
+    """Return the scale of type in a film of this width and height [px], 1 in a contact sheet."""
+    return float(np.clip(((width, height) / FULL_TYPE_SIDES).min(), SMALLEST_TYPE, 1.0))
 
 
 def _pictures(
     composition: Composition, stills: list[Still], size: tuple[int, int]
 ) -> Iterator[Array]:
-    """Yield the picture (height, width, 3) of each still; a frame that stays is drawn once."""
+    """Yield the picture (height, width, 3) of each still; repeated frames are drawn once."""
     width, height = size
-    letters = _letters(width, height)
+    letters = _type_scale(width, height)
     legend = legend_picture(entries_of(composition, stills), width, letters)
     room = height - round(letters * CAPTION) - len(legend)
     if room < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
     with Renderer(composition, stills, (width, room)) as renderer:
-        for _, alike in groupby(counted(stills, "pictures"), key=lambda still: still.index):
-            still, *others = alike
+        for _, repeated in groupby(counted(stills, "pictures"), key=lambda still: still.index):
+            still, *repeats = repeated
             caption = caption_picture(still.caption, width, letters)
             picture = np.concatenate([renderer.picture(still), caption, legend])
-            yield from [picture] * (1 + len(others))
+            yield from [picture] * (1 + len(repeats))
 
 
 def write_pictures(
@@ -142,10 +147,7 @@ def write_pictures(
 
 
 def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], fps: float) -> None:
-    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError for an incomplete film.
-
-    That is asked of the film itself, for imageio-ffmpeg does not ask how ffmpeg ended.
-    """
+    """Write H.264 with ffmpeg from the extra "movie". Raises OSError for an incomplete film."""
     import imageio_ffmpeg
 
     options: dict[str, Any] = dict(
@@ -158,6 +160,7 @@ def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], f
             for picture in pictures:
                 writer.send(np.ascontiguousarray(picture))
                 sent += 1
+        # imageio-ffmpeg ignores ffmpeg's exit status, so count the file's pictures
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
     except (OSError, RuntimeError):
         count = -1
@@ -166,9 +169,8 @@ def _write_video(path: Path, pictures: Iterable[Array], size: tuple[int, int], f
 
 
 def _write_images(path: Path, pictures: Iterable[Array], fps: float) -> None:
-    """Write an endless GIF or animated WebP by Pillow, which takes all pictures at once."""
+    """Write an endless GIF or animated WebP with Pillow, which needs all pictures in memory."""
     images = [Image.fromarray(picture) for picture in pictures]
-    options: dict[str, Any] = dict(
-        duration=1000 / fps, loop=0, quality=80, method=4
-    )  # these two of WebP
+    # quality and method apply to WebP only
+    options: dict[str, Any] = dict(duration=1000 / fps, loop=0, quality=80, method=4)
     images[0].save(path, save_all=True, append_images=images[1:], **options)

@@ -1,7 +1,8 @@
-"""Meshes to be drawn: the surface, and cells and springs of the half of the lattice behind its middle.
+"""Meshes to be drawn: the refined surface, and the cells of the rear half of the lattice.
 
-Triangles of the surface that are larger than cells follow the cells that carry them, and sharp edges are sharp. Drawn
-points are those of the file, in their order, then those put into long edges, then copies along sharp edges.
+Surface triangles larger than a cell are refined to follow the cells that carry them, and points on
+sharp edges are duplicated. The drawn points are the file's points in their order, then points on
+divided edges, then duplicates.
 """
 
 from dataclasses import replace
@@ -17,21 +18,23 @@ from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
-SHARP = 30.0  # [degrees] between the normals of two triangles: beyond it their edge is sharp
-HELD = 0.5  # pinned or led share of the surface beyond which it is painted as fixed
-MOST = 30_000  # triangles, roughly: however small the cells, edges are not divided into more
-CORNERS = np.array(
-    [[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
-)  # of a cell, VTK's order
+# angle between normals above which an edge is sharp [degrees]
+SHARP = 30.0
+# fixed share of a surface point above which it has the colour of fixed parts
+FIXED_SHARE = 0.5
+# approximate limit of triangles after refinement
+MAX_TRIANGLES = 30_000
+# corners of a cell in VTK's order
+CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
 
 
 def drawn(subject: Drawable) -> Drawable:
-    """Return bodies with their surface refined and split for drawing."""
+    """Return bodies with their surface refined, and split at sharp edges."""
     return _split(_refined(subject))
 
 
 def _refined(subject: Drawable) -> Drawable:
-    """Return bodies with no edge of the surface longer than a cell; cells carry the new points."""
+    """Return bodies whose surface has no edge longer than a cell; cells carry the new points."""
     rest = subject.rest
     cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
     if cell == 0:
@@ -39,7 +42,7 @@ def _refined(subject: Drawable) -> Drawable:
     a, b, c = rest.points[subject.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
     points, triangles, part_of = subdivided(
-        rest.points, subject.triangles, max(cell, np.sqrt(2 * area / MOST))
+        rest.points, subject.triangles, max(cell, np.sqrt(2 * area / MAX_TRIANGLES))
     )
     body = np.append(rest.body_of_point, np.empty(len(points) - len(rest.points), int))
     body[triangles] = body[subject.triangles[part_of, :1]]
@@ -53,7 +56,7 @@ def _refined(subject: Drawable) -> Drawable:
 
 
 def surface_of(points: Array, triangles: Array) -> pv.PolyData:
-    """Return points (v, 3) and triangles (f, 3) as VTK's data set."""
+    """Return points (v, 3) and triangles (f, 3) as a VTK data set."""
     surface: pv.PolyData = pv.PolyData.from_regular_faces(points, triangles)
     return surface
 
@@ -61,10 +64,10 @@ def surface_of(points: Array, triangles: Array) -> pv.PolyData:
 def subdivided(
     points: Positions, triangles: Indices, longest: float
 ) -> tuple[Positions, Indices, Indices]:
-    """Return a surface whose edges longer than `longest` [m] are divided.
+    """Return a surface whose edges longer than ``longest`` [m] are divided.
 
-    It is points (p, 3), the first of which are those given, triangles (f, 3), and of each the number
-    of the given triangle (f,) that it is part of.
+    Returns points (p, 3), the given points first; triangles (f, 3); and for each triangle the
+    number (f,) of the given triangle that contains it.
     """
     surface = surface_of(points, triangles)
     surface.cell_data["part of"] = np.arange(len(triangles))
@@ -75,7 +78,8 @@ def subdivided(
 def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array:
     """Return the matrix (p, n) of trilinear weights of nodes at points (p, 3) of bodies (p,)."""
     corners = rest.cells[rest.cells_around(points, body)]
-    low, high = rest.nodes[corners[:, 0]], rest.nodes[corners[:, 6]]
+    low = rest.nodes[corners[:, 0]]
+    high = rest.nodes[corners[:, 6]]
     u = np.clip((points - low) / (high - low), 0, 1)[:, None]
     weights = np.where(CORNERS, u, 1 - u).prod(axis=2)
     starts = 8 * np.arange(len(points) + 1)
@@ -83,7 +87,7 @@ def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array
 
 
 def _split(subject: Drawable) -> Drawable:
-    """Return bodies with a copy of each surface point for every smooth part of the surface around it."""
+    """Return bodies whose surface points are duplicated for each smooth patch around them."""
     rest = subject.rest
     first = first_of_equal(np.column_stack([rest.body_of_point, rest.points]))
     origin, triangles = split_at_edges(rest.points, first[subject.triangles])
@@ -92,9 +96,10 @@ def _split(subject: Drawable) -> Drawable:
 
 
 def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indices]:
-    """Return the original (d,) of each drawn point, the first v themselves, and triangles (f, 3).
+    """Return the original point (d,) of each drawn point, and triangles (f, 3) of drawn points.
 
-    Two corners of triangles at one point stay one drawn point where no sharp edge parts them.
+    The first v drawn points are the originals. A point has a duplicate for each further smooth
+    patch that sharp edges separate around it.
     """
     surface = surface_of(points, triangles)
     options: dict[str, Any] = dict(
@@ -104,16 +109,22 @@ def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indi
     return split["pyvistaOriginalPointIds"], split.regular_faces
 
 
-BOUNDARY, INTERIOR = 1, 2  # lattice/cell_kind
-SHRUNK = 0.86  # of a cell's size, so that neighbours are told apart
-THROUGH = 0.3  # opacity of a body whose lattice is shown
-Cut = dict[int, Indices]  # cells (c, 8) by their kind, of the half that remains
+# values of lattice/cell_kind
+BOUNDARY, INTERIOR = 1, 2
+# scale of a drawn cell, which separates it from its neighbours
+CELL_SCALE = 0.86
+# opacity of a body whose cells are shown
+CUT_OPACITY = 0.3
+# cells (c, 8) of the remaining half, by their kind
+Cut = dict[int, Indices]
+# colour and legend of each kind
 KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "interior cell")}
 
 
 def cut_open(subject: Drawable, camera: Camera) -> Cut:
-    """Return the half of the lattice behind the middle of the body at rest."""
-    cells, depth = subject.rest.cells, subject.rest.nodes @ camera.to_eye
+    """Return the cells behind the middle of the body at rest, as seen by the camera."""
+    cells = subject.rest.cells
+    depth = subject.rest.nodes @ camera.to_eye
     behind = depth[cells].mean(axis=1) <= (depth.min() + depth.max()) / 2
     kind = subject.array("lattice/cell_kind")
     parts = {number: cells[behind & (kind == number)] for number in KINDS}

@@ -11,12 +11,19 @@ from msmpetsc.geometry.surface import bounds_of
 from msmpetsc.view.camera import Camera, unit
 from msmpetsc.view.drawable import Drawable
 
-ARROW = 0.2  # length of an arrow, of the body's longest side
-NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
-CUT = 1.3  # a longer box is cut to this, of the bodies' extent
-MARGIN = 0.08  # around the bodies, of their longest extent
-GROUND = 1.6  # of the bodies' longest extent: as far from their middle a ground is drawn
-THICKNESS = 0.02  # of a plate of glass, of the bodies' longest extent
+# length of an arrow, relative to the longest side of the largest body
+ARROW = 0.2
+# The following lengths are relative to the longest side of the box around all bodies.
+# largest distance of an obstacle that is shown
+NEAR = 0.5
+# largest side of a shown box, relative to the same side of the box around the bodies
+CUT = 1.3
+# margin around the bodies
+MARGIN = 0.08
+# radius of a ground
+GROUND = 1.6
+# thickness of a glass plate
+THICKNESS = 0.02
 
 
 @dataclass(frozen=True)
@@ -27,13 +34,13 @@ class Ground:
     normal: Floats
 
     def below(self, points: Positions) -> Positions:
-        """Return the projection of points (n, 3) onto the plane."""
+        """Return points (n, 3) projected onto the plane."""
         return points - np.outer((points - self.corners[0]) @ self.normal, self.normal)
 
 
 @dataclass(frozen=True)
 class Ball:
-    """A spherical obstacle: center (3,), radius [m], and corners (8, 3) of the visible part of its box."""
+    """A sphere: center (3,), radius [m], corners (8, 3) of the visible part of its box."""
 
     center: Floats
     radius: float
@@ -42,9 +49,9 @@ class Ball:
 
 @dataclass(frozen=True)
 class MeshObstacle:
-    """An obstacle with a surface: its number, and corners (8, 3) as of a Ball.
+    """An obstacle with a mesh: its number, and corners (8, 3) of the visible part of its box.
 
-    turn, by : (3, 3) and (3,) [m]: it is at x @ turn + by of points x at time 0
+    turn, by : (3, 3) and (3,) [m]; a point x at time 0 is now at x @ turn + by
     """
 
     number: int
@@ -53,18 +60,18 @@ class MeshObstacle:
     seen: Positions
 
     def moved(self, points: Positions) -> Positions:
-        """Return where points (n, 3) [m] of it at time 0 are."""
+        """Return the present positions of points (n, 3) [m] at time 0."""
         return np.asarray(points @ self.turn + self.by)
 
 
 @dataclass(frozen=True)
 class Overlays:
-    """Obstacles and force arrows of one picture.
+    """Obstacles and force arrows of a picture.
 
-    grounds : planes drawn as they are
-    glass   : (8, 3) corners each, of boxes and of planes that would hide the body; corner number 4i + 2j + k
-    arrows  : (2, 3) each, tail and tip
-    balls   : of spheres, seen through like glass
+    grounds : planes that do not hide the bodies
+    glass   : corners (8, 3) of boxes and of planes in front; corner (i, j, k) is 4i + 2j + k
+    arrows  : tail and tip (2, 3) of each arrow
+    balls   : spheres, drawn as glass
     meshes  : obstacles that are meshes or functions
     """
 
@@ -76,7 +83,7 @@ class Overlays:
 
     @property
     def obstacles(self) -> Positions:
-        """Corners (n, 3) of all obstacles but grounds, as far as they are visible [m]."""
+        """Corners (n, 3) of the visible parts of all obstacles except grounds [m]."""
         seen = [*(ball.seen for ball in self.balls), *(mesh.seen for mesh in self.meshes)]
         return np.concatenate([np.empty((0, 3)), *self.glass, *seen])
 
@@ -84,9 +91,10 @@ class Overlays:
 def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera) -> Overlays:
     """Return the obstacles and force arrows of a frame.
 
-    bodies : (b, 3) surface points of all pictures [m], which say how much of an obstacle is worth showing
+    bodies : surface points (b, 3) of all pictures [m]; obstacles are clipped to their surroundings
     """
-    time, solids = float(subject.times[index]), subject.solids
+    time = float(subject.times[index])
+    solids = subject.solids
     shown = Overlays(
         arrows=[arrow for arrow in _arrows(subject, index) if _is_near(arrow[[0, 0]], bodies)]
     )
@@ -101,7 +109,8 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
                 path.moved(corners, pose) for corners in _box(np.array(obstacle.box), seen_from_it)
             )
         elif obstacle.shape == "sphere":
-            center, radius = np.array(obstacle.center) + pose[:3], obstacle.radius or 0.0
+            center = np.array(obstacle.center) + pose[:3]
+            radius = obstacle.radius or 0.0
             seen = _box(np.array([center - radius, center + radius]), bodies)
             shown.balls.extend(Ball(center, radius, corners) for corners in seen)
         elif obstacle.shape == "plane":
@@ -126,23 +135,26 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
 def _add_plane(
     shown: Overlays, point: Floats, normal: Floats, bodies: Positions, camera: Camera
 ) -> None:
-    """Add a near plane, as ground or, where it hides the body, as a plate of glass."""
-    if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
+    """Add a plane near the bodies: as ground, or as a glass plate if it hides the bodies."""
+    extent = _longest_side(bodies)
+    if ((bodies - point) @ normal).min() > NEAR * extent:
         return
     sides = _sides(normal)
-    if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:  # alike from anywhere
+    if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:
         middle = (bodies.min(axis=0) + bodies.max(axis=0)) / 2
         middle = middle - ((middle - point) @ normal) * normal
         corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ sides
-        shown.grounds.append(Ground(middle + GROUND * _reach(bodies) * corners, normal))
-    else:  # a plate where the bodies stand before the plane, with a margin
-        reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
-        plate = np.array([reached.min(axis=0) - margin, reached.max(axis=0) + margin])
+        shown.grounds.append(Ground(middle + GROUND * extent * corners, normal))
+    else:
+        across = bodies @ sides.T
+        margin = MARGIN * extent
+        plate = np.array([across.min(axis=0) - margin, across.max(axis=0) + margin])
         front = np.array([*product(*plate.T)]) @ sides + (point @ normal) * normal
-        shown.glass.append(np.concatenate([front, front - THICKNESS * _reach(bodies) * normal]))
+        shown.glass.append(np.concatenate([front, front - THICKNESS * extent * normal]))
 
 
-def _reach(bodies: Positions) -> float:
+def _longest_side(bodies: Positions) -> float:
+    """Return the longest side [m] of the box around points (n, 3)."""
     return float(np.ptp(bodies, axis=0).max())
 
 
@@ -154,7 +166,7 @@ def _sides(normal: Floats) -> Rows:
 
 
 def _box(box: Positions, bodies: Positions) -> list[Positions]:
-    """Return corners (8, 3) of a box (2, 3), clipped near the bodies; none for a distant box."""
+    """Return the corners (8, 3) of a box (2, 3), clipped near the bodies; [] if it is distant."""
     low, high = bodies.min(axis=0), bodies.max(axis=0)
     extent = high - low
     margin = (CUT - 1) / 2 * extent
@@ -166,20 +178,21 @@ def _box(box: Positions, bodies: Positions) -> list[Positions]:
 
 
 def _is_near(box: Positions, bodies: Positions) -> bool:
-    """Return whether a box (2, 3) is near enough to the bodies to be shown beside them."""
+    """Return whether a box (2, 3) is near enough to the bodies to be shown."""
     gap = np.maximum(box[0] - bodies.max(axis=0), bodies.min(axis=0) - box[1]).max()
-    return bool(gap <= NEAR * _reach(bodies))
+    return bool(gap <= NEAR * _longest_side(bodies))
 
 
 def _arrows(subject: Drawable, index: int) -> list[Positions]:
-    time, rest = float(subject.times[index]), subject.rest
+    """Return tail and tip (2, 3) of the arrow of each force that acts at a frame."""
+    time = float(subject.times[index])
+    rest = subject.rest
     length = ARROW * np.ptp(rest.bounds, axis=1).max()
     arrows = []
     for table in subject.scene.tables("force"):
         force = table.table
-        total = total_of(force.total or (0.0, 0.0, 0.0)).value_at(
-            time
-        )  # a function has no one direction
+        # a force given by a function has no single direction, so no arrow
+        total = total_of(force.total or (0.0, 0.0, 0.0)).value_at(time)
         if (
             within(time, force.start, force.stop)
             and any(total)

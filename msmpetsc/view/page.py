@@ -1,8 +1,8 @@
-"""A web page of a result in one file: the body turns with the mouse, its frames play under a slider.
+"""A web page of a result in a single file: the mouse turns the body, a slider plays its frames.
 
-page.html is its frame, page.css its look, page*.js draws and steers it; this file says what is drawn. Positions are
-whole numbers of 16 bits over the box around all frames. Frame by frame they are what is left of a prediction that goes
-straight on from the two frames before, deflated and in base64.
+page.html, page.css and page*.js contain layout and drawing; this module supplies the data.
+Positions are 16-bit integers over the box around all frames. A frame is stored as residual of the
+linear extrapolation from the two previous frames, deflated and base64-encoded.
 """
 
 import base64
@@ -29,25 +29,27 @@ from msmpetsc.view.film import usual_speed
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.overlays import Overlays
 
-MOST = 20e6  # [byte]: a page of more frames takes fewer of them
-LEVELS = 65535  # of a coordinate
+# size of a page [byte] above which frames are left out
+MAX_BYTES = 20e6
+# largest 16-bit integer
+LEVELS = 65535
 PARTS = files("msmpetsc.view")
 SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js")
 
 
 def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Style) -> None:
-    """Write the page of these frames, or of fewer if it would be larger than `MOST`.
+    """Write a page of these frames, or of a subset if the page would exceed ``MAX_BYTES``.
 
-    Raises InputError where they cannot be drawn or the page not be written.
+    Raises InputError if the frames cannot be drawn or the page cannot be written.
     """
     composition = composition_of(drawn(subject), frames, style)
     chosen = list(frames)
     while True:
         streams = packed_frames(composition, chosen)
         size = sum(map(len, streams.values())) * 4 / 3
-        if size <= MOST or len(chosen) < 3:
+        if size <= MAX_BYTES or len(chosen) < 3:
             break
-        step = max(2, int(np.ceil(size / MOST)))
+        step = max(2, int(np.ceil(size / MAX_BYTES)))
         chosen = [*chosen[:-1:step], chosen[-1]]
     if len(chosen) < len(frames):
         log.info(
@@ -55,9 +57,10 @@ def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Styl
             path,
             len(chosen),
             len(frames),
-            MOST / 1e6,
+            MAX_BYTES / 1e6,
         )
-    states: dict[bytes, int] = {}  # pinned or led shares of the points times 255, each state once
+    # distinct fields of the fixed shares, in 8 bits
+    states: dict[bytes, int] = {}
     fixed = (np.rint(255 * composition.subject.fixed(index)).astype(np.uint8) for index in chosen)
     numbers = [states.setdefault(mask.tobytes(), len(states)) for mask in fixed]
     streams["fixed"] = zlib.compress(b"".join(states))
@@ -79,28 +82,34 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
 def quantised(
     points: Callable[[int], Positions], frames: Iterable[int], box: Positions
 ) -> Iterator[Indices]:
-    """Yield the points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
+    """Yield the points (v, 3) of each frame as 16-bit integers over a box (2, 3) [m]."""
     scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
     for index in counted(list(frames), "frames packed"):
         yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
 
 
 def residuals(frames: Iterable[Indices]) -> Iterator[bytes]:
-    """Yield each frame less its linear extrapolation 2 p - q from the frames p, q before, low bytes first.
+    """Yield each frame's residual to the linear extrapolation 2 p - q from the frames p, q before.
 
-    A residual r is stored as 2 r, or -2 r - 1 where it is negative, so that small ones have no high byte.
+    A residual r is stored as 2 r, or as -2 r - 1 if negative, so that small values have a zero high
+    byte. The low bytes of a frame precede its high bytes.
     """
     p = q = None
     for frame in frames:
-        predicted = np.zeros_like(frame) if p is None else p if q is None else 2 * p - q
-        left = (frame - predicted + 2**15) % 2**16 - 2**15
-        coded = np.where(left < 0, -2 * left - 1, 2 * left).astype(np.uint16)
+        if p is None:
+            predicted = np.zeros_like(frame)
+        elif q is None:
+            predicted = p
+        else:
+            predicted = 2 * p - q
+        residual = (frame - predicted + 2**15) % 2**16 - 2**15
+        coded = np.where(residual < 0, -2 * residual - 1, 2 * residual).astype(np.uint16)
         yield (coded & 255).astype(np.uint8).tobytes() + (coded >> 8).astype(np.uint8).tobytes()
         p, q = frame, p
 
 
 def changes(frames: Iterable[Array]) -> Iterator[bytes]:
-    """Yield the differences (v,) of 8 bits between each frame and the one before it."""
+    """Yield the 8-bit differences (v,) between each frame and the previous frame."""
     before = None
     for frame in frames:
         yield (frame if before is None else frame - before).tobytes()
@@ -108,14 +117,15 @@ def changes(frames: Iterable[Array]) -> Iterator[bytes]:
 
 
 def deflated(parts: Iterable[bytes]) -> bytes:
-    """Return consecutive parts as one deflated stream."""
+    """Return consecutive parts as a single deflated stream."""
     packer = zlib.compressobj(6)
     return b"".join([*map(packer.compress, parts), packer.flush()])
 
 
 def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, Any]:
-    """Return the script's data but the streams."""
-    subject, frames = composition.subject, [still.index for still in stills]
+    """Return the script's data except the streams."""
+    subject = composition.subject
+    frames = [still.index for still in stills]
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
@@ -132,19 +142,19 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
 
 
 def json_text(facts: Any) -> str:
-    """Return facts, arrays among them, as JSON."""
+    """Return values, including arrays, as JSON."""
     return json.dumps(facts, separators=(",", ":"), default=np.ndarray.tolist)
 
 
 def distinct(overlays: Sequence[Overlays]) -> dict[str, list[Any]]:
-    """Return each distinct state of obstacles and arrows once, and the state's number of each frame."""
+    """Return the distinct states of obstacles and arrows, and the number of each frame's state."""
     states: dict[str, int] = {}
     numbers = [states.setdefault(json_text(asdict(shown)), len(states)) for shown in overlays]
     return {"states": [json.loads(state) for state in states], "numbers": numbers}
 
 
 def solid_facts(surface: Surface) -> dict[str, Floats]:
-    """Return an obstacle's surface for the script: corners of each triangle, with a normal at each."""
+    """Return an obstacle's surface for the script: corners and normals of each triangle."""
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     tiny = np.finfo(float).tiny
@@ -165,7 +175,8 @@ def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> s
         "title": html.escape(title),
         "css": (PARTS / "page.css").read_text(encoding="utf-8"),
         "script": "\n".join((PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS),
-        "data": json_text(data).replace("<", "\\u003c"),  # which could end the script
+        # a literal "</script>" would end the script
+        "data": json_text(data).replace("<", "\\u003c"),
     }
     text = (PARTS / "page.html").read_text(encoding="utf-8")
     for name, part in parts.items():

@@ -1,4 +1,4 @@
-"""Rendering of bodies, obstacles and arrows by VTK, off screen, with one orthographic camera."""
+"""Rendering of bodies, obstacles and arrows with VTK, off screen, by an orthographic camera."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -13,21 +13,23 @@ from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError
 from msmpetsc.view.colours import ARROW, FIXED, GLASS, GLASS_EDGE, GROUND, SHADOW
 from msmpetsc.view.composition import Composition, Still
-from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, surface_of
+from msmpetsc.view.mesh import CELL_SCALE, CUT_OPACITY, FIXED_SHARE, KINDS, surface_of
 from msmpetsc.view.overlays import Ground, Overlays
 
 GLASS_OPACITY = 0.22
-FADING, AROUND = 0.55, 72  # share of a ground's radius from which on it fades; corners of its rim
+# share of a ground's radius from which it fades, and number of corners of its rim
+FADING, RIM_CORNERS = 0.55, 72
 
 
 class Renderer(AbstractContextManager["Renderer"]):
-    """An off-screen window in which stills are drawn; a context, which closes it."""
+    """An off-screen window that draws stills; a context manager, which closes the window."""
 
     def __init__(self, composition: Composition, stills: Sequence[Still], size: tuple[int, int]):
-        """Open a window of width and height [px] that has room for all stills."""
+        """Open a window of width and height [px] whose view contains all stills."""
         self._composition = composition
-        low, high, self._depth = composition.room(stills)  # nothing reaches farther towards the eye
-        height = size[1] * ((high - low) / size).max()  # of what is seen [m]
+        low, high, self._depth = composition.room(stills)
+        # height of the view [m]
+        height = size[1] * ((high - low) / size).max()
         with quiet_opengl():
             self._plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
             self._plotter.background_color = pv.Color("white")
@@ -43,11 +45,10 @@ class Renderer(AbstractContextManager["Renderer"]):
             self._plotter.close()
 
     def picture(self, still: Still) -> Array:
-        """Return the picture (height, width, 3) of a still. Raises InputError if the graphics library gives none."""
+        """Return the picture (height, width, 3) of a still. Raises InputError if it is black."""
         with quiet_opengl():
-            self._plotter.suppress_rendering = (
-                True  # or all that is added would be drawn once more, half done
-            )
+            # otherwise each added mesh would render the window
+            self._plotter.suppress_rendering = True
             self._plotter.clear_actors()
             self._draw(still)
             self._plotter.suppress_rendering = False
@@ -58,23 +59,24 @@ class Renderer(AbstractContextManager["Renderer"]):
         return np.asarray(picture)
 
     def _face(self, centre: Floats, height: float) -> None:
-        """Set the orthographic camera on a point (2,) of the picture's plane; height: of what it shows [m]."""
+        """Aim the camera at a point (2,) of the picture's plane; ``height`` is the view's [m]."""
         camera = self._composition.camera
-        view, far = self._plotter.camera, 4 * self._depth
+        view = self._plotter.camera
+        distance = 4 * self._depth
         across, upward = centre
         behind = self._composition.box.mean(axis=0) @ camera.to_eye
         middle = across * camera.right + upward * camera.upward + behind * camera.to_eye
-        view.focal_point, view.position, view.up = (
-            middle,
-            middle + far * camera.to_eye,
-            camera.upward,
-        )
+        view.focal_point = middle
+        view.position = middle + distance * camera.to_eye
+        view.up = camera.upward
         view.parallel_projection = True
         view.parallel_scale = height / 2
-        view.clipping_range = (far / 100, 2 * far)
+        view.clipping_range = (distance / 100, 2 * distance)
 
     def _draw(self, still: Still) -> None:
-        subject, colouring = self._composition.subject, self._composition.colouring
+        """Add a still's bodies, cells, obstacles and arrows to the window."""
+        subject = self._composition.subject
+        colouring = self._composition.colouring
         surface = surface_of(subject.surface(still.index), subject.triangles)
         surface["colours"] = colouring.table[colouring.numbers(still.index)]
         surface["fixed"] = subject.fixed(still.index)
@@ -83,30 +85,27 @@ class Renderer(AbstractContextManager["Renderer"]):
         shading: dict[str, Any] = dict(
             smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08
         )
-        shading["opacity"] = THROUGH if still.cut else 1.0
-        # The border crosses triangles, so it is as smooth as the share that is fixed.
-        # A clip of PolyData would merge the points along sharp edges.
-        free, held = surface.cast_to_unstructured_grid().clip_scalar(
-            scalars="fixed", value=HELD, both=True
+        shading["opacity"] = CUT_OPACITY if still.cut else 1.0
+        # clipping PolyData would merge the points along sharp edges
+        free, fixed = surface.cast_to_unstructured_grid().clip_scalar(
+            scalars="fixed", value=FIXED_SHARE, both=True
         )
-        for part, paint in (free, dict(scalars="colours", rgb=True)), (held, dict(color=FIXED)):
+        for part, paint in (free, dict(scalars="colours", rgb=True)), (fixed, dict(color=FIXED)):
             if part.n_cells:
                 self._plotter.add_mesh(part, **paint, **shading)
         for kind, cells in (still.cut or {}).items():
             grid = pv.UnstructuredGrid(
                 {pv.CellType.HEXAHEDRON: cells}, subject.nodes(still.index)
-            ).shrink(SHRUNK)
+            ).shrink(CELL_SCALE)
             self._plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
         self._draw_obstacles(still.overlays)
-        for (
-            tail,
-            tip,
-        ) in still.overlays.arrows:  # nearer to the eye is the same point of the picture
-            _draw_arrow(
-                self._plotter, tail + 2 * self._depth * self._composition.camera.to_eye, tip - tail
-            )
+        # an arrow moved towards the eye stays in place and is not hidden
+        towards_eye = 2 * self._depth * self._composition.camera.to_eye
+        for tail, tip in still.overlays.arrows:
+            _draw_arrow(self._plotter, tail + towards_eye, tip - tail)
 
     def _draw_obstacles(self, overlays: Overlays) -> None:
+        """Add glass, spheres and obstacle meshes to the window."""
         for corners in overlays.glass:
             box = pv.StructuredGrid()
             box.points = corners
@@ -122,13 +121,13 @@ class Renderer(AbstractContextManager["Renderer"]):
                 theta_resolution=96,
                 phi_resolution=96,
             )
-            look: dict[str, Any] = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
-            self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **look)
+            shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
+            self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **shading)
         for obstacle in overlays.meshes:
             solid = self._composition.subject.solids[obstacle.number]
             mesh = surface_of(obstacle.moved(solid.points), solid.triangles)
-            look = dict(smooth_shading=True, split_sharp_edges=True, ambient=0.42, diffuse=0.62)
-            self._plotter.add_mesh(mesh, color=GLASS, **look)
+            shading = dict(smooth_shading=True, split_sharp_edges=True, ambient=0.42, diffuse=0.62)
+            self._plotter.add_mesh(mesh, color=GLASS, **shading)
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None:
@@ -136,7 +135,12 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     middle = ground.corners.mean(axis=0)
     radius = float(np.linalg.norm(ground.corners[1] - ground.corners[0])) / 2
     disk = pv.Disc(
-        center=middle, inner=0, outer=radius, normal=ground.normal.tolist(), r_res=20, c_res=AROUND
+        center=middle,
+        inner=0,
+        outer=radius,
+        normal=ground.normal.tolist(),
+        r_res=20,
+        c_res=RIM_CORNERS,
     )
     share = np.linalg.norm(disk.points - middle, axis=1) / radius
     share = np.clip((1 - share) / (1 - FADING), 0, 1)
@@ -146,12 +150,14 @@ def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None
     ).astype(np.uint8)
     plotter.add_mesh(disk, scalars="look", rgb=True, lighting=False)
     shadow = body.copy()
-    lift = 1e-3 * radius  # or the two surfaces would flicker into each other
+    # above the disk, because coincident surfaces flicker
+    lift = 1e-3 * radius
     shadow.points = ground.below(body.points) + lift * ground.normal
     plotter.add_mesh(shadow, color=SHADOW, lighting=False)
 
 
 def _draw_arrow(plotter: pv.Plotter, tail: Floats, along: Floats) -> None:
+    """Draw an arrow from its tail (3,) along a vector (3,)."""
     shape: dict[str, Any] = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045)
     shape |= dict(tip_resolution=40, shaft_resolution=40, scale=float(np.linalg.norm(along)))
     arrow = pv.Arrow(start=tail.tolist(), direction=along.tolist(), **shape)
@@ -167,7 +173,7 @@ def quiet_opengl() -> Iterator[None]:
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 2)
     try:
-        # With neither screen nor EGL, VTK falls back on OSMesa, which is hardly found and crashes it if absent.
+        # without screen and EGL, VTK chooses OSMesa, and crashes if OSMesa is missing
         if vtkRenderWindow().IsA("vtkOSOpenGLRenderWindow"):
             raise InputError("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
         yield

@@ -1,7 +1,7 @@
-"""Contact sheets: some moments of a result in rows of one picture, or a scene before its first step.
+"""Contact sheets: rows of pictures of a result's moments, or of a scene before its first step.
 
-All panels are seen by one camera without perspective, drawn one by one and pasted: so scale and height can be compared
-between them. Beside each body stand the obstacles and forces of its own time.
+A common orthographic camera makes lengths comparable between the panels. Each panel shows the
+obstacles and forces at its own time.
 """
 
 from collections.abc import Sequence
@@ -20,9 +20,12 @@ from msmpetsc.view.drawable import Drawable, drawable_of_result
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
 
-PANEL, NARROWEST = np.array([400, 870]), 240  # [px]: at most, and the least that a caption needs
-ROW = 2000  # [px]: wider ones are broken into several
-COUNT = 5  # moments, where nothing is said
+# largest sides of a panel, and least width for a caption [px]
+PANEL, NARROWEST = np.array([400, 870]), 240
+# width of the sheet above which panels are broken into rows [px]
+ROW = 2000
+# default number of moments
+COUNT = 5
 
 
 def contact_sheet(
@@ -32,9 +35,12 @@ def contact_sheet(
     count: int | None = None,
     style: Style | None = None,
 ) -> Path:
-    """Draw the surface at some moments of a result; return png_path.
+    """Draw a result's surface at some moments as a PNG file; return ``png_path``.
 
-    frames : these, or (count) as many as `choose_moments` finds, or those at the scene's picture.times
+    frames : frame numbers; by default the frames at the scene's picture.times, if it has any
+    count  : number of moments that ``choose_moments`` selects, if ``frames`` is not given
+
+    Raises InputError if the result cannot be read or drawn.
     """
     style = style or Style()
     with plain_damage(Path(h5_path)), Result(h5_path) as run:
@@ -51,15 +57,16 @@ def contact_sheet(
 
 
 def draw_panels(composition: Composition, stills: Sequence[Still], path: str | Path) -> None:
-    """Draw stills of a composition, in rows of panels above the legend.
+    """Draw stills of a composition in rows of panels above the legend.
 
-    The panels are drawn one by one: a graphics library's own pictures end at some width, and beyond it they are black.
+    Each panel is rendered separately, because graphics libraries limit the width of a window.
     """
     low, high, _ = composition.room(stills)
-    scale = ((composition.style.size or PANEL) / (high - low)).min()  # [px/m]
+    # [px/m]
+    scale = ((composition.style.size or PANEL) / (high - low)).min()
     width, height = (
         int(side) for side in np.maximum([NARROWEST, 1], np.round(scale * (high - low)))
-    )  # [px]
+    )
     rows = -(-len(stills) // max(1, ROW // width))
     columns = -(-len(stills) // rows)
     sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
@@ -91,11 +98,11 @@ def _moments(
 
 
 def choose_moments(run: Result, count: int) -> dict[int, str]:
-    """Return at most `count` characteristic frames in order of time, each with its reason.
+    """Return at most ``count`` characteristic frames in order of time, each with its reason.
 
-    In order of importance: the first and the last; the greatest elastic energy; before it the greatest kinetic
-    energy (a falling body is fastest just before it touches the ground); after it the greatest potential energy
-    (the top of the leap). Where these coincide, the middle of the longest gap between chosen frames is added.
+    The first and the last frame have priority, then the greatest elastic energy. Next come the
+    greatest kinetic energy before it (contact of a falling body) and the greatest potential energy
+    after it (top of the bounce). Remaining frames halve the longest gaps between chosen frames.
     """
     kinetic, elastic, potential = (
         run.frames[name][:] for name in ("kinetic", "elastic", "potential")

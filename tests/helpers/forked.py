@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
 
-from msmpetsc.study.forkserver import SERVER, Forked, enter, leave, speak_into
+from msmpetsc.study.forkserver import SERVER, Forked, enter, leave, redirect_output
 
 STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new; mv $OMPI_COMM_WORLD_RANK.new $OMPI_COMM_WORLD_RANK.env
 read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
@@ -100,7 +100,7 @@ def _hand_on(children: list, mpiexec: subprocess.Popen, folder: str, end: float)
 
 def _rank(arguments: list[str], streams: list[Path], environment: dict[str, str]) -> None:
     enter(environment["PWD"], environment)
-    speak_into(streams)
+    redirect_output(streams)
     status = 0
     try:
         _python(arguments)

@@ -11,7 +11,12 @@ from study_stand_in import blank_frame
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.writer import ResultFile
-from msmpetsc.study.metrics import distance_of_shapes, of_frames, together, trajectory_error
+from msmpetsc.study.metrics import (
+    distance_of_shapes,
+    frame_metrics,
+    merge_repeats,
+    trajectory_error,
+)
 
 
 def result(
@@ -63,7 +68,7 @@ def test_means_are_of_steps_and_leave_the_first_frame_out(tmp_path: Path):
         tmp_path / "x.h5", [0, 0.2, 0.4, 0.6], positions, [1], wall_time=[0, 9.0, 2.0, 4.0], iterations=[0, 50, 4, 8],
         ksp_its=[0, 0, 40, 0], products=[0, 0, 60, 12], step_error=[0, 0.3, 0.4, 0.0],
     )  # fmt: skip
-    row = of_frames(file, 0.1)
+    row = frame_metrics(file, 0.1)
     assert (row["frames"], row["steps"]) == (4, 6)
     assert row["time_frame"] == pytest.approx(6 / 4)
     assert (row["iterations"], row["ksp_its"], row["products"]) == (3, 10, 18)
@@ -76,9 +81,9 @@ def test_repeats_become_medians_with_their_range_and_a_single_run_has_none():
         {"time_frame": time, "memory": memory, "true_error": error} for time, memory, error in known
     ]
     ends = {"time_frame_min": 0.1, "time_frame_max": 0.3}
-    assert together(runs) == {"time_frame": 0.2, "memory": 7, "true_error": 0.1} | ends
-    assert together(runs[:1]) == runs[0]
-    assert together([*runs[:2], {}]).items() >= ({"time_frame": 0.2} | ends).items()
+    assert merge_repeats(runs) == {"time_frame": 0.2, "memory": 7, "true_error": 0.1} | ends
+    assert merge_repeats(runs[:1]) == runs[0]
+    assert merge_repeats([*runs[:2], {}]).items() >= ({"time_frame": 0.2} | ends).items()
 
 
 def block(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -122,5 +127,5 @@ def test_energy_is_not_compared_where_a_load_acts_and_a_number_that_is_none_has_
         kinetic=[1] * 4,
         potential=[0, 0, 0, -1],
     )
-    row = of_frames(path, 0.1)
+    row = frame_metrics(path, 0.1)
     assert "energy_left" not in row and row["shape_error"] is None

@@ -48,7 +48,7 @@ def test_three_sizes_tell_order_and_error(order: float, sizes: tuple):
     e = [0.03 * size**order for size in sizes]
     law = error_law(sizes, [e[0] - e[1], e[1] - e[2]], ORDERS)
     assert (
-        law.seen
+        law.observed
         and law.order == pytest.approx(order)
         and law.error(0.5) == pytest.approx(0.03 * 0.5**order)
     )
@@ -58,11 +58,11 @@ def test_three_sizes_tell_order_and_error(order: float, sizes: tuple):
 def test_an_order_that_cannot_be_is_not_believed():
     """Distances that do not shrink have no order: the least is taken, which makes the error the greatest."""
     stuck = error_law((4, 2, 1), [0.05, 0.05], ORDERS)
-    assert not stuck.seen and stuck.order == 1 and stuck.error(1) == pytest.approx(0.05)
+    assert not stuck.observed and stuck.order == 1 and stuck.error(1) == pytest.approx(0.05)
     steep = error_law((4, 2, 1), [0.5, 0.01], ORDERS)
     assert steep.order == 2.2 and steep.error(1) == pytest.approx(0.01 / (2**2.2 - 1))
     two = error_law((2, 1), [0.05], ORDERS)
-    assert not two.seen and two.error(1) == pytest.approx(0.05)
+    assert not two.observed and two.error(1) == pytest.approx(0.05)
 
 
 def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
@@ -70,8 +70,8 @@ def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
     sizes, errors = (4, 1.4, 1), (0.4, 0.16, 0.08)
     near = error_law(sizes, [0.24, 0.08], ORDERS)
     wide = error_law(sizes, [0.24, 0.08], ORDERS, across=errors[0] - errors[2])
-    assert not near.seen and near.error(1) == pytest.approx(0.2)
-    assert not wide.seen and wide.error(1) == pytest.approx(0.32 / 3)
+    assert not near.observed and near.error(1) == pytest.approx(0.2)
+    assert not wide.observed and wide.error(1) == pytest.approx(0.32 / 3)
     assert error_law((4, 2, 1), [0.05, 0.05], ORDERS, across=0.1).error(1) == pytest.approx(0.05)
     seen = [0.03 * (4**1.5 - 1.4**1.5), 0.03 * (1.4**1.5 - 1)]
     assert error_law(sizes, seen, ORDERS, across=1.0).error(1) == pytest.approx(0.03)

@@ -132,7 +132,7 @@ def test_a_bar_that_turns_is_drawn_as_it_has_turned(tmp_path: Path):
 
 DAMAGE = {
     "obstacle/triangles has numbers outside its 8 points": ("triangles", lambda old: old + 1),
-    "the surfaces of its obstacles are none": ("points", lambda old: old * np.inf),
+    "the points of its obstacles are not finite": ("points", lambda old: old * np.inf),
 }
 
 

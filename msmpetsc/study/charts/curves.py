@@ -1,8 +1,8 @@
-"""Curves of methods: speed against accuracy, surface error over cost, growth with cells.
+"""Charts of methods: cost over error, surface error over cost, growth with the number of cells.
 
-The errors are never mixed. The step error says how far a step is from the exact minimiser of its energy: methods can be
-compared by it where the time step is the same. The trajectory error says how far the run is from the true motion of the
-lattice: explicit and implicit runs of any time step can be compared by it.
+Two errors are kept apart. The step error is the distance of a step from the exact minimiser of its
+energy: it compares methods with the same time step. The trajectory error is the distance of a run
+from the true motion of the lattice: it compares integrators and time steps of any kind.
 """
 
 from collections.abc import Sequence
@@ -39,21 +39,25 @@ from msmpetsc.study.table import (
 )
 
 KIND = "Speed against accuracy"
+# errors for which the cheapest case is reported
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
 FRONT = "Pareto front, or within its noise"
 CAPTION = (
-    "Lower is faster, further left is more exact. A line joins a method's own best points; its other measurements are "
-    "small and hollow. Whiskers reach from the least to the greatest of the repeats, whose median is the point. The "
-    "grey stair is the Pareto front: nothing measured is both cheaper and more exact, errors taken to two digits. "
-    "Ringed are its points, and points whose ranges overlap its own: the repeats do not tell which is cheaper. The "
-    "step error is that of solving a step; the trajectory error is that of the whole motion, time step included."
+    "Lower is faster, further left is more exact. A line joins the Pareto-optimal points of a "
+    "method; its other points are small and hollow. A point is the median of the repeats; whiskers "
+    "reach from the least to the greatest. The grey stair is the Pareto front: no measured case is "
+    "both cheaper and more exact, with errors compared to two digits. Rings mark its points and "
+    "the points whose ranges overlap theirs, because the repeats do not tell which is cheaper. The "
+    "step error is that of solving a step; the trajectory error is that of the whole motion, time "
+    "step included."
 )
 STEPPING = ("time_step", "substep")
+# columns of a point's tooltip
 TIP = ("least", "greatest", *STEPPING, "error", "max_iterations", "iterations", "ranks")
 
 
 class ErrorMeasure(NamedTuple):
-    """A panel of cost over error: the columns of both, and their labels."""
+    """A panel of cost over error: the columns of both, and their axis titles."""
 
     error: str
     cost: str
@@ -63,6 +67,7 @@ class ErrorMeasure(NamedTuple):
 
     @property
     def columns(self) -> tuple[str, str]:
+        """Columns of the x axis and the y axis."""
         return self.error, self.cost
 
 
@@ -83,18 +88,19 @@ TRAJECTORY = ErrorMeasure(
 
 
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
-    """Return the indices of the Pareto-optimal points, by rising x."""
-    across = np.subtract.outer(x, x)  # of a row's point from a column's
+    """Return the indices of the Pareto-optimal points (least x and least y) in the order of x."""
+    # entry i, j: coordinate of point i less that of point j
+    across = np.subtract.outer(x, x)
     down = np.subtract.outer(y, y)
     beaten = ((across >= 0) & (down >= 0) & ((across > 0) | (down > 0))).any(axis=1)
     return [int(index) for index in np.lexsort((y, x)) if not beaten[index]]
 
 
 def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
-    """Return the front of measured rows, by rising error.
+    """Return the Pareto-optimal rows in the order of their error.
 
-    Errors that read alike, to two digits, count as equal: no step can better the trajectory error
-    of its time step but in the last digits, and those are no reason to pay more.
+    Errors that agree to two digits count as equal: solving a step better improves the trajectory
+    error only in later digits, which justify no cost.
     """
     return rows.iloc[
         front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))
@@ -102,7 +108,7 @@ def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
 
 
 def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFrame:
-    """Return the cheapest row below an error, then the rows whose range overlaps its own."""
+    """Return the cheapest row with an error up to ``level``, and rows with overlapping ranges."""
     rows = measured(rows, *measure.columns)
     rows = rows[rows[measure.error] <= level].sort_values(measure.cost, kind="stable")
     reached = rows.assign(**spread(rows, measure.cost))
@@ -112,7 +118,7 @@ def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFram
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return one chart for each scene and each cell count at which a method was swept."""
+    """Return a chart for each scene and each number of cells at which a method was swept."""
     charts = []
     for scene, rows in grouped(table, "scene").items():
         sizes = grouped(succeeded(rows), "cells")
@@ -137,11 +143,12 @@ def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 
 
 def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
-    """Return the panels that have data."""
+    """Return the chart of a scene, with a panel for each measure of error that has data."""
     step = measured(rows, *STEP.columns)
-    of_steps = grouped(step, "time_step").values()  # only those of one compare by time a frame
+    # only rows of equal time steps compare: take the time step with the most rows
+    by_step = grouped(step, "time_step").values()
     step = max(
-        of_steps, key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=step
+        by_step, key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=step
     )
     panels = [(STEP, step), (TRAJECTORY, measured(rows, *TRAJECTORY.columns))]
     panels = [(measure, shown) for measure, shown in panels if len(shown)]
@@ -160,7 +167,7 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
 
 
 def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
-    """Draw the Pareto front, a line through the best points of each method, and the other points hollow."""
+    """Draw the Pareto front, a line through the best points of each method, other points hollow."""
     step = formatting.worded("time_step", rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
     x = log_axis(measure.x_label, rows[measure.error], ERROR)
@@ -169,7 +176,8 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel = chart.panel(f"over the {measure.name}{at_step}", x, y)
     front = front_rows(rows, measure)
     (_, right), (_, top) = x["scale"]["domain"], y["scale"]["domain"]
-    errors, costs = list(front[measure.error]), list(front[measure.cost])
+    errors = list(front[measure.error])
+    costs = list(front[measure.cost])
     panel.stair([errors[0], *errors, right], [top, *costs, costs[-1]])
     best = concat([front_rows(group, measure) for group in grouped(rows, "label").values()])
     columns = (*measure.columns, *TIP)
@@ -185,7 +193,7 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
 
 
 def cheapest_line(measure: ErrorMeasure, level: float, best: DataFrame) -> str:
-    """Return a sentence that names the cheapest case, and the methods within its noise."""
+    """Return a sentence that names the cheapest case and the methods within its noise."""
     start = f"{formatting.error(level)} or less:"
     if best.empty:
         return f"{start} nothing measured reaches it."
@@ -199,47 +207,49 @@ def cheapest_line(measure: ErrorMeasure, level: float, best: DataFrame) -> str:
 
 
 def cost_of(row: Row, measure: ErrorMeasure) -> str:
-    """Return the cost of a row, with its range over the repeats if known: 10 ms [9 ms to 21 ms]."""
+    """Return the cost of a row with its range over the repeats, if known: 10 ms [9 ms to 21 ms]."""
     ends = [
         formatting.seconds(row[name]) for name in ("least", "greatest") if row[name] is not None
     ]
     return formatting.seconds(row[measure.cost]) + (f" [{' to '.join(ends)}]" if ends else "")
 
 
-# ---- the error of the surface over what it costs
+# ---- surface error over cost
 
 SIZES = "Surface error over cost"
 SIZES_CAPTION = (
-    "Lower is more exact, further left is cheaper. The surface error is how far the surface is from that of a run of "
-    "many more cells and shorter steps, rms over the surface and time, of its largest displacement: cells, time step "
-    "and unfinished steps together. A line joins the cells of one way to step, few at its left end; ringed is the "
-    "Pareto front. What an error takes is read off these lines, between two points by their logarithms."
+    "Lower is more exact, further left is cheaper. The surface error is the distance of the "
+    "surface from that of a run with many more cells and shorter steps: rms over surface and time, "
+    "relative to its largest displacement. It contains the errors of cells, time step and solver. "
+    "A line joins runs of a method from few cells to many; rings mark the Pareto front. The cost "
+    "of an error is interpolated on these lines between the logarithms of two points."
 )
 SIZE = ("time_second", "surface_error")
 
 
 def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return a chart of surface errors over cost and over cells, a curve for each way to step."""
+    """Return a chart of surface error over cost and over cells, with a curve for each method."""
     scenes = grouped(measured(succeeded(table), *SIZE), "scene")
     if not scenes:
         return []
-    own = {label: styles[label] for label in dict.fromkeys(concat(scenes.values())["label"])}
+    labels = dict.fromkeys(concat(scenes.values())["label"])
+    own = {label: styles[label] for label in labels}
     chart = Chart("size", SIZES, SIZES, SIZES_CAPTION, own, columns=2, height=200)
     if len(scenes) == 1:
         chart.name += f"_{next(iter(scenes))}"
         chart.title += f": {next(iter(scenes))}"
     for scene, rows in scenes.items():
         draw_sizes(chart, scene, rows.sort_values("cells", kind="stable"))
-        chart.findings[f"What an error of the surface takes: {scene}"] = lines = []
+        chart.findings[f"Cells and cost for a surface error: {scene}"] = lines = []
         curves = grouped(rows, "label").items()
         for level in (0.1, 0.03, 0.01):
-            ends = ", ".join(f"{label} {reached(of, level)}" for label, of in curves)
+            ends = ", ".join(f"{label} {size_for(group, level)}" for label, group in curves)
             lines.append(f"{100 * level:g}%: {ends}.")
     return [chart]
 
 
 def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
-    """Draw the errors of a scene over cost and over cells."""
+    """Draw the surface errors of a scene over cost and over cells."""
     y = log_axis("surface error", rows["surface_error"], ERROR)
     over_cost = chart.panel(scene, log_axis(TRAJECTORY.y_label, rows["time_second"], SECONDS), y)
     over_cost.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
@@ -248,8 +258,8 @@ def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
         panel.curves(rows, columns, (*columns[::-1], "cells", "time_step", "error"))
 
 
-def reached(rows: DataFrame, level: float) -> str:
-    """Return the cells and the cost from which on the errors of a curve are below a level."""
+def size_for(rows: DataFrame, level: float) -> str:
+    """Return the cells and the cost beyond which a curve's errors stay below a level."""
     above = np.flatnonzero(rows["surface_error"] > level)
     if len(above) == 0:
         cells, seconds = rows.iloc[0][["cells", "time_second"]]
@@ -264,16 +274,18 @@ def reached(rows: DataFrame, level: float) -> str:
     return f"{formatting.count(round(cells))} cells ({formatting.seconds(seconds)})"
 
 
-# ---- growth with the number of cells
+# ---- growth with the number of cells, as in the paper's Figure 6
 
 GROWTH = "Growth with the number of cells"
 GROWTH_CAPTION = (
-    "Frames a second: higher is faster, and a frame is one time step; set-up and factorisation, done once, are not "
-    "counted (the paper's Figure 6). The legend says which true step error each curve reached: only curves of like "
-    "error compare. Per cell, a level curve means a cost in proportion to the cells. Memory is the peak of all ranks, "
-    "the program itself and the surface mesh included. Whiskers reach from the least to the greatest of the repeats."
+    "Frames a second: higher is faster. A frame is one time step; set-up and factorisation, done "
+    "once, are not counted (the paper's Figure 6). The legend gives the true step error of each "
+    "curve: only curves of like error compare. A level curve of time a cell means cost "
+    "proportional to the cells. Memory is the peak of all ranks, including the program itself and "
+    "the surface mesh. Whiskers reach from the least to the greatest of the repeats."
 )
-VARIED = ("error", "max_iterations", "ranks")  # may differ between curves of one method
+# columns that distinguish curves of a method, if they vary within it
+VARIED = ("error", "max_iterations", "ranks")
 GROWTH_TIP = (
     "time_frame",
     "memory",
@@ -284,7 +296,8 @@ GROWTH_TIP = (
     "time_factor",
     "ranks",
 )
-GROWTH_PANELS = (  # title, column, how its ticks are written, whether it varies with the time
+# title, column, format of ticks, whether the column has a range over the repeats
+GROWTH_PANELS = (
     ("frames a second", "fps", COUNT, True),
     ("time a frame and cell", "time_frame_a_cell", SECONDS, True),
     ("memory a cell", "memory_a_cell", BYTES, False),
@@ -293,7 +306,7 @@ GROWTH_PANELS = (  # title, column, how its ticks are written, whether it varies
 
 
 def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return a chart for each scene and time step where some curve has two cell counts or more."""
+    """Return a chart for each scene and time step with at least two cell counts on a curve."""
     charts = []
     for (scene, time_step), rows in grouped(
         measured(succeeded(table), "cells"), "scene", "time_step"
@@ -310,7 +323,7 @@ def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 
 
 def with_curves(rows: DataFrame) -> DataFrame:
-    """Return the rows with a column ``curve``: the method, its varied options, and its step error."""
+    """Return the rows with a column ``curve``: method, options that vary, and step error."""
     varied = [
         name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()
     ]
@@ -328,7 +341,7 @@ def with_curves(rows: DataFrame) -> DataFrame:
 
 
 def styles_of(curves: DataFrame, styles: Styles) -> Styles:
-    """Return the style of each curve; curves of one label share the colour but not the marker."""
+    """Return the style of each curve; curves of a label share its colour but not its marker."""
     found = {}
     number = curves.groupby("label").cumcount()
     for curve, label, more in zip(curves["curve"], curves["label"], number, strict=True):
@@ -338,7 +351,7 @@ def styles_of(curves: DataFrame, styles: Styles) -> Styles:
 
 
 def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
-    """Return the panels that have data."""
+    """Return the chart of a scene and time step, with the panels that have data."""
     rows = rows.assign(
         time_frame_a_cell=rows["time_frame"] / rows["cells"],
         memory_a_cell=rows["memory"] / rows["cells"],

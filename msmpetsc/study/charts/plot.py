@@ -1,6 +1,6 @@
 """Elements of charts: colours and markers, axes in readable units, points with tooltips.
 
-A chart is a Vega-Lite specification; vl-convert draws it, without a browser, as SVG for the page and as PNG.
+A chart is a Vega-Lite specification, which vl-convert renders as SVG and PNG without a browser.
 """
 
 import math
@@ -20,7 +20,7 @@ from msmpetsc.study import formatting
 from msmpetsc.study.table import records, spread
 
 INK, FAINT, GRID = "#2b2f36", "#8a8f98", "#e4e6ea"
-# Okabe and Ito's colours but yellow, which white swallows, then Tol's wine, olive, indigo, and a brown.
+# Okabe and Ito's colours without yellow, faint on white; then Paul Tol's and a brown
 COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
     "#882255", "#999933", "#332288", "#8c6239",
@@ -28,29 +28,33 @@ COLORS = (
 X = "M-1,-.6L-.6,-1L0,-.4L.6,-1L1,-.6L.4,0L1,.6L.6,1L0,.4L-.6,1L-1,.6L-.4,0Z"
 STAR = "M0,-1.2L.35,-.4L1.15,-.37L.52,.15L.7,.97L0,.5L-.7,.97L-.52,.15L-1.15,-.37L-.35,-.4Z"
 SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross", X, STAR)
-# Dashes of lines, one for each round through the colours.
+# dashes of lines, taken in turn whenever the colours are used up
 DASHES = ((1, 0), (6, 3), (2, 2))
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
-WIDTH, HEIGHT = 1080, 280  # [px] of all panels of a chart, and of one
-MARKER = 50  # [px^2]
-LETTER = 8  # [px]: mean width in a legend
+# width of a chart and height of a panel [px]
+WIDTH, HEIGHT = 1080, 280
+# area of a marker [px^2]
+MARKER = 50
+# mean width of a legend's letter [px]
+LETTER = 8
 CONFIG: dict[str, Any] = {
     "background": "white",
     "font": "DejaVu Sans, Verdana, Arial, sans-serif",
     "view": {"stroke": None},
     "axis": {
-        "labelColor": INK, "titleColor": INK, "titleFontWeight": "normal", "gridColor": GRID, "domainColor": FAINT,
-        "tickColor": FAINT, "labelFontSize": 12, "titleFontSize": 12, "labelOverlap": "greedy",
+        "labelColor": INK, "titleColor": INK, "titleFontWeight": "normal", "gridColor": GRID,
+        "domainColor": FAINT, "tickColor": FAINT, "labelFontSize": 12, "titleFontSize": 12,
+        "labelOverlap": "greedy",
     },
     "title": {"anchor": "start", "color": INK, "fontWeight": "normal", "fontSize": 13},
     "legend": {
-        "orient": "bottom", "labelFontSize": 12, "labelColor": INK, "symbolSize": 90, "columnPadding": 24,
-        "labelLimit": WIDTH, "symbolOpacity": 1, "symbolStrokeWidth": 0,
+        "orient": "bottom", "labelFontSize": 12, "labelColor": INK, "symbolSize": 90,
+        "columnPadding": 24, "labelLimit": WIDTH, "symbolOpacity": 1, "symbolStrokeWidth": 0,
     },
     "point": {"opacity": 1},
 }  # fmt: skip
 UNIT = "replace(format(datum.value, '~s'), regexp('([^0-9.]?)$'), '\N{NO-BREAK SPACE}$1{}')"
-# how the number of a tick is written, as an expression of Vega's
+# formats of ticks, as Vega expressions
 ERROR = "replace(format(datum.value, '~e'), '+', '')"
 COUNT = "format(datum.value, '~s')"
 SECONDS, BYTES = UNIT.format("s"), UNIT.format("B")
@@ -58,15 +62,16 @@ SECONDS, BYTES = UNIT.format("s"), UNIT.format("B")
 
 @dataclass(frozen=True)
 class CurveStyle:
-    """Colour, marker and dashes of one method, the same in all charts."""
+    """Colour, marker and dashes of a method, the same in all charts."""
 
     color: str
     shape: str
     dash: tuple[int, int] = DASHES[0]
 
 
-Styles = dict[str, CurveStyle]  # by label
-Columns = tuple[str, str]  # of both axes
+# style of each label, and columns on the x axis and the y axis
+Styles = dict[str, CurveStyle]
+Columns = tuple[str, str]
 
 
 def curve_styles(labels: Iterable[str]) -> Styles:
@@ -82,7 +87,7 @@ def curve_styles(labels: Iterable[str]) -> Styles:
 
 
 def tips(rows: DataFrame, names: Iterable[str], curve: str = "label") -> list[str]:
-    """Return the tooltip of each row: its curve, its numbers and the command that repeats it."""
+    """Return the tooltip of each row: its curve, its numbers, and the command that repeats it."""
     names = list(dict.fromkeys(names))
     lines = (
         [row[curve], *(formatting.entry(row, name) for name in names), row["command"]]
@@ -92,7 +97,7 @@ def tips(rows: DataFrame, names: Iterable[str], curve: str = "label") -> list[st
 
 
 def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dict[str, Any]:
-    """Return an axis whose tick labels are written by ``words``, an expression of Vega."""
+    """Return an axis whose tick labels the Vega expression ``words`` formats."""
     axis = {"values": list(ticks), "labelExpr": words}
     return {
         "type": "quantitative",
@@ -103,9 +108,10 @@ def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dic
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
-    """Return a logarithmic axis around positive values, NaN left out, with margins, at least a decade long."""
+    """Return a logarithmic axis for positive values, at least a decade long; NaN is ignored."""
     low, high = math.log10(np.nanmin(values)), math.log10(np.nanmax(values))
-    middle, half = (low + high) / 2, max(high - low, 0.85) * 0.58
+    middle = (low + high) / 2
+    half = max(high - low, 0.85) * 0.58
     low, high = middle - half, middle + half
     steps = (1, 2, 5) if high - low < 2.5 else (1,)
     ticks = [
@@ -116,7 +122,7 @@ def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
 
 @dataclass
 class Axes:
-    """A panel: two axes, the layers drawn in it, and the styles of all curves of the chart."""
+    """A panel: two axes, layers drawn in it, and the styles of the chart's curves."""
 
     title: str
     x: dict[str, Any]
@@ -125,7 +131,7 @@ class Axes:
     layers: list[dict[str, Any]] = field(default_factory=list)
 
     def draw(self, values: list[dict[str, Any]], mark: dict[str, Any], **channels: Any) -> None:
-        """Add a layer of values with columns x, y and what the channels name."""
+        """Add a layer of values with columns x, y and the columns of the other channels."""
         if values:
             axes = {"x": {"field": "x"} | self.x, "y": {"field": "y"} | self.y}
             silent = {"aria": "description" in channels}
@@ -134,13 +140,13 @@ class Axes:
             )
 
     def stair(self, x: Iterable[float], y: Iterable[float]) -> None:
-        """Draw a grey stair through points in their order."""
+        """Draw a grey step function through points in their order."""
         values = [{"x": a, "y": b, "n": n} for n, (a, b) in enumerate(zip(x, y, strict=True))]
         mark = {"type": "line", "color": FAINT, "interpolate": "step-after", "strokeWidth": 1.2}
         self.draw(values, mark, order={"field": "n"})
 
     def whiskers(self, rows: DataFrame, columns: Columns, curve: str = "label") -> None:
-        """Draw the spread of the repeats of each row; the second column is its cost."""
+        """Draw the range of each row over its repeats; the second column is its cost."""
         ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows[curve]).dropna()
         values = records(ends.rename(columns={"least": "y", "greatest": "high"}))
         part = {"opacity": 1, "aria": False}
@@ -150,14 +156,14 @@ class Axes:
     def curves(
         self, rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label"
     ) -> None:
-        """Draw the rows of each curve, in their order, as a line with a marker at each point."""
+        """Draw each curve's rows, in their order, as a line with a marker at each point."""
         values = points(rows, columns, names, curve)
         own = {"color": nominal(self.styles, "color"), "strokeDash": nominal(self.styles, "dash")}
         self.draw(values, {"type": "line", "strokeWidth": 1.6}, order={"field": "n"}, **own)
         self.mark(values)
 
     def mark(self, values: list[dict[str, Any]], hollow: bool = False) -> None:
-        """Draw a marker with a tooltip at each of ``points``."""
+        """Draw a marker with a tooltip for each value from ``points``, small if ``hollow``."""
         color = nominal(self.styles, "color")
         own = {"fill": color}
         mark: dict[str, Any] = {
@@ -196,22 +202,29 @@ def points(
 
 @dataclass
 class Chart:
-    """Panels with one legend, and sentences that sum them up."""
+    """Panels with a common legend, and sentences that summarise them.
 
-    name: str  # of its file
-    kind: str  # the heading it stands under
+    name     : name of its PNG file without suffix
+    kind     : heading that it shares with similar charts
+    columns  : largest number of panels side by side
+    gap      : distance between panels, which contains the axis labels [px]
+    findings : lines by their heading
+    """
+
+    name: str
+    kind: str
     title: str
     caption: str
-    styles: Styles  # of all its curves, for the legend
-    columns: int = 3  # panels side by side, at most
-    gap: float = 85  # [px] between panels, with their axes
-    height: float = HEIGHT  # [px] of a panel
+    styles: Styles
+    columns: int = 3
+    gap: float = 85
+    height: float = HEIGHT
     panels: list[Axes] = field(default_factory=list)
-    findings: dict[str, list[str]] = field(default_factory=dict)  # lines by their heading
+    findings: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def anchor(self) -> str:
-        """The id of its element on the page."""
+        """The id of the chart's element in the report."""
         return "chart-" + re.sub(r"\W|_", "-", self.name)
 
     def panel(self, title: str, x: dict[str, Any], y: dict[str, Any]) -> Axes:
@@ -220,7 +233,7 @@ class Chart:
         return self.panels[-1]
 
     def spec(self) -> dict[str, Any]:
-        """Return the Vega-Lite specification: rows of panels above one legend."""
+        """Return the Vega-Lite specification: rows of panels above a common legend."""
         columns = min(len(self.panels), self.columns)
         width = (WIDTH - self.gap * (columns - 1)) / columns
         panels = [
@@ -236,11 +249,12 @@ class Chart:
 
 
 def legend(styles: Styles) -> dict[str, Any]:
-    """Return an empty chart with the legend."""
+    """Return an empty chart that shows the legend."""
     longest = max(map(len, styles), default=1)
     fit = max(1, min(6, len(styles), int(WIDTH / (LETTER * longest + 40))))
     lines = -(-len(styles) // fit)
-    shown = {"title": None, "columns": -(-len(styles) // lines)}  # as even as can be
+    # the fewest lines, filled evenly
+    shown = {"title": None, "columns": -(-len(styles) // lines)}
     channels = {"fill": nominal(styles, "color", shown), "shape": nominal(styles, "shape", shown)}
     values = [{"curve": name} for name in styles]
     mark = {"type": "point", "opacity": 0, "aria": False}
@@ -254,20 +268,20 @@ def legend(styles: Styles) -> dict[str, Any]:
 
 
 def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return the channel that gives each curve its "color", its "shape" or its "dash"."""
+    """Return the channel that encodes a curve as its "color", "shape" or "dash"."""
     scale = {"domain": list(styles), "range": [getattr(style, name) for style in styles.values()]}
     return {"field": "curve", "type": "nominal", "scale": scale, "legend": legend}
 
 
 def save_png(chart: Chart, folder: Path) -> None:
-    """Write the chart with its title as a PNG file of its name."""
+    """Write a chart with its title as a PNG file in a folder."""
     title = {"text": chart.title, "fontWeight": "bold", "fontSize": 15, "offset": 12}
     image = vl_convert.vegalite_to_png({"config": CONFIG, "title": title} | chart.spec(), scale=1.5)
     write_whole(folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', chart.name)}.png", image)
 
 
 def svg_text(chart: Chart) -> str:
-    """Return the chart as an <svg> element whose points have a <title>, which browsers show as a tooltip."""
+    """Return a chart as an <svg> element; browsers show the <title> of a point as its tooltip."""
     text = vl_convert.vegalite_to_svg({"config": CONFIG} | chart.spec())
     return re.sub(
         r'<path aria-label="([^"]*)"([^>]*)/>',

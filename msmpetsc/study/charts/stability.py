@@ -1,4 +1,4 @@
-"""Stability maps: the outcomes of each method over two axes, or of named cases."""
+"""Stability maps: outcomes of each method over two axes, or over named cases."""
 
 import json
 import math
@@ -13,29 +13,33 @@ from msmpetsc.study.table import Row, grouped, mapped, records
 
 KIND = "Stability"
 CAPTION = (
-    "How each run went, the worst that befell it. A number is the mean of the iterations a step, where every step was "
-    "solved; of verlet, its substeps. Point at a cell for its numbers and the command that repeats it."
+    "The worst outcome of each run. If every step was solved, a number gives the mean iterations a "
+    "step, or the substeps of verlet. The tooltip of a cell gives its numbers and the command that "
+    "repeats it."
 )
-# from the worst to the best: they differ in lightness and hue, and each cell has its symbol
+# colours differ in lightness as well as in hue, for colour-blind readers
 COLORS = {
-    "crashed": "#000000", "timeout": "#7a4a1e", "refused": "#9a9a9a", "not finite": "#332288", "energy": "#882255",
-    "diverged": "#d55e00", "not recovered": "#cc79a7", "inverted": "#e69f00", "slow": "#f0e442", "ok": "#c3e3f5",
+    "crashed": "#000000", "timeout": "#7a4a1e", "refused": "#9a9a9a", "not finite": "#332288",
+    "energy": "#882255", "diverged": "#d55e00", "not recovered": "#cc79a7", "inverted": "#e69f00",
+    "slow": "#f0e442", "ok": "#c3e3f5",
 }  # fmt: skip
 SYMBOLS = {
-    "crashed": "!!", "timeout": "T", "refused": "R", "not finite": "NaN", "energy": "E", "diverged": "D",
-    "not recovered": "S", "inverted": "I",
+    "crashed": "!!", "timeout": "T", "refused": "R", "not finite": "NaN", "energy": "E",
+    "diverged": "D", "not recovered": "S", "inverted": "I",
 }  # fmt: skip
-DARK = {"crashed", "timeout", "not finite", "energy", "diverged"}  # their symbols are white
-COLUMNS = 6  # panels side by side
-CELL = 24  # [px]: height
+# outcomes whose symbols are white
+DARK = {"crashed", "timeout", "not finite", "energy", "diverged"}
+# panels side by side, and height of a cell [px]
+COLUMNS, CELL = 6, 24
+# columns of a cell's tooltip
 TIP = (
-    "outcome", "steps", "iterations", "most_iterations", "inverted", "shape_error", "energy_gained", "substeps",
-    "fallbacks", "reason",
+    "outcome", "steps", "iterations", "most_iterations", "inverted", "shape_error",
+    "energy_gained", "substeps", "fallbacks", "reason",
 )  # fmt: skip
 
 
 class Scale(NamedTuple):
-    """One axis of a map: its values in order, and their labels."""
+    """An axis of a map: its values in order, and their labels."""
 
     name: str
     values: tuple[str, ...]
@@ -43,7 +47,7 @@ class Scale(NamedTuple):
 
 
 def entry(value: str, unit: str) -> str:
-    """Return the label of a value of an axis: 10 ms, 20%, 100 kPa, or the name of a case."""
+    """Return the label of a value on an axis: 10 ms, 20%, 100 kPa, or the name of a case."""
     try:
         number = float(value)
     except ValueError:
@@ -56,7 +60,7 @@ def entry(value: str, unit: str) -> str:
 
 
 def scale(rows: DataFrame, column: str, axis: dict[str, Any]) -> Scale:
-    """Return the values of rows on an axis, in the order and the unit of the study file."""
+    """Return the axis of a column, with the order and the unit that the study file gives."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]
@@ -65,13 +69,13 @@ def scale(rows: DataFrame, column: str, axis: dict[str, Any]) -> Scale:
 
 
 def stability_charts(table: DataFrame, study: dict[str, Any]) -> list[Chart]:
-    """Return one chart for each map, with the axes that the study file names."""
+    """Return a chart for each map, with the axes that the study file names."""
     maps = {entry.get("name"): entry for entry in study.get("map", ())}
     return [stability_chart(name, rows, maps.get(name, {})) for name, rows in mapped(table).items()]
 
 
 def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Chart:
-    """Return the chart of a map, ``settings`` being its table in the study file."""
+    """Return the chart of a map; ``settings`` is the map's table in the study file."""
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")
     legend = {
@@ -104,7 +108,7 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
 
 
 def axis(scale: Scale, shown: bool = True, **more: Any) -> dict[str, Any]:
-    """Return an axis with cells of width 1 around 0, 1, 2 and so on, labelled if ``shown``."""
+    """Return an axis whose cells have width 1 around 0, 1, 2, ...; labelled if ``shown``."""
     count = len(scale.values)
     words = f"{json.dumps(scale.texts)}[datum.value]"
     made = channel(scale.name if shown else "", words, range(count), domain=[-0.5, count - 0.5])
@@ -113,33 +117,36 @@ def axis(scale: Scale, shown: bool = True, **more: Any) -> dict[str, Any]:
 
 
 def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the axes of a map of named cases: cases from top to bottom, methods above."""
+    """Return the axes of a map of named cases: methods along the top, cases downwards."""
     broken = [
         text.replace("-", "-\n").split("\n") if len(text) > 12 else [text] for text in x.texts
     ]
     room = 4 + 14 * (max(map(len, broken)) - 1)
-    across, down = axis(x, orient="top", labelOverlap=False, labelPadding=room), axis(y)
+    across = axis(x, orient="top", labelOverlap=False, labelPadding=room)
+    down = axis(y)
     across["axis"]["labelExpr"] = f"{json.dumps(broken)}[datum.value]"
     down["scale"]["reverse"] = True
     return across | {"title": ""}, down | {"title": ""}
 
 
 def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
-    """Draw cells with symbols and tooltips."""
+    """Draw a coloured cell with its symbol and tooltip for each row."""
     words = {
-        of.name: rows[column].map(dict(zip(of.values, of.texts, strict=True)))
-        for column, of in (("x", x), ("y", y))
+        given.name: rows[column].map(dict(zip(given.values, given.texts, strict=True)))
+        for column, given in (("x", x), ("y", y))
     }
     placed = rows.assign(i=rows["x"].map(x.values.index), j=rows["y"].map(y.values.index), **words)
     values = [
         {
-            "x": row["i"] - 0.47, "x2": row["i"] + 0.47, "y": row["j"] - 0.46, "y2": row["j"] + 0.46, "tip": tip,
+            "x": row["i"] - 0.47, "x2": row["i"] + 0.47,
+            "y": row["j"] - 0.46, "y2": row["j"] + 0.46, "tip": tip,
             "i": row["i"], "j": row["j"], "text": symbol(row), "color": COLORS[row["outcome"]],
             "ink": "white" if row["outcome"] in DARK else INK,
         }
         for row, tip in zip(records(placed), tips(placed, (*words, *TIP)), strict=True)
     ]  # fmt: skip
-    own = {"type": "nominal", "scale": None}  # colours that stand in a column
+    # the columns contain colours, so Vega must not map them
+    own = {"type": "nominal", "scale": None}
     ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
     panel.draw(
         values,
@@ -153,7 +160,7 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
 
 
 def symbol(row: Row) -> str:
-    """Return the text of a cell: the symbol of its outcome, or iterations a step."""
+    """Return the text of a cell: the symbol of its outcome, or the iterations per step."""
     count = row["iterations"]
     if row["outcome"] in SYMBOLS or count is None:
         return SYMBOLS.get(row["outcome"], "")

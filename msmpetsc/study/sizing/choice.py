@@ -1,4 +1,4 @@
-"""The cheapest split of a surface error among cells, step and solution, and the plan that it makes."""
+"""Cheapest split of a surface error among cells, time step and solver, and the resulting plan."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,40 +17,41 @@ from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import scene_tables
 from msmpetsc.study.sizing.orders import ErrorLaw
 
-STEEPEST = 1.6  # power of the cells that the cost of a step goes by, at most: what is more is the noise of a clock
+# largest exponent of the cells in the cost of a step; above it timer noise prevails
+MAX_COST_ORDER = 1.6
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A way to step a scene; explicit steps have no preset and no error."""
+    """An integrator with its time step [s] and, except for verlet, solver preset and step error."""
 
     integrator: IntegratorName
-    time_step: float  # [s]
+    time_step: float
     preset: str = ""
     step_error: float | None = None
 
 
 @dataclass(frozen=True)
 class Stepping:
-    """An integrator with its step, tried on one lattice."""
+    """A method tried on a coarse lattice: error of its time step [-], cost [s per simulated s]."""
 
     method: Candidate
-    error: float  # of the time step alone [-]
-    cost: float  # computing seconds a simulated second there
+    error: float
+    cost: float
 
 
 @dataclass(frozen=True)
 class Solving:
-    """A target of the relative error of a step, with what it leaves and costs."""
+    """A target of the step error: resulting error of the motion [-], cost over the trials' cost."""
 
     step_error: float | None
-    error: float  # that it leaves in the motion [-]
-    cost: float  # over that of the trials
+    error: float
+    cost: float
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The parts of a surface error, each relative to the largest displacement [-]; their sum is never exceeded."""
+    """The parts of a surface error, each relative to the largest displacement [-]."""
 
     cells: float
     time: float
@@ -58,36 +59,42 @@ class Budget:
 
     @property
     def total(self) -> float:
+        """The sum of the parts, an upper bound of the surface error [-]."""
         return self.cells + self.time + self.step
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A run, with its expected error and cost."""
+    """A run with its expected error and cost: computing time per simulated time [s/s]."""
 
     method: Candidate
     cells: int
     budget: Budget
-    cost: float  # computing seconds a simulated second
+    cost: float
 
 
 @dataclass(frozen=True)
 class CostModel:
-    """Errors of cells, steps and their solution as the trials showed them, and their costs."""
+    """Errors and costs of cells, time steps and step errors, extrapolated from the trials.
 
-    law: ErrorLaw  # of the error over the edge of a cell, cells^(-1/3)
+    law         : error of the cells over the edge of a cell, cells^(-1/3)
+    cells       : number of cells of the lattice on which ``steppings`` were tried
+    costs       : cells and cost on each lattice tried, all with the same method, ascending
+    explicit    : whether that method was verlet, whose substeps shrink with the edge of a cell
+    least, most : range of cells that may be chosen
+    """
+
+    law: ErrorLaw
     steppings: Sequence[Stepping]
     solvings: Sequence[Solving]
-    cells: float  # of the lattice that the steppings were tried on
-    costs: Sequence[
-        tuple[float, float]
-    ]  # of one of them by the cells of the lattices tried, ascending
-    explicit: bool  # whether that one was explicit, whose substeps shorten as the edge of a cell
-    least: int  # cells that may be chosen
+    cells: float
+    costs: Sequence[tuple[float, float]]
+    explicit: bool
+    least: int
     most: int
 
     def cheapest(self, target: float) -> Choice | None:
-        """Return the cheapest choice whose errors add up to the target at most, or None."""
+        """Return the cheapest choice whose parts sum to at most ``target``, or None."""
         choices = [
             self.choice(stepping, solving, cells)
             for stepping in self.steppings
@@ -97,82 +104,90 @@ class CostModel:
         return min(choices, key=lambda choice: choice.cost, default=None)
 
     def best(self) -> Choice:
-        """Return the choice of the least error, whatever it costs."""
+        """Return the choice of least error, at any cost."""
         stepping = min(self.steppings, key=lambda each: each.error)
         solving = min(self._solvings(stepping), key=lambda each: each.error)
         return self.choice(stepping, solving, self.most)
 
     def cells_for(self, error: float) -> float:
-        """Return the number of cells that has this error; infinity for an error of 0."""
+        """Return the fewest cells whose error is at most ``error``; infinity for an error of 0."""
         if error <= 0:
             return math.inf
-        return (
-            max(self.least, math.ceil(self.law.size(error) ** -3))
-            if self.law.factor > 0
-            else self.least
-        )
+        if self.law.factor <= 0:
+            return self.least
+        return max(self.least, math.ceil(self.law.size(error) ** -3))
 
     def choice(self, stepping: Stepping, solving: Solving, cells: float) -> Choice:
+        """Return the choice of a method, a step error and a number of cells."""
         budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error, solving.error)
-        shorter = (
-            stepping.method.integrator == "verlet"
-        ) - self.explicit  # substeps, than those of the costs known
-        growth = self.growth(self.cells, cells) * (cells / self.cells) ** (shorter / 3)
+        # verlet's substeps grow as 1 / edge; ``costs`` may contain this growth
+        substep_order = (stepping.method.integrator == "verlet") - self.explicit
+        growth = self.growth(self.cells, cells) * (cells / self.cells) ** (substep_order / 3)
         cost = stepping.cost * solving.cost * growth
         method = replace(stepping.method, step_error=solving.step_error)
         return Choice(method, int(cells), budget, cost)
 
     def growth(self, before: float, after: float) -> float:
-        """Return the ratio of the costs of two numbers of cells, interpolated between the lattices tried."""
+        """Return the cost at ``after`` cells over that at ``before``, interpolated from trials."""
         cells, costs = np.log(self.costs).T
         if len(cells) < 2:
             return after / before
-        slopes = np.clip(np.diff(costs) / np.diff(cells), 0.0, STEEPEST)
+        slopes = np.clip(np.diff(costs) / np.diff(cells), 0.0, MAX_COST_ORDER)
         knots = np.concatenate([[0.0], np.cumsum(slopes * np.diff(cells))])
         ends = np.log([before, after])
-        past = np.maximum(0.0, ends - cells[-1])  # where nothing was tried
-        start, end = np.interp(ends, cells, knots) + max(1.0, slopes[-1]) * past
+        # beyond the finest trial, cost grows at least in proportion to the cells
+        beyond = np.maximum(0.0, ends - cells[-1])
+        start, end = np.interp(ends, cells, knots) + max(1.0, slopes[-1]) * beyond
         return math.exp(end - start)
 
     def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
-        """Return the step errors that may be chosen; explicit steps have none."""
-        return (
-            [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings
-        )
+        """Return the step errors that may be chosen with a method; verlet has none."""
+        if stepping.method.integrator == "verlet":
+            return [Solving(None, 0.0, 1.0)]
+        return self.solvings
 
 
 @dataclass(frozen=True)
 class SizeTrial:
-    """A run with its cost and its result."""
+    """A trial run, with its cost and its result file.
+
+    asked    : requested number of valid cells; ``cells`` is the lattice's number
+    cost     : computing time per simulated time [s/s]
+    substeps : mean number of substeps per step for verlet, of iterations otherwise
+    inverted : number of cells that are inverted at the end
+    """
 
     method: Candidate
-    asked: int  # valid cells
-    cells: float  # that it had
-    cost: float  # computing seconds a simulated second
-    substeps: float  # of a step, for verlet; else iterations; their mean
-    inverted: float  # cells that end inside out
+    asked: int
+    cells: float
+    cost: float
+    substeps: float
+    inverted: float
     result: Path
 
     @property
     def edge(self) -> float:
-        """Edge of a cell, relative to that of a body of one cell."""
+        """Edge of a cell, relative to the edge of a body of a single cell [-]."""
         return float(self.cells ** (-1 / 3))
 
 
 @dataclass
 class SizePlan:
-    """The choice of a plan, and what bounds its error."""
+    """The choice of a plan, and the limits of its error.
 
-    choice: Choice  # the cheapest that meets the error, or of the smallest error there is
-    met: bool  # whether it is expected to meet the error
-    bounds: list[str] = field(
-        default_factory=list
-    )  # what keeps the error from being smaller, or sure, in words
+    choice : cheapest run that meets the error, or else the run of least error
+    met    : whether the run is expected to meet the error
+    bounds : reasons why the error is not smaller, or not certain
+    """
+
+    choice: Choice
+    met: bool
+    bounds: list[str] = field(default_factory=list)
     tried: list[SizeTrial] = field(default_factory=list)
 
 
 def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
-    """Return which of step and cells leaves over half of the target at its finest."""
+    """Return a note each for time step and cells if its least error exceeds half the target."""
     bounds = []
     best = model.best().budget
     if best.time > target / 2 and not step_known:
@@ -186,39 +201,44 @@ def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
 
 
 def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
-    """Return a note if cells of the finest lattice end inverted: such a motion need not converge."""
+    """Return a note if cells of the finest lattice are inverted, because convergence may fail."""
     finest = max(trials, key=lambda each: each.cells)
     if not finest.inverted:
         return []
     helps = "fewer --frames"
     if law == "linear":
         helps += ' or material.law = "neo-hookean"'
-    inverted = f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, each lattice in its own way"
+    inverted = (
+        f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, "
+        "each lattice in its own way"
+    )
     return [f"the motion: {inverted}; {helps} may help"]
 
 
-# The answer as changes of a scene file
+# ---- the answer as changes of a scene file
 
-Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
+# values by table and key of a scene file
+Tables = Mapping[str, Mapping[str, Any]]
 
 
 def tables(method: Candidate) -> Tables:
-    """Return the tables of a scene that a method sets; a key that is None is absent."""
+    """Return the tables of a scene that a method determines; None stands for no key."""
     values = vars(method) | {"substep": None, "error": method.step_error, "max_iterations": None}
     if method.integrator == STATIC:
-        del values["time_step"]  # which spaces states, and need not stand there
+        # a static scene needs no time step
+        del values["time_step"]
     return scene_tables(values)
 
 
 def overrides(scene: Path, tables: Tables) -> list[str]:
-    """Return the changes of a scene file as overrides of --set. Raises InputError."""
-    (_, document), changes = read_toml(scene), []
+    """Return changes of a scene file as arguments of --set. Raises InputError."""
+    _, document = read_toml(scene)
+    changes = []
     for name, table in tables.items():
         given = document.get(name, {})
         if any(value is None and key in given for key, value in table.items()):
-            changes.append(
-                f"{name}={toml_value({**given, **table})}"
-            )  # --set changes keys, and takes none away
+            # --set cannot remove a key, so the whole table is replaced
+            changes.append(f"{name}={toml_value({**given, **table})}")
         else:
             changes += [
                 f"{name}.{key}={value}" for key, value in table.items() if value is not None
@@ -227,7 +247,7 @@ def overrides(scene: Path, tables: Tables) -> list[str]:
 
 
 def put_into(scene: Path, tables: Tables) -> None:
-    """Change a scene file, keeping its comments and order. Raises InputError."""
+    """Write changes into a scene file, keeping comments, order and line ends. Raises InputError."""
     text = scene.read_bytes().decode()
     line_end = "\r\n" if "\r\n" in text else "\n"
     document = tomlkit.parse(text)
@@ -240,5 +260,5 @@ def put_into(scene: Path, tables: Tables) -> None:
                 old.pop(key, None)
             elif old.get(key) != value:
                 old[key] = value
-    # new lines end like the others
+    # tomlkit may end new lines in another way
     write_whole(scene, tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))

@@ -1,13 +1,13 @@
-"""Discretisation error from runs of several sizes, by Richardson extrapolation with the observed order.
+"""Discretisation error by Richardson extrapolation from runs of several sizes.
 
-A size is the edge of a cell, or the time step. Where the error is e = C size^p, three runs tell p
-and C (Roache 1994, the grid convergence index). Errors are fields: that of a coarse run is its
-distance d to a finer one, plus the finer one's error, as vectors at an angle,
+A size is the edge of a cell or the time step. If the error is e = C size^p, three runs determine p
+and C (Roache 1994, the grid convergence index). The errors are fields. With distance d between a
+coarse run a and a finer run b, and the angle between the fields d and e_b of cosine c,
 
-    e_a^2 = d^2 + e_b^2 + 2 c d e_b,        c its cosine.
+    e_a^2 = d^2 + e_b^2 + 2 c d e_b.
 
-With c = 1, which is Roache's, all err to the same side, as time steps do. Lattices of unlike cells
-err by chance as well, each in its own way: distances of three of them tell c.
+Roache's method has c = 1: all errors have the same direction, as errors of time steps do. Errors of
+lattices that do not nest have a random part as well; distances of three lattices determine c.
 """
 
 import math
@@ -16,61 +16,66 @@ from dataclasses import dataclass, replace
 
 from scipy.optimize import brentq
 
-ORDERS = (
-    1.0,
-    2.2,
-)  # that are believed: of a boundary seen by the share of its cells, of linear cells; of steps
-ALIKE = 1.9  # times: sizes nearer than that differ by chance as much as by their order
-CLOSE = 1.01  # times: what parts sizes nearer than that is chance alone
-UNSEEN = 0.05  # a measured order may lie so far below the range before it counts as not seen
+# range of orders accepted: 1 for partly filled boundary cells, 2 for linear cells and
+# for time steps
+ORDERS = (1.0, 2.2)
+# ratio of sizes below which a random part hides the order
+SIMILAR_RATIO = 1.9
+# ratio of sizes below which two errors differ by their random part alone
+DISTINCT_RATIO = 1.01
+# distance of a measured order below the range at which it still counts as observed
+ORDER_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True)
 class ErrorLaw:
-    """A power law of the error, factor size^order."""
+    """The power law e = factor * size^order of an error.
+
+    observed : whether the order was measured; otherwise it is an end of the accepted range
+    cosine   : cosine c of the angle between distance and error of the finer run
+    """
 
     factor: float
     order: float
-    seen: bool = (
-        True  # the order was measured; else it is the end of the range that the measurements left
-    )
-    cosine: float = 1.0  # of what parts two runs and the finer one's error
+    observed: bool = True
+    cosine: float = 1.0
 
     def error(self, size: float) -> float:
-        """Return the error of a size [-]."""
+        """Return the error at a size [-]."""
         return float(self.factor * size**self.order)
 
     def size(self, error: float) -> float:
-        """Return the largest size with this error."""
+        """Return the size that has this error."""
         return float((error / self.factor) ** (1 / self.order))
 
     def through(self, *known: tuple[float, float]) -> "ErrorLaw":
-        """Return the law through the (size, error) of one run, with this order, or of two runs, the coarser first."""
-        (a, error), (b, less) = known[0], known[-1]
-        order = (
-            math.log(error / less) / math.log(a / b)
-            if a > CLOSE * b and error > less > 0
-            else self.order
-        )
-        return replace(self, factor=error / a**order, order=order)
+        """Return the law through the (size, error) of a run, or of two runs, the coarser first.
 
-    def measured(self, apart: float, finer: float) -> float:
-        """Return the error of a run from its distance to a finer one."""
+        The order remains, unless two runs determine it.
+        """
+        (a, error_a), (b, error_b) = known[0], known[-1]
+        order = self.order
+        if a > DISTINCT_RATIO * b and error_a > error_b > 0:
+            order = math.log(error_a / error_b) / math.log(a / b)
+        return replace(self, factor=error_a / a**order, order=order)
+
+    def measured(self, distance: float, finer: float) -> float:
+        """Return the error of a run from its distance to a run of size ``finer``."""
         error = self.error(finer)
-        return math.sqrt(apart**2 + error**2 + 2 * self.cosine * apart * error)
+        return math.sqrt(distance**2 + error**2 + 2 * self.cosine * distance * error)
 
-    def measured_finer(self, apart: float, size: float, coarser: float) -> float:
-        """Return the error of a run from its distance to a coarser one."""
-        return _finer_error(apart, (coarser / size) ** self.order, self.cosine)
+    def measured_finer(self, distance: float, size: float, coarser: float) -> float:
+        """Return the error of a run of this size from its distance to a run of size ``coarser``."""
+        return _finer_error(distance, (coarser / size) ** self.order, self.cosine)
 
 
-def _finer_error(apart: float, ratio: float, cosine: float) -> float:
-    """Return e_b from d, c and e_a / e_b."""
-    return apart * (cosine + math.sqrt(cosine**2 + ratio**2 - 1)) / (ratio**2 - 1)
+def _finer_error(distance: float, ratio: float, cosine: float) -> float:
+    """Return e_b from d, e_a / e_b and c."""
+    return distance * (cosine + math.sqrt(cosine**2 + ratio**2 - 1)) / (ratio**2 - 1)
 
 
 def cosine_of(first: float, second: float, across: float) -> float:
-    """Return the cosine c of three runs from the distances of neighbours and of the ends, within 0 and 1."""
+    """Return the cosine c of three runs from distances 1-2, 2-3 and 1-3, clipped to [0, 1]."""
     if not first or not second:
         return 1.0
     return min(1.0, max(0.0, (across**2 - first**2 - second**2) / (2 * first * second)))
@@ -83,36 +88,43 @@ def error_law(
     across: float | None = None,
     cosine: float = 1.0,
 ) -> ErrorLaw:
-    """Return the law of the error from the distances between runs of descending sizes.
+    """Return the law of the error from distances between runs.
 
-    sizes     : two or three of them
-    distances : one fewer; of the last two runs the last
-    orders    : the least and the greatest that are believed; of two sizes the least is taken
-    across    : distance of the first and the last run, which is taken where no order is seen and the last two are alike
+    sizes     : two or three sizes, descending
+    distances : distances between consecutive runs
+    orders    : least and greatest order accepted; two runs get the least
+    across    : distance between the first and the last run; it replaces the last of ``distances``
+                if no order is observed and the last two sizes are similar
+    cosine    : cosine c of the angle between distance and error
     """
-    order, seen = orders[0], False
+    order = orders[0]
+    observed = False
     if len(sizes) > 2 and distances[-1] > 0:
-        order, seen = _order(sizes, distances[-2] / distances[-1], cosine, orders)
-    (a, b), apart = sizes[-2:], distances[-1]
-    if not seen and across is not None and a < ALIKE * b:
-        a, apart = sizes[0], across
-    return ErrorLaw(_finer_error(apart, (a / b) ** order, cosine) / b**order, order, seen, cosine)
+        order, observed = _order(sizes, distances[-2] / distances[-1], cosine, orders)
+    a, b = sizes[-2:]
+    distance = distances[-1]
+    if not observed and across is not None and a < SIMILAR_RATIO * b:
+        a = sizes[0]
+        distance = across
+    factor = _finer_error(distance, (a / b) ** order, cosine) / b**order
+    return ErrorLaw(factor, order, observed, cosine)
 
 
 def _order(
     sizes: Sequence[float], ratio: float, cosine: float, orders: tuple[float, float]
 ) -> tuple[float, bool]:
-    """Return the order at which distances have this ratio, clipped to the range, and whether it was observed."""
+    """Return the order that gives a ratio of distances, clipped, and whether it was observed."""
     a, b, c = sizes[-3:]
     low, high = orders
 
-    def excess(order: float) -> float:  # rises with the order
+    # increases with the order
+    def excess(order: float) -> float:
         middle = (b / c) ** order * _finer_error(1.0, (b / c) ** order, cosine)
         coarse = (a / b) ** order * middle
         return float(math.sqrt(coarse**2 - (1 - cosine**2) * middle**2) - cosine * middle - ratio)
 
     if excess(low) >= 0:
-        return low, excess(low - UNSEEN) < 0
+        return low, excess(low - ORDER_TOLERANCE) < 0
     if excess(high) <= 0:
         return high, True
     return float(brentq(excess, low, high)), True

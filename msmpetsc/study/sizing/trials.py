@@ -1,4 +1,4 @@
-"""Trial runs of a plan: coarse lattices show the step's error, three lattices the cells'."""
+"""Trial runs of a plan, which measure errors and costs of time steps, step errors and cells."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -29,41 +29,54 @@ from msmpetsc.study.sizing.choice import (
 )
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
-PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
-COARSER = 2  # times: the edge of a cell from one lattice to the next; the finest chosen is so much finer than the scene
-COARSEST = (2.0, 5 / 3, 4 / 3)  # times that it is done, the first that can be run
+# solver preset of the trials; it chooses the preconditioner itself
+PRESET = "newton"
+# ratio of cell edges of successive lattices, and of the scene to the finest choice
+REFINEMENT = 2
+# powers of REFINEMENT by which the coarsest lattice is coarsened; the first that runs
+COARSEST_POWERS = (2.0, 5 / 3, 4 / 3)
 IMPLICIT: tuple[IntegratorName, ...] = ("bdf2", "implicit-euler")
-HALVINGS = 6  # of the scene's step
-REFINED = 3  # times that explicit substeps are halved, at most
-FINE = 4  # times the cells: of a choice less fine than that its distance from a coarser lattice tells nothing
-FEWEST = 1000  # cells of the finest lattice that is worth beginning with
-PART = 8  # the error of the finest step must be so small a part of the error asked for
-FAR = 0.15  # surfaces so far apart move out of step: that is no small error any more, and shrinks with no order
-USUAL = 1.5  # order of cells that count by their fill: 1.5 to 2 on clamped bars
-LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
-TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
-CHOICES = 6  # that are tried
-NARROW = 1.05  # times the cells: between cells so alike none are tried
-VAGUE = (
-    1 / 3
-)  # of the error asked for: the most that the finest lattice may have by an order that is not sure
-AIM, ENOUGH = (
-    0.9,
-    0.75,
-)  # times the error asked for: what is tried, and where fewer cells are not tried any more
+# largest numbers of halvings of the scene's step and of verlet's substeps
+HALVINGS, SUBSTEP_HALVINGS = 6, 3
+# ratio of cells below which the distance of a finer to a coarser lattice is random
+DISTINCT_CELLS = 4
+# cells of the finest lattice in the first round
+START_CELLS = 1000
+# target / error of the finest step; so that this step stands for the true motion
+STEP_MARGIN = 8
+# distance of lattices [-] above which the motions are out of phase and show no order
+OUT_OF_PHASE = 0.15
+# order taken for lattices out of phase; clamped bars show 1.5 to 2
+USUAL_ORDER = 1.5
+# step errors tried in addition to that of the trials
+LOOSE_STEP_ERRORS = (1e-1, 1e-2)
+# time limits of a trial on coarse lattices and on the finest [s]
+TIMEOUT, FINEST_TIMEOUT = 150.0, 900.0
+MAX_CHOICES = 6
+# ratio of most to least cells at which the search for cells ends
+NARROW = 1.05
+# error / target above which the finest lattice is refined if its order is uncertain
+UNCERTAIN = 1 / 3
+# error / target that a choice aims at, and the least that ends the search
+AIM, ACCEPTED = 0.9, 0.75
 
 
 class Asked(NamedTuple):
-    """The request of a plan."""
+    """The request of a plan.
 
-    target: float  # error of the surface
-    frames: int  # first frames of the scene that are tried
-    cells: int | None = None  # of the finest lattice that is tried; the scene's if None
+    target : largest surface error [-]
+    frames : number of frames, from the scene's first, that the trials run
+    cells  : cells of the finest trial lattice; the scene's number if None
+    """
+
+    target: float
+    frames: int
+    cells: int | None = None
     ranks: int = 1
 
 
 class Sizer:
-    """Runs the trials of a scene for a surface error, and reports each."""
+    """Planner that runs trials of a scene for a surface error and reports each of them."""
 
     def __init__(
         self, scene: Path, bench: Bench, asked: Asked, report: Callable[[SizeTrial | str], None]
@@ -83,308 +96,328 @@ class Sizer:
         self.step = self.as_given.time.step
         steps = min(asked.frames, self.as_given.time.steps)
         self.is_static = self.as_given.time.integrator == STATIC
-        self.duration = self.step * max(
-            1, steps if self.is_static else steps // 2 * 2
-        )  # twice the step fits, too
+        # an even number of steps, so that twice the step fits
+        self.duration = self.step * max(1, steps if self.is_static else steps // 2 * 2)
         self.halved = [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
-        self.solved = min(1e-3, self.target / 10)  # step error of the trials
+        # step error of the trials
+        self.solved = min(1e-3, self.target / 10)
         self.bounds: list[str] = []
-        self.cell_bound = ""  # what is not sure of the cells' error
+        self.cell_bound = ""
         self.trials: list[SizeTrial] = []
 
     def plan(self) -> SizePlan:
-        """Run the trials, on few cells first, and choose. Raises InputError where too few runs succeed."""
-        most, between = self.cells, COARSER**3
-        while self.cells >= between * FEWEST:
-            self.cells //= between
+        """Return the plan from trials, first on few cells. Raises InputError if too few succeed."""
+        most = self.cells
+        ratio = REFINEMENT**3
+        while self.cells >= ratio * START_CELLS:
+            self.cells //= ratio
         while True:
             self.bounds.clear()
-            plan = self._sized()
+            plan = self._plan_on_lattices()
             if self.cells >= most or (plan.met and plan.choice.cells <= self.cells / 2):
                 return plan
-            self.cells = min(most, between * self.cells)
+            self.cells = min(most, ratio * self.cells)
 
-    def _sized(self) -> SizePlan:
-        """Return the plan by lattices of at most ``cells`` cells."""
+    def _plan_on_lattices(self) -> SizePlan:
+        """Return the plan from lattices of at most ``cells`` cells."""
         coarse = self._coarser(1)
         steppings = self._steppings(coarse)
-        fair = [each for each in steppings if each.error <= self.target / 2]
-        method = (
-            min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)
-        ).method
+        accurate = [each for each in steppings if each.error <= self.target / 2]
+        if accurate:
+            method = min(accurate, key=self._cost_at_scale).method
+        else:
+            method = min(steppings, key=lambda each: each.error).method
         solvings = self._solvings(method, coarse)
         lattices = self._lattices(method)
         costs = [(each.cells, each.cost) for each in lattices]
-        on = next(each.cells for each in self.trials if each.asked == coarse)
+        cells = next(each.cells for each in self.trials if each.asked == coarse)
         law = self._law(lattices)
         model = CostModel(
-            law,
-            steppings,
-            solvings,
-            on,
-            costs,
-            method.integrator == "verlet",
-            1,
-            COARSER**3 * self.cells,
+            law=law,
+            steppings=steppings,
+            solvings=solvings,
+            cells=cells,
+            costs=costs,
+            explicit=method.integrator == "verlet",
+            least=1,
+            most=REFINEMENT**3 * self.cells,
         )
         wanted = model.cheapest(AIM * self.target)
-        like = (
-            wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
+        finest = lattices[-1]
+        # a choice this near the finest lattice cannot be measured from it
+        is_near = (
+            wanted is not None and finest.cells / 2 < wanted.cells < DISTINCT_CELLS * finest.cells
         )
-        # such an order makes the error of the finest lattice, which is part of all that are measured
-        vague = not law.seen or _apart(lattices[0], lattices[1]) > FAR
-        blind = vague and (wanted is None or law.error(lattices[-1].edge) > VAGUE * self.target)
-        if (like or blind) and (finer := self._run(method, self._coarser(-0.5))):
-            lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
+        # the order determines the error of the finest lattice, which enters all errors
+        is_uncertain = not law.observed or _distance(lattices[0], lattices[1]) > OUT_OF_PHASE
+        is_too_coarse = wanted is None or law.error(finest.edge) > UNCERTAIN * self.target
+        if (is_near or (is_uncertain and is_too_coarse)) and (
+            finer := self._run(method, self._coarser(-0.5))
+        ):
+            lattices = [*lattices[-2:], finer]
             model = replace(model, law=self._law(lattices))
-        plan, model = self._checked(model, lattices)
+        plan, model = self._refine_choice(model, lattices)
         return replace(plan, bounds=self._bounds(plan, model), tried=self.trials)
 
-    # Time
+    # ---- time step and step error
 
     def _steppings(self, cells: int) -> list[Stepping]:
-        """Return integrators and steps with their time error, the finest run being the true motion."""
-        if self.is_static:  # whose states have no such error
+        """Return methods with the error of their time step; the finest run is taken as exact."""
+        if self.is_static:
+            # static states have no error of a time step
             state = self._run(self._method(STATIC, self.step), cells)
             if state is None:
                 raise InputError(f"{self.scene}: the trial failed on {cells} cells, see above")
             return [Stepping(state.method, 0.0, state.cost)]
-        ladder, sizes = self._explicit(cells)
-        if not ladder:
-            ladder, sizes = self._implicit(cells)
-        if len(ladder) < 2:
+        runs, sizes = self._explicit(cells)
+        if not runs:
+            runs, sizes = self._implicit(cells)
+        if len(runs) < 2:
             raise InputError(
-                f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared"
+                f"{self.scene}: the trials failed on {cells} cells, see above: "
+                "nothing can be compared"
             )
-        finest, left = ladder[-1], self._left(ladder, sizes)
-        if left > self.target / PART:
-            apart = _apart(ladder[-2], finest)
+        finest = runs[-1]
+        remaining = self._remaining_error(runs, sizes)
+        if remaining > self.target / STEP_MARGIN:
+            distance = _distance(runs[-2], finest)
             self.bounds.append(
-                f"the step: the two shortest of {finest.method.integrator} are {apart:.1e} apart"
+                f"the step: runs of {finest.method.integrator} with the two shortest steps are "
+                f"{distance:.1e} apart"
             )
         known = [
-            Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]
+            Stepping(each.method, _distance(each, finest) + remaining, each.cost)
+            for each in runs[:-1]
         ]
-        known.append(Stepping(finest.method, left, finest.cost))
+        known.append(Stepping(finest.method, remaining, finest.cost))
         explicit = finest.method.integrator == "verlet"
-        chosen_from = (
-            known[:1] if explicit else known
-        )  # shorter substeps than verlet's own cost much, and give nothing
+        # substeps shorter than verlet's stability limit cost more without need
+        candidates = known[:1] if explicit else known
         for integrator in IMPLICIT:
             if explicit or integrator != finest.method.integrator:
-                chosen_from += self._others(
-                    integrator, chosen_from, finest=finest, left=left, cells=cells
+                candidates += self._implicit_steppings(
+                    integrator, candidates, finest=finest, remaining=remaining, cells=cells
                 )
-        return chosen_from
+        return candidates
 
     def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
-        """Return runs of verlet with halved substeps, and the substeps; none where one takes too long."""
+        """Return runs of verlet with halved substeps, and the substeps; none if a run fails."""
         first = self._run(self._method("verlet", self.step), cells)
         if first is None:
             return [], []
         runs = [first]
-        sizes = [self.step / math.ceil(first.substeps)]  # frames come at the same times
-        for _ in range(REFINED):
+        # a whole number of substeps per step, so that frames have the same times
+        sizes = [self.step / math.ceil(first.substeps)]
+        for _ in range(SUBSTEP_HALVINGS):
             sizes.append(sizes[-1] / 2)
             run = self._run(self._method("verlet", sizes[-1]), cells)
             if run is None:
                 return [], []
             runs.append(run)
-            if self._left(runs, sizes) <= self.target / PART:
+            if self._remaining_error(runs, sizes) <= self.target / STEP_MARGIN:
                 break
         return runs, sizes
 
     def _implicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
-        """Return runs of BDF2 with halved steps until the remaining error is small, and the steps."""
+        """Return runs of BDF2 with halved steps until the error is small, and the steps."""
         runs: list[SizeTrial] = []
         for step in self.halved:
             run = self._run(self._method("bdf2", step), cells)
             if run is None:
                 break
             runs.append(run)
-            if len(runs) > 2 and self._left(runs, self.halved[: len(runs)]) <= self.target / PART:
+            sizes = self.halved[: len(runs)]
+            if len(runs) > 2 and self._remaining_error(runs, sizes) <= self.target / STEP_MARGIN:
                 break
         return runs, self.halved[: len(runs)]
 
-    def _left(self, runs: list[SizeTrial], sizes: list[float]) -> float:
-        """Return the error of the last of runs whose steps, or substeps, have these sizes."""
-        apart = [_apart(*pair) for pair in pairwise(runs)]
-        return error_law(sizes, apart, ORDERS).error(sizes[-1])
+    def _remaining_error(self, runs: list[SizeTrial], sizes: list[float]) -> float:
+        """Return the error of the last run; ``sizes`` are the steps or substeps of the runs."""
+        distances = [_distance(*pair) for pair in pairwise(runs)]
+        return error_law(sizes, distances, ORDERS).error(sizes[-1])
 
-    def _others(
+    def _implicit_steppings(
         self,
         integrator: IntegratorName,
         known: list[Stepping],
         *,
         finest: SizeTrial,
-        left: float,
+        remaining: float,
         cells: int,
     ) -> list[Stepping]:
         """Return runs of an integrator with halved steps, while it may be the cheapest."""
-        others: list[Stepping] = []
-        enough = min(
-            (self._at_scale(each) for each in known if each.error <= self.target / 2),
+        steppings: list[Stepping] = []
+        cheapest = min(
+            (self._cost_at_scale(each) for each in known if each.error <= self.target / 2),
             default=math.inf,
         )
         for step in self.halved:
             run = self._run(self._method(integrator, step), cells)
             if run is None:
                 break
-            others.append(Stepping(run.method, _apart(run, finest) + left, run.cost))
-            if others[-1].error <= self.target / 3 or run.cost > 2 * enough:
+            error = _distance(run, finest) + remaining
+            steppings.append(Stepping(run.method, error, run.cost))
+            if error <= self.target / 3 or run.cost > 2 * cheapest:
                 break
-        return others
+        return steppings
 
-    def _at_scale(self, stepping: Stepping) -> float:
-        """Return the cost on the finest lattice up to a common factor; verlet's substeps shorten with the cells."""
-        return stepping.cost * (COARSER if stepping.method.integrator == "verlet" else 1)
+    def _cost_at_scale(self, stepping: Stepping) -> float:
+        """Return the cost on the finest lattice, up to a factor that all methods share."""
+        return stepping.cost * (REFINEMENT if stepping.method.integrator == "verlet" else 1)
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
-        """Return the step errors that may be chosen, with the error that each leaves in the motion."""
+        """Return step errors that may be chosen, with the error in the motion due to each."""
         if method.step_error is None:
             return [Solving(self.solved, 0.0, 1.0)]
         base = self._run(method, cells)
         known: list[Solving] = []
-        rest = 0.0
-        for step_error in LOOSE:
+        tight_error = 0.0
+        for step_error in LOOSE_STEP_ERRORS:
             if base and (run := self._run(replace(method, step_error=step_error), cells)):
-                error = _apart(run, base)
+                error = _distance(run, base)
                 known.append(Solving(step_error, error, run.cost / base.cost))
-                rest = error * self.solved / step_error
-        return [*known, Solving(self.solved, rest, 1.0)]
+                tight_error = error * self.solved / step_error
+        return [*known, Solving(self.solved, tight_error, 1.0)]
 
-    # Cells
+    # ---- cells
 
     def _lattices(self, method: Candidate) -> list[SizeTrial]:
-        """Return the runs of three lattices, from which the error of the cells is extrapolated.
+        """Return runs on three lattices, or on two if the coarsest lattices fail.
 
-        Where the coarsest fails, in which a pin may hold no node, a finer one stands in for it.
+        A coarse lattice fails, for example, if no node lies in a pin. Raises InputError if fewer
+        than two lattices run.
         """
-        coarsest = (run for power in COARSEST if (run := self._run(method, self._coarser(power))))
+        coarsest = (
+            run for power in COARSEST_POWERS if (run := self._run(method, self._coarser(power)))
+        )
         finer = (self._run(method, self._coarser(power)) for power in (1, 0))
         runs = [run for run in (next(coarsest, None), *finer) if run is not None]
         if len(runs) < 2:
             raise InputError(
-                f"{self.scene}: only one lattice could be run, see above: the cells' error is not known"
+                f"{self.scene}: only one lattice could be run, see above: "
+                "the error of the cells is not known"
             )
         return runs
 
     def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
-        """Return the error of the cells from runs of two lattices or three.
+        """Return the law of the cells' error from runs on two or three lattices.
 
-        What turns inside out is as fine as the cells are, and shrinks no faster, whatever the distances say.
+        If cells are inverted, order 1 is taken: the inverted region shrinks no faster than the edge
+        of a cell.
         """
-        apart = [_apart(*pair) for pair in pairwise(runs)]
+        distances = [_distance(*pair) for pair in pairwise(runs)]
         least, greatest = ORDERS
-        far, inverted = len(runs) > 2 and apart[0] > FAR, runs[-1].inverted > 0
-        orders = (least, least) if inverted else (USUAL if far else least, greatest)
-        across = _apart(runs[0], runs[-1])
-        cosine = cosine_of(apart[0], apart[1], across) if len(runs) > 2 else 0.0
-        law = error_law(
-            [each.edge for each in runs], apart, orders, None if far else across, cosine
-        )
-        law, self.cell_bound = replace(law, seen=law.seen and not inverted), ""
-        if not law.seen:
+        is_out_of_phase = len(runs) > 2 and distances[0] > OUT_OF_PHASE
+        is_inverted = runs[-1].inverted > 0
+        orders = (USUAL_ORDER if is_out_of_phase else least, greatest)
+        if is_inverted:
+            orders = (least, least)
+        across = _distance(runs[0], runs[-1])
+        cosine = cosine_of(distances[0], distances[1], across) if len(runs) > 2 else 0.0
+        edges = [each.edge for each in runs]
+        law = error_law(edges, distances, orders, None if is_out_of_phase else across, cosine)
+        law = replace(law, observed=law.observed and not is_inverted)
+        self.cell_bound = ""
+        if not law.observed:
             self.cell_bound = (
                 f"the cells: their distances show no order; order {law.order:g} is taken"
             )
         return law
 
     def _coarser(self, power: float) -> int:
-        """Return the number of cells of the lattice coarsened ``power`` times."""
-        cells: float = self.cells / COARSER ** (3 * power)
+        """Return the cells of the lattice whose edges are REFINEMENT^power times as long."""
+        cells: float = self.cells / REFINEMENT ** (3 * power)
         return max(1, round(cells))
 
-    def _checked(
+    def _refine_choice(
         self, model: CostModel, lattices: Sequence[SizeTrial]
     ) -> tuple[SizePlan, CostModel]:
-        """Choose, run and measure, until the error is little less than the target.
+        """Choose, run and measure until the error is a little less than the target.
 
-        Each choice lies between the cells that met the error and those that did not, for errors go
-        up and down from lattice to lattice. Returns the model with what was learnt, too.
+        Each choice lies between cells that met the target and cells that did not, because the error
+        is not monotonic in the cells. Returns the plan, and the model with the cells narrowed.
         """
-        law, finest, met = model.law, lattices[-1], None
-        fine = (
-            [(finest.edge, law.error(finest.edge))]
-            if law.error(finest.edge) < AIM * self.target
-            else []
-        )
-        coarse: list[
-            tuple[float, float]
-        ] = []  # sizes and errors of what is too coarse, and of what is not
-        for _ in range(CHOICES):
+        law = model.law
+        finest = lattices[-1]
+        met = None
+        finest_error = law.error(finest.edge)
+        # (edge, error) of lattices that are fine enough, and too coarse
+        fine = [(finest.edge, finest_error)] if finest_error < AIM * self.target else []
+        coarse: list[tuple[float, float]] = []
+        for _ in range(MAX_CHOICES):
             choice = model.cheapest(AIM * self.target) or model.cheapest(self.target)
             if choice is None:
                 break
             run = self._run(choice.method, choice.cells)
             if run is None:
-                model = self._without(choice, model, math.ceil(lattices[0].cells))
+                model = self._excluding(choice, model, math.ceil(lattices[0].cells))
                 continue
             measured = self._measured(choice, run, finest, law)
             error = measured.total / self.target
             if error <= 1:
-                met, fine = (
-                    replace(choice, cost=run.cost, budget=measured),
-                    [(run.edge, measured.cells)],
-                )
+                met = replace(choice, cost=run.cost, budget=measured)
+                fine = [(run.edge, measured.cells)]
                 model = replace(model, most=choice.cells - 1)
             else:
                 coarse = [(run.edge, measured.cells)]
                 model = replace(model, least=choice.cells + 1)
-            if ENOUGH <= error <= 1 or model.least > model.most / NARROW:
+            if ACCEPTED <= error <= 1 or model.least > model.most / NARROW:
                 break
             self.report(f"{choice.cells} cells: {measured.total:.1e}, chosen once more")
             model = replace(model, law=law.through(*coarse, *fine))
         return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
 
-    def _without(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
-        """Return a model without a failed choice: without its cells if they are few, or else without its step."""
+    def _excluding(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
+        """Return a model without a failed choice's cells if they are few, or without its method."""
         if choice.cells < fewest:
             return replace(model, least=fewest)
         method = self._as_tried(choice.method)
         kept = [each for each in model.steppings if each.method != method]
         self.bounds.append(
-            f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells"
+            f"the step: {method.integrator} with steps of {method.time_step:g} s "
+            "fails on finer cells"
         )
         return replace(model, steppings=kept or model.steppings)
 
     def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> Budget:
-        """Return the errors of a choice, that of its cells measured from the finest lattice.
+        """Return the errors of a choice; its distance to the finest lattice gives the cells' error.
 
-        Where it is the finer one and they are alike, that is as expected: what they are apart is chance.
+        If the choice is a little finer than the finest lattice, their distance is random and the
+        expected error stands.
         """
-        if 1 < run.cells / finest.cells < FINE:
+        if 1 < run.cells / finest.cells < DISTINCT_CELLS:
             return choice.budget
-        finest = (
-            self._run(self._as_tried(choice.method), finest.asked) or finest
-        )  # so that only the cells differ
-        apart = _apart(run, finest)
+        # the same method, so that only the cells differ
+        finest = self._run(self._as_tried(choice.method), finest.asked) or finest
+        distance = _distance(run, finest)
         if run.edge < finest.edge:
-            return replace(choice.budget, cells=law.measured_finer(apart, run.edge, finest.edge))
-        return replace(choice.budget, cells=law.measured(apart, finest.edge))
-
-    # What is said
+            cells_error = law.measured_finer(distance, run.edge, finest.edge)
+        else:
+            cells_error = law.measured(distance, finest.edge)
+        return replace(choice.budget, cells=cells_error)
 
     def _bounds(self, plan: SizePlan, model: CostModel) -> list[str]:
+        """Return the reasons why the error of a plan is not smaller, or not certain."""
         inverted = inverted_bound(self.trials, self.as_given.material.law)
         bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted]
         if not plan.met:
             bounds += size_bounds(model, self.target, bool(self.bounds))
         return bounds
 
-    # Runs
+    # ---- runs
 
     def _as_tried(self, method: Candidate) -> Candidate:
-        """Return a method with its steps solved as those of the trials are."""
+        """Return a method with the step error of the trials."""
         return replace(method, step_error=self.solved if method.step_error else None)
 
     def _method(self, integrator: IntegratorName, step: float) -> Candidate:
+        """Return an integrator with a time step [s], solved as the trials are."""
         if integrator == "verlet":
             return Candidate(integrator, step)
         return Candidate(integrator, step, PRESET, self.solved)
 
     def _run(self, method: Candidate, cells: int) -> SizeTrial | None:
-        """Return a trial, run at most once; None if it fails, which is reported."""
+        """Return a trial, run on first use; report a failure and return None."""
         done = next(
             (each for each in self.trials if (each.method, each.asked) == (method, cells)), None
         )
@@ -397,30 +430,32 @@ class Sizer:
                 f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}"
             )
             return None
+        inverted = row.get("inverted") or 0.0
+        result = self.bench.result_of(case)
         trial = SizeTrial(
-            method, cells, row["cells"], row["time_second"], row["iterations"], row.get("inverted") or 0.0,
-            self.bench.result_of(case),
-        )  # fmt: skip
+            method, cells, row["cells"], row["time_second"], row["iterations"], inverted, result
+        )
         self.trials.append(trial)
         self.report(trial)
         return trial
 
     def case(self, method: Candidate, cells: int) -> Case:
-        """Return the case of a method and a number of cells, with output at the frames of the scene."""
+        """Return the case of a method and a number of cells, with output at the scene's frames."""
         cages = self.as_given.cages.model_dump(exclude_unset=True) | {
             "count": cells,
             "cell_size": None,
         }
-        timeout = TIME if cells < self.cells else LONG_TIME
+        timeout = TIMEOUT if cells < self.cells else FINEST_TIMEOUT
         case = Case(
-            scene=self.scene.stem, file=self.scene, content="", set=(f"cages={toml_value(cages)}",), ranks=self.ranks,
-            integrator=method.integrator, time_step=method.time_step, preset=method.preset, error=method.step_error,
-            timeout=timeout,
+            scene=self.scene.stem, file=self.scene, content="", set=(f"cages={toml_value(cages)}",),
+            ranks=self.ranks, integrator=method.integrator, time_step=method.time_step,
+            preset=method.preset, error=method.step_error, timeout=timeout,
         )  # fmt: skip
         every = max(1, round(self.step / method.time_step))
         case = with_tables(case, self.duration, 1, self.as_given, surface=True)
         return case.changed(f"output.every={every}")
 
 
-def _apart(run: SizeTrial, reference: SizeTrial) -> float:
+def _distance(run: SizeTrial, reference: SizeTrial) -> float:
+    """Return the distance of the surfaces of two trials [-]."""
     return surface_error(run.result, reference.result)

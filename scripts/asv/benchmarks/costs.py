@@ -1,4 +1,4 @@
-"""What small runs cost, for `asv run`: counts, which no machine changes, peak memory, and a few times."""
+"""Costs of small runs for `asv run`: machine-independent counts, peak memory and some times."""
 
 import sys
 from pathlib import Path
@@ -8,20 +8,20 @@ import lab
 
 CELLS = "cages={count=2000}"
 FRAMES = {"armadillo_leg": 6, "heart_pull": 10, "lung_press": 20, "studies/beam_soft": 10}
-# of a frame, the first left out; times in seconds
-MEANS = "products", "proof_products", "iterations", "ksp_its", "wall_time"
-TOTALS = "memory [byte]", "setup [s]"
+# columns of frames that are averaged, without the first frame; times in seconds
+MEANS = ("products", "proof_products", "iterations", "ksp_its", "wall_time")
+TOTALS = ("memory [byte]", "setup [s]")
 
 
 class Scenes:
-    """A scene's first frames on a small lattice."""
+    """The first frames of each scene on a small lattice."""
 
     params = (tuple(FRAMES), (*MEANS, *TOTALS))
     param_names = ("scene", "figure")
     timeout = 600
 
     def setup_cache(self) -> dict[str, dict[str, float]]:
-        """Run each scene once; its figures by their names."""
+        """Run each scene once and return its figures by name."""
         found = {}
         for scene, frames in FRAMES.items():
             run = lab.run(

@@ -17,11 +17,9 @@ from msmpetsc.lattice.lattice import Lattice
 # constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2);
 # then m and lambda V / (16 h^2)
 ROWS = FORM + 2
-# entries of a cell in a Hessian's state [-]: F by rows, V U' / (16 h^2), V U'' / (16
-# h^2)
+# entries of a cell in a Hessian's state [-]: F by rows, then V U' and V U'' over 16 h^2
 STATE = 11
-# VTK corner at each place of the order with x fastest, then y [-]; the strain formulas
-# need it
+# VTK's corner number at each place of the order with x fastest, then y [-]
 BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]
 
 

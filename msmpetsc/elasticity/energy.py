@@ -51,10 +51,7 @@ class Elasticity:
 
     @property
     def corners(self) -> Indices:
-        """Corner nodes (c, 8) of the solid's cells that this rank owns, in its order.
-
-        (0, 8) for springs.
-        """
+        """Corner nodes (c, 8) of this rank's cells, in the solid's order; (0, 8) for springs."""
         return self.solid.corners if self.solid else np.empty((0, 8), np.int64)
 
     @property

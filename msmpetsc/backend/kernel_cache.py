@@ -79,7 +79,7 @@ def _is_safe(folder: Path) -> bool:
 
 @cache
 def folders() -> tuple[list[Path], Path | None]:
-    """Return the cache directories to read, and the directory to write; None if all are read-only."""
+    """Return the cache directories to read, and the directory to write; None if there is none."""
     safe = []
     for folder in map(Path.absolute, _candidates()):
         with suppress(OSError):

@@ -68,7 +68,7 @@ class Motion(Lines):
         )
 
     @property
-    def leads_away(self) -> bool:
+    def is_moving(self) -> bool:
         """Return whether the motion has a pose after the first."""
         return len(self.times) > 1
 

@@ -1,4 +1,4 @@
-"""Moving obstacles, how a scene's tables make them, and how deep nodes lie in them."""
+"""Moving obstacles: their construction from a scene's tables, and the depths of nodes in them."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,19 +22,22 @@ from msmpetsc.scene.body import MeshTable
 from msmpetsc.scene.obstacles import ObstacleTable
 from msmpetsc.scene.reading import Scene
 
-TOUCHING = 1e-6  # cells: no depth, but what was rounded
-MOST_OFF = 0.01  # by which the gradient of a distance may differ from a unit vector in length
+# depth that counts as touching [cell]; above rounding
+TOUCHING = 1e-6
+# deviation of a distance function's gradient from unit length [-]; a rough test of a
+# user's function
+GRADIENT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Obstacle(Timed):
-    """A solid that may move, and may be there for a while only.
+    """A solid that may move, and may act for a limited time.
 
-    solid       : at its place at time 0
-    path        : how it moves
-    key         : of its table in the scene, for messages
-    outside     : (l,) how far nodes stick out of the surface at rest [m] (build.nearest_of_body): they go so much
-        deeper before the surface meets the obstacle. None: they are the surface
+    solid   : the solid in its pose at time 0
+    path    : motion of the solid
+    key     : key of its table in the scene, for messages
+    outside : (l,) distance of nodes outside of the surface at rest [m] (build.nearest_of_body),
+              which is subtracted from their depth; None if the nodes are the surface
     """
 
     solid: Solid
@@ -43,21 +46,22 @@ class Obstacle(Timed):
     outside: Floats | None = None
 
     def seen_from(self, q: Positions, time: float) -> Positions:
-        """Return where positions (n, 3) [m] at a time [s] are as seen from the solid."""
-        return q - like(q, self.path.displacement_at(time)) if self.path.leads_away else q
+        """Return positions (n, 3) [m] at a time [s] in the frame of the solid."""
+        return q - like(q, self.path.displacement_at(time)) if self.path.is_moving else q
 
     def depths(
         self, q: Positions, time: float, sides: Indices | None = None
     ) -> tuple[Floats, Indices]:
-        """Return how deep the surface at nodes (n, 3) lies in the obstacle at a time [s], (n,) [m], and faces (n,).
+        """Return the depths (n,) [m] of the surface at nodes (n, 3) at a time [s], and the faces
+        (n,).
 
-        sides : (n or more,) by which face each node came in; None: the nearest counts
+        sides : (n or more,) sides of the nodes (solids.side_of); None for the nearest face
         """
         depths, face = self.solid.depths(self.seen_from(q, time), sides)
         return depths if self.outside is None else depths - self.outside[: len(q)], face
 
     def normals_at(self, q: Positions, time: float, face: Indices) -> Rows:
-        """Return unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within at a time [s]."""
+        """Return unit normals (n, 3) of faces (n,) at positions (n, 3) [m] in the solid."""
         return self.solid.normals(self.seen_from(q, time), face)
 
     def sides(
@@ -68,9 +72,12 @@ class Obstacle(Timed):
         time_step: float,
         before: Indices | None = None,
     ) -> Indices:
-        """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3) [m] in a step ending at ``time``.
+        """Return the sides (n,) of nodes on straight paths from q to ``end`` (n, 3) [m] in a step.
 
-        before : (n,) the sides when it began. A node that the obstacle appears around gets the face nearest to it.
+        If the obstacle begins to act in the step, a node inside gets the nearest face.
+
+        time   : end of the step [s]
+        before : (n,) sides at the beginning of the step
         """
         if not (self.acts_at(time) and isinstance(self.solid, Faces)):
             return no_sides(q)
@@ -81,7 +88,7 @@ class Obstacle(Timed):
         return self.solid.sides_of(self.seen_from(q, begin), self.seen_from(end, time), before)
 
     def sent(self, send: Send) -> "Obstacle":
-        """Return it with the arrays that each step works with sent where ``send`` takes them."""
+        """Return the obstacle with the arrays of a step's work on the device of ``send``."""
         outside = None if self.outside is None else send(self.outside)
         return replace(self, solid=self.solid.sent(send), outside=outside)
 
@@ -89,9 +96,11 @@ class Obstacle(Timed):
 def build_obstacles(
     comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Floats | None
 ) -> list[Obstacle]:
-    """Return the obstacles of a scene, for nodes (l,) that stick ``outside`` [m] so far (collective).
+    """Return the obstacles of a scene (collective).
 
-    Raises InputError on all ranks for a mesh that is not closed, and for a function that is no signed distance.
+    outside : (l,) distance of nodes outside of the surface at rest [m]
+
+    Raises InputError on all ranks if a mesh is not closed or a function is no signed distance.
     """
     obstacles = []
     for number, table in enumerate(scene.obstacle):
@@ -103,7 +112,7 @@ def build_obstacles(
 
 
 def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
-    """Return the surface of an obstacle that is a mesh. Raises InputError if it is not closed."""
+    """Return the surface of an obstacle's mesh. Raises InputError if the mesh is not closed."""
     try:
         surface = prepare(load(mesh.source, folder), mesh.prepare, mesh.size, mesh.base)
         report = examine(surface)
@@ -118,7 +127,7 @@ def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
 
 
 def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: Positions) -> Solid:
-    """Return the solid of a table, for bodies that have nodes (owned, 3) [m] at rest."""
+    """Return the solid of a table. A function is checked at the nodes (owned, 3) [m] at rest."""
     if table.mesh is not None:
         mesh = table.mesh
         surface = comm.bcast(on_root(comm, lambda: obstacle_surface(mesh, key, folder)))
@@ -127,7 +136,7 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: 
         with together(comm):
             solid = FunctionSolid(OBSTACLES.find(table.function), key)
             lengths = np.linalg.norm(solid.distances(nodes)[1], axis=1)
-            if len(nodes) and abs(np.median(lengths) - 1) > MOST_OFF:
+            if len(nodes) and abs(np.median(lengths) - 1) > GRADIENT_TOLERANCE:
                 wrong = f"its gradient is {np.median(lengths):.3g} long at most nodes, not 1"
                 raise InputError(f"{key}.function: no signed distance: {wrong}")
             return solid
@@ -141,11 +150,12 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: 
 def describe_overlap(
     comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, held: Mask, time: float
 ) -> str | None:
-    """Describe the free nodes inside an obstacle at a time [s]; None if there are none (collective).
+    """Return a description of the free nodes inside an obstacle; None without nodes (collective).
 
-    A scene seldom means that, and what reflects leaves them inside.
+    Such an overlap is seldom intended, and an obstacle that reflects does not remove it.
 
-    q, held : (l, 3) [m]; (l,) bool, the nodes that are not free
+    q    : (l, 3) positions [m]
+    held : (l,) bool, the nodes that are not free
     """
     owned = slice(lattice.owned)
     inside, _ = obstacle.depths(q[owned], time)
@@ -156,4 +166,5 @@ def describe_overlap(
     deepest = comm.allreduce(greatest(inside[rows]), MPI.MAX)
     nodes = f"{count} node{'s' if count > 1 else ''}"
     worst = node_of_greatest(comm, lattice, rows, inside[rows])
-    return f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({deepest / lattice.cell_size:.2g} cells) deep: {worst}"
+    cells = deepest / lattice.cell_size
+    return f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({cells:.2g} cells) deep: {worst}"

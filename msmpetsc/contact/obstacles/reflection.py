@@ -1,12 +1,11 @@
-"""What a node does that strikes an obstacle: it loses speed (``slowed``), or, as the paper has it
-(section 5), its last two positions are exchanged (``Exchange``).
+"""Impact of nodes on obstacles, with a coefficient of restitution e.
 
-There is no velocity in the state, only q_n and q_(n-1). A node that strikes gets e times its normal
-velocity by another q_(n-1): it stays where the springs want it, and no energy comes in. The push of
-the face then turns it round, so that it leaves with e times the speed that it came with.
+The state has q_n and q_(n-1) in place of a velocity. There are two laws:
 
-The paper reverses a velocity, v_(n+1) = -v_n, by q_(n+1) = q_(n-1). The obstacle thereby moves
-nodes against their springs, which adds energy during the impact; it is not a conservative contact.
+- ``slowed`` scales the normal velocity of a striking node by e through a new q_(n-1). The node's
+  position stays, so no energy is added. The push of the penalty then reverses the velocity.
+- ``Exchange`` is the paper's reflection (section 5): v_(n+1) = -v_n by q_(n+1) = q_(n-1). It moves
+  nodes against their springs, which adds energy. So this contact is not conservative.
 """
 
 from dataclasses import dataclass
@@ -19,8 +18,11 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 @dataclass(frozen=True)
 class StepTaken:
-    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in
-    contact (Obstacle.sides), of several obstacles (o, n); None: by none."""
+    """A completed step: the time [s] of its end, its length [s], and the sides of nodes.
+
+    sides : (n,) faces by which nodes are in contact (Obstacle.sides), or (o, n) for several
+            obstacles; None without contact
+    """
 
     time: float
     length: float
@@ -29,7 +31,7 @@ class StepTaken:
 
 @dataclass(frozen=True)
 class Exchange:
-    """An obstacle and its restitution in [0, 1] (1: the paper)."""
+    """The paper's reflection, with a coefficient of restitution in [0, 1]; the paper has 1."""
 
     obstacle: Obstacle
     restitution: float
@@ -37,11 +39,12 @@ class Exchange:
     def exchanged(
         self, q: Positions, q_previous: Positions, step: StepTaken
     ) -> tuple[Positions, Positions]:
-        """Return q_n and q_(n-1) after contact; (n, 3) [m] each.
+        """Return q_n and q_(n-1) (n, 3) [m] after the impact.
 
-        Where a node, on its way, has come to lie on or behind a face and its v_n = q_n - q_(n-1), as seen from
-        the obstacle, goes on into it, the normal part of q_n goes back by that of v_n, which becomes -e times itself.
-        With e = 1 and an obstacle at rest this exchanges the normal parts of q_n and q_(n-1).
+        A node strikes if it is on or behind a face and v_n = q_n - q_(n-1), relative to the
+        obstacle, points into the solid. The normal part of v_n is then subtracted from q_n, and the
+        new v_n has -e times this part. If e = 1 and the obstacle rests, this exchanges the normal
+        parts of q_n and q_(n-1).
         """
         rows, into = striking(self.obstacle, q, q_previous, step)
         if len(rows) == 0:
@@ -55,7 +58,10 @@ class Exchange:
 def slowed(
     obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken
 ) -> Positions:
-    """Return q_(n-1) (n, 3) [m] by which nodes that came to a face in this step have e times their velocity into it."""
+    """Return q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes by restitution e.
+
+    A node strikes in the step in which it reaches a face.
+    """
     rows, into = striking(obstacle, q, q_previous, step)
     before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]
     rows, into = rows[before < 0], into[before < 0]
@@ -69,8 +75,11 @@ def slowed(
 def striking(
     obstacle: Obstacle, q: Positions, q_previous: Positions, step: StepTaken
 ) -> tuple[Indices, Rows]:
-    """Return the nodes (k,) on or behind the faces of their sides, and the part (k, 3) [m] of their way in the step
-    that goes on into it, as seen from the obstacle; nothing where that is not there."""
+    """Return the nodes (k,) on or behind a face, and their displacements (k, 3) [m] into the solid.
+
+    The displacement is the normal part, inwards, of the step's displacement relative to the
+    obstacle. If the obstacle does not act, the result is empty.
+    """
     time, path = step.time, obstacle.path
     if not obstacle.acts_at(time):
         return np.zeros(0, np.int64), np.zeros((0, 3))
@@ -81,6 +90,6 @@ def striking(
     rows = np.flatnonzero(behind)
     normal = obstacle.normals_at(q[rows], time, face[rows])
     v = q[rows] - q_previous[rows]
-    if path.leads_away:
+    if path.is_moving:
         v = v - like(v, path.displacement_between(time - step.length, time))
     return rows, np.minimum((v * normal).sum(axis=1), 0)[:, None] * normal

@@ -1,6 +1,6 @@
-"""Solids that nodes stay out of: planes, boxes and balls.
+"""Solids that obstacles consist of: planes, boxes and balls.
 
-Each at its place at time 0; where an obstacle has moved, positions are as seen from it.
+A solid is fixed in its pose at time 0. For a moving obstacle, positions are given in its frame.
 """
 
 from abc import ABC, abstractmethod
@@ -13,62 +13,69 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 
-TINY = 1e-300  # [m]
-OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other
-ROUNDED = 1e-12  # of a node's way: a plate as thin as that is not passed either
+# smallest length to divide by [m]
+TINY = 1e-300
+# largest cosine between the normals of opposite faces [-]; -1 up to rounding
+OPPOSITE = -1 + 1e-9
+# rounding of a crossing [fraction of a node's path]; a plate of zero thickness still
+# stops nodes
+ROUNDED = 1e-12
 
 Send = Callable[[Array], Array]
 
 
 class Solid(ABC):
-    """A solid. Positions are (n, 3) [m]; a face is what a node comes in by, one of several or the only one, 0."""
+    """A solid, whose faces have numbers from 0. Positions are (n, 3) [m]."""
 
     @property
     def has_sides(self) -> bool:
-        """Whether it matters by which of its faces a node came in."""
+        """Whether the depth depends on the face by which a node entered."""
         return False
 
     @abstractmethod
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """Return how deep positions lie (n,) [m], behind the face of their side (n or more,) or
-        else the nearest, and that face (n,).
+        """Return the depths (n,) [m] of positions behind a face, and the numbers (n,) of the faces.
 
-        Outside it is negative, and no less than minus the distance.
+        The depth outside is negative, and at least minus the distance.
+
+        sides : (n or more,) 1 + the face by which each node entered; 0 for the nearest face
         """
 
     @abstractmethod
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
+        """Return the outward unit normals (n, 3) of the faces (n,) at positions in the solid."""
 
     @abstractmethod
-    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return how much deeper positions within lie behind faces (n,) than ``moved`` (n, 3) [m] before, (n,) [m].
+    def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        """Return the change of depth (n,) [m] behind faces (n,) from q - moved to q, in the solid.
 
-        A difference of depths would keep only the digits of a position.
+        A difference of two depths would lose the digits of a small displacement.
+
+        moved : (n, 3) displacement [m]
         """
 
     def sent(self, send: Send) -> "Solid":
-        """Return it with the arrays that each step works with sent where ``send`` takes them."""
+        """Return the solid with the arrays of a step's work on the device of ``send``."""
         return self
 
 
 class Planes(NamedTuple):
-    """Planes of faces, (f, 3) each: a point [m], and the unit normal towards the free side."""
+    """Planes of faces: points (f, 3) [m], and outward unit normals (f, 3)."""
 
     points: Positions
     normals: Rows
 
 
 class Depths(NamedTuple):
-    """Sides (n or more,) of nodes; their depths (n,) [m] and faces (n,), to be written to."""
+    """Sides (n or more,) of nodes, and a kernel's output: depths (n,) [m] and faces (n,)."""
 
     sides: Indices
     depths: Floats
     faces: Indices
 
 
-class Ways(NamedTuple):
-    """Ends (n, 3) [m] of nodes' ways, sides (n,) before, and after (n,), to be written to."""
+class Paths(NamedTuple):
+    """Ends (n, 3) [m] of nodes' paths, sides (n,) before, and a kernel's output: sides (n,)."""
 
     ends: Positions
     before: Indices
@@ -77,7 +84,7 @@ class Ways(NamedTuple):
 
 @njit(inline="always")
 def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
-    """Return how far the position q[i] (3,) lies behind a face [m]; negative in front of it."""
+    """Return the distance [m] of q[i] behind the plane of a face; negative in front of it."""
     points, normals = planes
     distance: float = -normals[face, 0] * (q[i, 0] - points[face, 0])
     distance -= normals[face, 1] * (q[i, 1] - points[face, 1])
@@ -87,9 +94,9 @@ def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
 
 @njit(inline="always")
 def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
-    """Return how deep q[i] (3,) lies behind the face of its ``side`` [m], and that face.
+    """Return the depth [m] of q[i] behind the face of its ``side``, and the number of the face.
 
-    Without a side: how deep in the solid, not positive outside, and the nearest face.
+    If ``side`` is 0, return the depth in the solid, not positive outside, and the nearest face.
     """
     if side > 0:
         return behind(q, i, planes, side - 1), side - 1
@@ -103,9 +110,9 @@ def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
 
 @njit()
 def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
-    """Return whether q[i] lies behind a face and has not slid off it past another.
+    """Return whether q[i] is behind a face and has not slid off the face sideways.
 
-    The opposite face is left aside: that of a thin plate may be passed.
+    The opposite face does not count, because a node may be beyond the far face of a thin plate.
     """
     if behind(q, i, planes, face) <= 0.0:
         return False
@@ -120,19 +127,20 @@ def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
 
 @njit()
 def side_of(q: Positions, end: Positions, i: int, planes: Planes, side: int) -> int:
-    """Return 1 + the face by which a node is in contact on its straight way from q[i] to end[i], 0 if it meets none.
+    """Return 1 + the face by which a node is in contact on its straight path from q[i] to end[i].
 
-    side : by which it was before: it keeps that until it is out of the solid
+    The result is 0 if the node does not meet the solid. The test is for the node itself, which may
+    lie outside of the body's surface. So a node with a side may still have no depth.
 
-    It is the node that counts here, however far it sticks out of the surface: with a side, but no
-    depth yet, it is on its way in, or out again.
+    side : the node's side before, which it keeps until it leaves the solid
     """
     if side > 0 and _stays(q, i, planes, side - 1):
         return side
     inside, face = depth(q, i, planes, 0)
     if inside > 0.0:
         return face + 1
-    enter, leave, side = -1.0, 1.0, 0  # fractions of the way
+    # Fractions of the path at which the node enters the solid and leaves it.
+    enter, leave, side = -1.0, 1.0, 0
     for f in range(len(planes.points)):
         first, last = behind(q, i, planes, f), behind(end, i, planes, f)
         if first <= 0.0:
@@ -153,24 +161,25 @@ def _depths_of(first: int, count: int, step: int, q: Positions, planes: Planes, 
 
 
 @kernel
-def _sides_of(first: int, count: int, step: int, q: Positions, planes: Planes, ways: Ways) -> None:
-    ends, before, sides = ways
+def _sides_of(
+    first: int, count: int, step: int, q: Positions, planes: Planes, paths: Paths
+) -> None:
+    ends, before, sides = paths
     for i in range(first, count, step):
         sides[i] = side_of(q, ends, i, planes, before[i])
 
 
 @dataclass(frozen=True)
 class Faces(Solid):
-    """The points behind all faces: one face is a plane, six are a box."""
+    """The points behind all faces: a half space with a single face, or a box with six."""
 
     planes: Planes
 
     @classmethod
     def of_box(cls, low: Positions, high: Positions) -> "Faces":
         """Return the box between two corners (3,) [m]."""
-        points = np.repeat(
-            np.array([low, high], float), 3, axis=0
-        )  # the faces that meet at each of the two corners
+        # Three faces meet at each of the two corners.
+        points = np.repeat(np.array([low, high], float), 3, axis=0)
         return cls(Planes(points, np.concatenate([-np.eye(3), np.eye(3)])))
 
     @property
@@ -186,15 +195,18 @@ class Faces(Solid):
     def normals(self, q: Positions, face: Indices) -> Rows:
         return self.planes.normals[face]
 
-    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        deeper: Floats = -(moved * self.planes.normals[face]).sum(axis=1)
-        return deeper
+    def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        change: Floats = -(moved * self.planes.normals[face]).sum(axis=1)
+        return change
 
     def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
-        """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3), ``before`` (n,) having sides."""
-        ways = Ways(end, before, no_sides(q))
-        _sides_of(len(q), q, self.planes, ways)
-        return ways.sides
+        """Return ``side_of`` (n,) for nodes on straight paths from q to ``end`` (n, 3) [m].
+
+        before : (n,) the nodes' sides before
+        """
+        paths = Paths(end, before, no_sides(q))
+        _sides_of(len(q), q, self.planes, paths)
+        return paths.sides
 
     def sent(self, send: Send) -> "Faces":
         return Faces(Planes(*map(send, self.planes)))
@@ -202,7 +214,7 @@ class Faces(Solid):
 
 @dataclass(frozen=True)
 class BallSolid(Solid):
-    """A ball: center (3,) and radius [m]. At its very center there is no normal."""
+    """A ball: center (3,) [m] and radius [m]. The normal at its center is zero."""
 
     center: Positions
     radius: float
@@ -217,18 +229,18 @@ class BallSolid(Solid):
         normals: Rows = out / np.maximum(np.linalg.norm(out, axis=1), TINY)[:, None]
         return normals
 
-    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return how much deeper positions within lie: |u| - |v| = (u - v) (u + v) / (|u| + |v|), (n,) [m]."""
+    def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        # |u| - |v| = (u - v) . (u + v) / (|u| + |v|)
         u = q - self.center
         v = u - moved
         both = np.linalg.norm(u, axis=1) + np.linalg.norm(v, axis=1)
-        deeper: Floats = -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
-        return deeper
+        change: Floats = -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
+        return change
 
     def sent(self, send: Send) -> "BallSolid":
         return replace(self, center=send(self.center))
 
 
 def no_sides(q: Positions) -> Indices:
-    """Return the sides (n,) of nodes (n, 3) that are in contact with nothing."""
+    """Return the sides (n,) of nodes (n, 3) without contact: zeros."""
     return np.zeros(len(q), np.int8, like=q)

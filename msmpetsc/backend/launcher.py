@@ -84,15 +84,8 @@ def described(
         layout = "F"
     else:
         layout = "A"
-    return f"{dtype} {len(shape)} {layout}", (
-        0,
-        0,
-        int(np.prod(shape)),
-        size,
-        pointer,
-        *shape,
-        *strides,
-    )
+    words = 0, 0, int(np.prod(shape)), size, pointer, *shape, *strides
+    return f"{dtype} {len(shape)} {layout}", words
 
 
 def type_of(kind: Kind) -> object:

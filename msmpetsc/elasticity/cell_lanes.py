@@ -38,15 +38,9 @@ FAST = {"contract", "nsz", "reassoc", "arcp"}
 @njit(inline="always")
 def _component_in(w: Floats, at: int) -> Eight:
     return (
-        w[at],
-        w[at + 24],
-        w[at + 48],
-        w[at + 72],
-        w[at + 96],
-        w[at + 120],
-        w[at + 144],
-        w[at + 168],
-    )
+        w[at], w[at + 24], w[at + 48], w[at + 72],
+        w[at + 96], w[at + 120], w[at + 144], w[at + 168],
+    )  # fmt: skip
 
 
 @njit(inline="always")

@@ -33,15 +33,8 @@ def strain(u: Eight, form: Six) -> Seven:
     a, b, c, d, e, f, g, h = u
     s0, d0, s1, d1, s2, d2, s3, d3 = a + b, b - a, c + d, d - c, e + f, f - e, g + h, h - g
     x0, y0, xy0, x1, y1, xy1 = d0 + d1, s1 - s0, d1 - d0, d2 + d3, s3 - s2, d3 - d2
-    x, y, z, xy, xz, yz, xyz = (
-        x0 + x1,
-        y0 + y1,
-        (s2 + s3) - (s0 + s1),
-        xy0 + xy1,
-        x1 - x0,
-        y1 - y0,
-        xy1 - xy0,
-    )
+    x, y, z = x0 + x1, y0 + y1, (s2 + s3) - (s0 + s1)
+    xy, xz, yz, xyz = xy0 + xy1, x1 - x0, y1 - y0, xy1 - xy0
     cx, cy, cz, mxy, mxz, myz = form
     return (
         x + xy * cy + xz * cz + xyz * myz,
@@ -73,14 +66,8 @@ def corner_strain(a: int, form: Six) -> Seven:
 @njit(inline="always")
 def modes_forces(c: Floats, k: int, e: Seven) -> Four:
     """Return the derivatives (4,) of the modes' energy with respect to the modes of a strain."""
-    xy, xz, yz, of_yz, of_xz, of_xy = (
-        c[k + 48],
-        c[k + 56],
-        c[k + 64],
-        c[k + 72],
-        c[k + 80],
-        c[k + 88],
-    )
+    xy, xz, yz = c[k + 48], c[k + 56], c[k + 64]
+    of_yz, of_xz, of_xy = c[k + 72], c[k + 80], c[k + 88]
     return (
         xy * e[3] + of_yz * e[4] + of_xz * e[5],
         of_yz * e[3] + xz * e[4] + of_xy * e[5],

@@ -43,46 +43,13 @@ def strains_at(q: Positions, cells: CellRows, i: int) -> Strains:
     """Return the strains of cell i for the values q (l, 3) of nodes."""
     c, form = cells.nodes[i], form_of(cells.constants, constants_at(cells, i))
     return (
-        strain(
-            (
-                q[c[0], 0],
-                q[c[1], 0],
-                q[c[2], 0],
-                q[c[3], 0],
-                q[c[4], 0],
-                q[c[5], 0],
-                q[c[6], 0],
-                q[c[7], 0],
-            ),
-            form,
-        ),
-        strain(
-            (
-                q[c[0], 1],
-                q[c[1], 1],
-                q[c[2], 1],
-                q[c[3], 1],
-                q[c[4], 1],
-                q[c[5], 1],
-                q[c[6], 1],
-                q[c[7], 1],
-            ),
-            form,
-        ),
-        strain(
-            (
-                q[c[0], 2],
-                q[c[1], 2],
-                q[c[2], 2],
-                q[c[3], 2],
-                q[c[4], 2],
-                q[c[5], 2],
-                q[c[6], 2],
-                q[c[7], 2],
-            ),
-            form,
-        ),
-    )
+        strain((q[c[0], 0], q[c[1], 0], q[c[2], 0], q[c[3], 0],
+                q[c[4], 0], q[c[5], 0], q[c[6], 0], q[c[7], 0]), form),
+        strain((q[c[0], 1], q[c[1], 1], q[c[2], 1], q[c[3], 1],
+                q[c[4], 1], q[c[5], 1], q[c[6], 1], q[c[7], 1]), form),
+        strain((q[c[0], 2], q[c[1], 2], q[c[2], 2], q[c[3], 2],
+                q[c[4], 2], q[c[5], 2], q[c[6], 2], q[c[7], 2]), form),
+    )  # fmt: skip
 
 
 @njit(inline="always")

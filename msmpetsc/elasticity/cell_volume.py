@@ -34,34 +34,16 @@ def _volume(a: Vector, b: Vector, c: Vector) -> float:
 @njit()
 def least_volume(q: Positions, c: Indices) -> float:
     """Return the smallest of the eight corner volumes of a cell [m^3]."""
-    x0, x1, x2, x3 = (
-        edge(q, c[0], c[1]),
-        edge(q, c[3], c[2]),
-        edge(q, c[4], c[5]),
-        edge(q, c[7], c[6]),
-    )
-    y0, y1, y2, y3 = (
-        edge(q, c[0], c[3]),
-        edge(q, c[1], c[2]),
-        edge(q, c[4], c[7]),
-        edge(q, c[5], c[6]),
-    )
-    z0, z1, z2, z3 = (
-        edge(q, c[0], c[4]),
-        edge(q, c[1], c[5]),
-        edge(q, c[2], c[6]),
-        edge(q, c[3], c[7]),
-    )
-    volume = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
-    return float(
-        min(
-            volume,
-            _volume(x2, y2, z0),
-            _volume(x2, y3, z1),
-            _volume(x3, y3, z2),
-            _volume(x3, y2, z3),
-        )
-    )
+    x0, x1 = edge(q, c[0], c[1]), edge(q, c[3], c[2])
+    x2, x3 = edge(q, c[4], c[5]), edge(q, c[7], c[6])
+    y0, y1 = edge(q, c[0], c[3]), edge(q, c[1], c[2])
+    y2, y3 = edge(q, c[4], c[7]), edge(q, c[5], c[6])
+    z0, z1 = edge(q, c[0], c[4]), edge(q, c[1], c[5])
+    z2, z3 = edge(q, c[2], c[6]), edge(q, c[3], c[7])
+    low = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
+    v4, v5 = _volume(x2, y2, z0), _volume(x2, y3, z1)
+    v6, v7 = _volume(x3, y3, z2), _volume(x3, y2, z3)
+    return float(min(low, v4, v5, v6, v7))
 
 
 @kernel
@@ -82,15 +64,9 @@ def least_volumes(q: Positions, cells: Indices) -> Floats:
 @njit(inline="always")
 def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
     corners = (
-        q[c[0], k],
-        q[c[1], k],
-        q[c[3], k],
-        q[c[2], k],
-        q[c[4], k],
-        q[c[5], k],
-        q[c[7], k],
-        q[c[6], k],
-    )
+        q[c[0], k], q[c[1], k], q[c[3], k], q[c[2], k],
+        q[c[4], k], q[c[5], k], q[c[7], k], q[c[6], k],
+    )  # fmt: skip
     x, y, z, _, _, _, _ = strain(corners, form)
     return x, y, z
 

@@ -133,11 +133,9 @@ def _coupling_bound(f: Nine, j: float, slope: float, least: float) -> float:
     Gershgorin's bound of the largest singular value of F, exact in a rotation. Otherwise c is R
     |F|.
     """
-    xx, yy, zz = (
-        f[0] ** 2 + f[3] ** 2 + f[6] ** 2,
-        f[1] ** 2 + f[4] ** 2 + f[7] ** 2,
-        f[2] ** 2 + f[5] ** 2 + f[8] ** 2,
-    )
+    xx = f[0] ** 2 + f[3] ** 2 + f[6] ** 2
+    yy = f[1] ** 2 + f[4] ** 2 + f[7] ** 2
+    zz = f[2] ** 2 + f[5] ** 2 + f[8] ** 2
     xy = abs(f[0] * f[1] + f[3] * f[4] + f[6] * f[7])
     xz = abs(f[0] * f[2] + f[3] * f[5] + f[6] * f[8])
     yz = abs(f[1] * f[2] + f[4] * f[5] + f[7] * f[8])
@@ -177,18 +175,11 @@ def gradient_of(e: Strains, inverse_h4: float) -> Nine:
 @njit(inline="always")
 def kept_gradient(state: Floats, s: int) -> Nine:
     """Return F (9,) of the cell whose entries begin at ``state[s]``."""
-    rows = state[s], state[s + 8], state[s + 16], state[s + 24], state[s + 32], state[s + 40]
     return (
-        rows[0],
-        rows[1],
-        rows[2],
-        rows[3],
-        rows[4],
-        rows[5],
-        state[s + 48],
-        state[s + 56],
-        state[s + 64],
-    )
+        state[s], state[s + 8], state[s + 16],
+        state[s + 24], state[s + 32], state[s + 40],
+        state[s + 48], state[s + 56], state[s + 64],
+    )  # fmt: skip
 
 
 @njit(inline="always")
@@ -228,14 +219,9 @@ def quadratic_change(w: Floats, k: int, moved: Strains, base: Strains) -> float:
 @njit(inline="always")
 def write_state(store: Floats, s: int, f: Nine, slope: float, curvature: float) -> None:
     """Write F, V U' and V U'' of a cell into ``store`` from index s, for its Hessian."""
-    store[s], store[s + 8], store[s + 16], store[s + 24], store[s + 32] = (
-        f[0],
-        f[1],
-        f[2],
-        f[3],
-        f[4],
-    )
-    store[s + 40], store[s + 48], store[s + 56], store[s + 64] = f[5], f[6], f[7], f[8]
+    store[s], store[s + 8], store[s + 16] = f[0], f[1], f[2]
+    store[s + 24], store[s + 32], store[s + 40] = f[3], f[4], f[5]
+    store[s + 48], store[s + 56], store[s + 64] = f[6], f[7], f[8]
     store[s + 72], store[s + 80] = slope, curvature
 
 

@@ -208,17 +208,8 @@ def topology_of(cages: Cages) -> Topology:
     share = None if share is None else share[:, *CORNERS.T]
     squares = cages.of_cells(ijk[cells[:, 0]], cages.squares)
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    return Topology(
-        table,
-        corners,
-        ijk,
-        octants,
-        ghosts,
-        cells,
-        share,
-        squares,
-        *_springs(cells, numbers, owned),
-    )
+    springs = _springs(cells, numbers, owned)
+    return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *springs)
 
 
 class LawConstants(NamedTuple):

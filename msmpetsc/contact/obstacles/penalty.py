@@ -123,7 +123,7 @@ class ContactState:
         return self.penalty.obstacle.depths(q, self.time, self.sides)
 
     def pressed(self, q: Positions) -> Pressed:
-        """Return the rows (a,) of positions q (n, 3) inside, their depths (a,) and normals (a, 3)."""
+        """Return the rows (a,) of nodes q (n, 3) inside, their depths (a,) and normals (a, 3)."""
         depths, face = self.depths(q)
         rows = np.flatnonzero(depths > 0)
         return rows, depths[rows], self.penalty.obstacle.normals_at(q[rows], self.time, face[rows])
@@ -197,7 +197,7 @@ class Contact:
         return total
 
     def stopped(self, q: Positions, base: Positions) -> Positions | None:
-        """Return q with the nodes that enter obstacles from base stopped there; None without them."""
+        """Return q with the nodes that enter obstacles from base stopped; None without them."""
         corrections = [state.stopped(q[: self.owned], base[: self.owned]) for state in self.states]
         if not any(len(rows) for rows, _ in corrections):
             return None
@@ -249,8 +249,8 @@ class Contact:
     def hessian(self, q: Positions, duals: Duals | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield the nodes (a,) and blocks (a, 3, 3) [N/m] of each obstacle's penalty and friction.
 
-        The Hessian is the sum of all blocks, which are positive semidefinite. The negative term
-        -k d / r of a solid with radius of curvature r is neglected.
+        The Hessian is the sum of all blocks, each positive semidefinite. The negative term -k d / r of a
+        solid with radius of curvature r is neglected.
 
         duals : duals of friction; None for its true Hessian
         """

@@ -24,16 +24,14 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 
 
 def kernel(body: Callable[..., None]) -> Callable[..., None]:
-    """Return a kernel: ``kernel(body)(count, *arguments)`` runs the body for all indices below
-    count.
+    """Return a kernel that runs a body for all indices: ``kernel(body)(count, *arguments)``.
 
     ``body(first, count, step, *arguments)`` must loop over range(first, count, step). The type of
-    the first argument, an array, selects the device. The order of the indices is arbitrary, so no
-    two indices may write to the same place. The body may call functions of ``math`` and functions
+    the first argument, an array, selects the device. The order of indices is arbitrary, so no two
+    indices may write to the same place. The body may call functions of ``math`` and functions
     compiled by ``njit``.
     """
-    # On a GPU a division by zero gives infinity. The CPU must agree, so that a step
-    # detects it.
+    # Division by zero gives infinity, as on a GPU. A step detects it.
     compiled = njit(error_model="numpy")(body)
 
     @wraps(body)

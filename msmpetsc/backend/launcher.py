@@ -24,8 +24,7 @@ from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import MsmpetscError
 
 cuda: Any = untyped
-# threads of a block [-]; registers limit the kernels that visit all neighbours of a
-# node
+# threads of a block [-]; registers limit kernels that visit all neighbours of a node
 THREADS = 128
 # array descriptors in the cache [-]; bounds its memory
 KEPT = 4096

@@ -55,8 +55,7 @@ class ActingForces:
         return self._load
 
     def beyond(self, time: float, end: float) -> Rows | None:
-        """Return f(time) - f(end) (owned, 3) [N] of the time-dependent forces that act at both
-        times.
+        """Return f(time) - f(end) (owned, 3) [N] of time-dependent forces that act at both times.
 
         end : end of the step that contains ``time`` [s]
 

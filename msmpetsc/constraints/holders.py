@@ -29,8 +29,7 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.reading import Scene
 
-# least free fraction of a spring [-]; stiffer springs cost iterations and explicit
-# steps
+# least free fraction of a spring [-]; stiff springs cost iterations and substeps
 LEAST = 0.1
 # bisections towards the edge of a region [-]; the edge is exact to 1e-6 of a spring
 HALVINGS = 20
@@ -72,8 +71,7 @@ class Holders:
         return sums_by(self.number, forces, len(self.keys))
 
     def torques(self, q: Positions, forces: Rows, points: Positions) -> Rows:
-        """Return the torque (a, 3) [N m] of ``forces`` (owned, 3) on each holder's nodes on this
-        rank.
+        """Return the torque (a, 3) [N m] of ``forces`` (owned, 3) on each holder's owned nodes.
 
         points : (a, 3) reference point of each holder [m]
         """
@@ -195,8 +193,7 @@ def taken(
     for table in scene.tables("force"):
         where, force = masks[table.key], table.table
         until = math.inf if force.stop is None else force.stop
-        # Only an anchor that holds a node as long as the force acts takes all of its
-        # effect.
+        # An anchor annuls a force only if it holds the node as long as the force acts.
         lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
         nodes = count(where)
         held = count(where & reduce(np.logical_or, lasting, lattice.pinned))

@@ -17,8 +17,7 @@ from msmpetsc.scene.values import Vector
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-# relative tolerance of times [-]; a multiple of the time step may be rounded below a
-# time
+# relative tolerance of times [-]; a multiple of the time step may be rounded down
 SAME = 1e-12
 
 
@@ -45,8 +44,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Motion(Lines):
-    """A rigid motion over time. Its vectors (k, 6) are displacements [m] and rotation vectors
-    [rad].
+    """A rigid motion over time: displacements [m] and rotation vectors [rad], side by side (k, 6).
 
     The first time is 0, with the zero vector.
 
@@ -186,8 +184,7 @@ class OwnForce(Timed):
         force = np.zeros((len(q), 3))
         if not len(self.rows):
             return force
-        # Floating-point errors in a user's function are warnings, not errors of this
-        # program.
+        # A user's function may divide by zero: its result is checked below.
         with np.errstate(all="warn"):
             per_mass = np.asarray(self.function(q[self.rows], v[self.rows], time), float)
         try:

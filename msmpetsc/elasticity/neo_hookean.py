@@ -38,8 +38,7 @@ from msmpetsc.elasticity.springs import Vector
 
 # J_0 [-]; U is a parabola below, so that the force on an inverted cell stays finite
 ONSET = 0.2
-# least J [-] at which compression leaves the 3 x 3 block positive semidefinite; see
-# above
+# least J [-] at which compression keeps the 3 x 3 block semidefinite; see above
 CONVEX = 0.5
 # R, bound of the norm of G -> F x G by |F| [-]; see above
 NORM = math.sqrt(4 / 3)
@@ -250,8 +249,7 @@ def concavity_bound(f: Nine, mu: float, lame: float) -> float:
 def rotation_of(f: Nine) -> tuple[Nine, bool]:
     """Return the rotation R of F = R S, and whether it was computed.
 
-    Newton's iteration is R <- (R + R^-T) / 2 (Higham 1986). If J is not above J_0, R is the
-    identity.
+    Newton's iteration is R <- (R + R^-T) / 2 (Higham 1986). If J <= J_0, R is the identity.
     """
     if not determinant(f, cofactors(f)) > ONSET:
         return (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), False

@@ -24,8 +24,7 @@ from msmpetsc.elasticity.neo_hookean import ONSET
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.lattice.lattice import Lattice
 
-# indices of xx, yy, zz, xy, yz, xz among a tensor's nine entries [-]; the order of the
-# result file
+# indices of xx, yy, zz, xy, yz, xz among nine entries [-]; the result file's order
 UPPER = np.array([0, 4, 8, 1, 5, 2])
 
 

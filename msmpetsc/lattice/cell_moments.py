@@ -68,8 +68,7 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
         covariance[:, k, k] = squares[:, k] / volume[:, 0] - middle[:, k] ** 2
     for k, (i, j) in enumerate(PAIRS):
         covariance[:, i, j] = covariance[:, j, i] = products[:, k] - middle[:, i] * middle[:, j]
-    # Shares are limited to 1 if bodies overlap, so a covariance may have negative
-    # eigenvalues.
+    # Shares are cut at 1 if bodies overlap: a covariance may then be indefinite.
     values, vectors = np.linalg.eigh(covariance)
     covariance = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     x, y, z = covariance[:, range(3), range(3)].T

@@ -15,8 +15,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Rows
 from msmpetsc.lattice.material import CELLS_AROUND, ISOTROPIC
 
-# corners of a cell [cell]; in VTK's hexahedron order, which is also the order in the
-# file
+# corners of a cell [cell]; in VTK's hexahedron order, as in the result file
 CORNERS = np.array(
     [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
 )

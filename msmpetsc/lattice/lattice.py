@@ -27,8 +27,7 @@ from msmpetsc.lattice.material import (
 )
 from msmpetsc.scene.body import Material
 
-# direction (8, 8) from corner a to corner b [-]; an index into the 3 x 3 x 3 nodes
-# around a
+# direction (8, 8) from corner a to b [-]; an index into the 3 x 3 x 3 nodes around a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
 # kind (27,) of the spring in each direction [-]: its squared length in cells
 KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
@@ -51,8 +50,7 @@ class SolidCells(NamedTuple):
 
 @dataclass(frozen=True)
 class Lattice:
-    """This rank's part of a lattice. In local numbers the ``owned`` nodes come first, then the
-    ghosts.
+    """This rank's part of a lattice. Local numbers begin with the ``owned`` nodes; ghosts follow.
 
     table       : global node numbers by grid key; ``table.first`` is that of the first owned node
     nodes       : (l, 3) rest positions [m]
@@ -63,7 +61,7 @@ class Lattice:
     springs     : (s, 2) local ends. This rank owns the first ``springs_owned``, whose first end has
                   the lower number. The rank of the lower-numbered end owns each further spring.
     rest_length : (s,) distance of the ends at rest [m]
-    stiffness   : (s,) [N/m]; for a solid, of zero-length springs whose L bounds the Hessian at rest
+    stiffness   : (s,) [N/m]; a solid has zero-length springs whose L bounds its Hessian at rest
     pinned      : (l,) bool, nodes that do not move
     local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
                   first corner this rank owns. For a solid all cells around owned nodes follow.
@@ -71,7 +69,7 @@ class Lattice:
     cell_share  : (c,) fraction of each of ``cells`` that lies inside the surface [-]
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
     solid       : constants of a neo-Hookean solid; None if the law is springs
-    viscous     : beta / tau [-], the viscosity of a step over the stiffness (elasticity.viscosity)
+    viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
     """
 
     table: SortedKeys

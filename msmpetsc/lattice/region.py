@@ -165,11 +165,10 @@ class Finder:
     def _of_mesh(
         self, table: OfBody, ijk: Indices, points: Positions, body: Indices, are_nodes: bool
     ) -> Mask:
-        """Return the mask (n,) of nodes or cells in a region of painted points or a group
-        (collective).
+        """Return the mask (n,) of nodes or cells in a region of painted points or a group.
 
         A group has the nodes that are nearest to a point of its triangles, or the cells that its
-        triangles cut. A closed group has the nodes and cells that it encloses, too.
+        triangles cut. A closed group has the nodes and cells that it encloses, too (collective).
 
         ijk    : (n, 3) grid index of the nodes or cells
         points : (n, 3) positions of the nodes, or centroids of the cells [m]
@@ -185,8 +184,7 @@ class Finder:
             self.bodies, table.key + ".region", region.group, table.body
         ).items():
             grid = grids.grids[number]
-            # A node is nearest to the points of a cell centred at it: shift by half a
-            # cell.
+            # A node is nearest to the points of the cell centred at the node.
             corners = grid.to_cells(group.points)[group.triangles] + are_nodes / 2
             marked = marked_cells(corners, grid.shape + 1, Slab(0, grid.shape[0] + 1))
             where |= np.isin(encode_morton(ijk), encode_morton(marked + grids.first(number)))
@@ -384,8 +382,7 @@ class ProbePoints:
             place = (np.array(point) - low) / lattice.cell_size
             around = np.flatnonzero(((place >= -SAME) & (place <= 1 + SAME)).all(axis=1))
             own = int(numbers[around].min(initial=lattice.table.total))
-            # A point on a face or in overlapping bodies has several cells: choose the
-            # first.
+            # A point on a face or in overlapping bodies has several cells.
             first = comm.allreduce(own, MPI.MIN)
             if first == lattice.table.total:
                 place_text = ", ".join(f"{x:g}" for x in point)

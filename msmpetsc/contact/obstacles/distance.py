@@ -87,8 +87,7 @@ class FunctionSolid(DistanceSolid):
         """
         if not len(q):
             return np.zeros(0), np.zeros((0, 3))
-        # Floating-point errors in a user's function are warnings, not errors of this
-        # program.
+        # A user's function may divide by zero: its result is checked below.
         with np.errstate(all="warn"):
             answer = self.function(q.copy())
         try:

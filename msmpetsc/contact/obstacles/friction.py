@@ -1,5 +1,4 @@
-"""Coulomb friction: its law for implicit steps, friction of nodes on obstacles, and explicit
-friction.
+"""Coulomb friction of nodes on obstacles, and its law for implicit steps.
 
 The normal force N is known before the step is solved. Then friction has the convex potential
 mu N f(|u|) of the slip u (Li et al. 2020, Incremental Potential Contact, Eq. 12 to 15), with
@@ -59,8 +58,7 @@ class Friction:
         raise NotImplementedError
 
     def change(self, q: Positions, base: Positions, moved: Rows | None = None) -> float:
-        """Return the energy change mu N (f(u) - f(u_0)) [J] from base to q, summed over the
-        contacts.
+        """Return the energy change [J] from base to q: the sum of mu N (f(u) - f(u_0)).
 
         The change of |u| is computed from the displacement, so a small change keeps its digits.
 
@@ -130,8 +128,7 @@ class Friction:
     def curvature(self, q: Positions, plane: Rows, duals: Rows | None) -> Rows:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) (w d^T + d w^T) / 2) (a, 3, 3) [N/m].
 
-        d is the slip's direction. w = p / f' is at most 1 in length, so that each block is positive
-        semidefinite.
+        d is the slip's direction. w = p / f' is at most 1 in length, so no block is negative.
 
         plane : (a or 1, 3, 3) I - n n^T
         duals : (a, 3) p; None for the forces of the slips, w = d, which gives the true Hessian
@@ -165,8 +162,7 @@ class NodeFriction(Friction):
     carried: Positions
 
     def after(self, last: "NodeFriction | None", q: Positions) -> "NodeFriction":
-        """Return the friction with the elastic slips of the step before, which ended at q (owned,
-        3).
+        """Return the friction with the elastic slips of the step before, at q (owned, 3) [m].
 
         last : friction of the step before; None without it
         """

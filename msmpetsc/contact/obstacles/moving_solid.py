@@ -24,8 +24,7 @@ from msmpetsc.scene.reading import Scene
 
 # depth that counts as touching [cell]; above rounding
 TOUCHING = 1e-6
-# deviation of a distance function's gradient from unit length [-]; a rough test of a
-# user's function
+# deviation of a distance's gradient from unit length [-]; a rough test of functions
 GRADIENT_TOLERANCE = 0.01
 
 
@@ -52,8 +51,7 @@ class Obstacle(Timed):
     def depths(
         self, q: Positions, time: float, sides: Indices | None = None
     ) -> tuple[Floats, Indices]:
-        """Return the depths (n,) [m] of the surface at nodes (n, 3) at a time [s], and the faces
-        (n,).
+        """Return the depths (n,) [m] of the surface at nodes q (n, 3) [m], and the faces (n,).
 
         sides : (n or more,) sides of the nodes (solids.side_of); None for the nearest face
         """

@@ -128,13 +128,11 @@ class NodeObstacles:
     def contact_stiffness_bound(
         self, q: Positions, speed: float, start: float, time: float, sides: Indices
     ) -> Floats:
-        """Return a bound (owned,) [N/m] of the obstacles' stiffness at nodes from start to
-        ``time``.
+        """Return a bound (owned,) [N/m] of the obstacles' stiffness at nodes until ``time``.
 
-        A node counts as inside if it is within twice the distance that it and the obstacle can
-        move.
+        A node counts as inside within twice the distance that it and the obstacle can move.
 
-        q     : (owned, 3) positions at the start [m]
+        q     : (owned, 3) positions at ``start`` [m]
         speed : upper bound of the nodes' speed [m/s]
         """
         stiffness = np.zeros(len(q), like=q)
@@ -174,8 +172,7 @@ class NodeObstacles:
     def friction_work_bound(
         self, before: Placed, after: Placed, time: float, time_step: float, frame: Floats
     ) -> float:
-        """Return a bound of the work [J] of moving obstacles' friction on this rank's nodes in a
-        step.
+        """Return a bound of the work [J] of moving obstacles' friction on owned nodes in a step.
 
         The bound is mu N times the obstacles' distance in a frame displaced by ``frame`` (3,) [m].
         """

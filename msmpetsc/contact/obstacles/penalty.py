@@ -21,11 +21,9 @@ from msmpetsc.contact.obstacles.friction import NodeFriction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
-# depth at which a step stops a node [fraction of its full depth]; above zero, so that
-# the Hessian has the contact
+# depth at which nodes are stopped [fraction]; above 0, so that the Hessian has a contact
 SHALLOW = 1e-3
-# duals (a, 3) of each obstacle's friction, then of the surface's; None for the slips'
-# forces
+# duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
 Duals = list[Rows | None]
 
 
@@ -83,8 +81,7 @@ class Penalty:
             stick *= 2 / 3
         if last is not None and end is None:
             extrapolated, _ = self.obstacle.depths(2 * q - last[: len(q)], time, sides)
-            # The limit guards against the poor extrapolation for a node that has just
-            # entered.
+            # Extrapolation is poor for a node that has just entered.
             depth = np.clip(extrapolated[nodes], 0, 2 * depth)
         limit = self.friction * self.stiffness * depth
         begin = np.zeros((1, 3), like=q)
@@ -230,8 +227,7 @@ class Contact:
     def no_duals(self) -> Duals:
         """Return the duals for which ``hessian`` has the secant of the obstacles' friction.
 
-        The matrix A needs the secant: the true Hessian is zero along a slip, and nodes would
-        oscillate.
+        The matrix A needs the secant: the true Hessian is zero along a slip, so nodes oscillate.
         """
         return [
             *(state.friction.no_duals() if state.friction else None for state in self.states),
@@ -249,8 +245,8 @@ class Contact:
     def hessian(self, q: Positions, duals: Duals | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield the nodes (a,) and blocks (a, 3, 3) [N/m] of each obstacle's penalty and friction.
 
-        The Hessian is the sum of all blocks, each positive semidefinite. The negative term -k d / r of a
-        solid with radius of curvature r is neglected.
+        The Hessian is the sum of all blocks, each positive semidefinite. The negative term -k d / r
+        of a solid with radius of curvature r is neglected.
 
         duals : duals of friction; None for its true Hessian
         """

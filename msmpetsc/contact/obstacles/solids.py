@@ -17,8 +17,7 @@ from msmpetsc.backend.kernel import kernel, njit
 TINY = 1e-300
 # largest cosine between the normals of opposite faces [-]; -1 up to rounding
 OPPOSITE = -1 + 1e-9
-# rounding of a crossing [fraction of a node's path]; a plate of zero thickness still
-# stops nodes
+# rounding of a crossing [fraction of a path]; a plate of zero thickness stops nodes
 ROUNDED = 1e-12
 
 Send = Callable[[Array], Array]

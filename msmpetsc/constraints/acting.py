@@ -91,8 +91,7 @@ class Anchors:
     ) -> Positions | None:
         """Return q with the anchored nodes at their prescribed positions; None without anchors.
 
-        begin, share : the anchors' pose is the share from their pose at ``begin`` [s] to ``time``
-        [s]
+        begin, share : the anchors made this share of their motion from ``begin`` [s] to ``time``
         """
         anchors = self.acting(time)
         if not anchors:

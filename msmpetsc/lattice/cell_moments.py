@@ -18,9 +18,9 @@ The modes are h_xy = XY + 2 c_z XYZ, h_xz, h_yz and XYZ. They give the rest of t
 
     4 (du/dx - <du/dx>) = 2 (y - c_y) h_xy + 2 (z - c_z) h_xz + 4 ((y - c_y) (z - c_z) - C_yz) XYZ.
 
-Summed over x, y and z, its mean square is approximated by a quadratic form of the modes. Third
+Its mean square, summed over x, y and z, is approximated by a quadratic form of the modes. Third
 moments are neglected, and fourth moments are those of independent coordinates. The form is exact in
-a whole cell (Flanagan and Belytschko 1981; Belytschko and Bindeman 1993):
+a whole cell (Flanagan and Belytschko 1981; Belytschko and Bindeman 1993). 16 times the form is
 
     4 (C_xx + C_yy) h_xy^2 + 8 C_yz h_xy h_xz + ... + 16 (C_xx C_yy + C_xx C_zz + C_yy C_zz) XYZ^2.
 
@@ -56,7 +56,7 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
         4 C_yz, 4 C_xz, 4 C_xy,                               modes 1 and 2, 1 and 3, 2 and 3
         16 (C_xx C_yy + C_xx C_zz + C_yy C_zz)                the mode XYZ
 
-    share   : (c, 8) of the corners (geometry.fill_fractions)
+    share   : (c, 8) shares of the corners (geometry.fill_fractions)
     squares : (c, 3) integrals of x^2, y^2 and z^2 over the part inside (geometry.fill_fractions)
     """
     volume = share.mean(axis=1, keepdims=True)

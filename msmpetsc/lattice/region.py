@@ -241,7 +241,7 @@ def groups_named(
     Raises InputError on all ranks if no mesh has the group.
     """
 
-    def found() -> dict[int, Surface]:
+    def groups_by_body() -> dict[int, Surface]:
         asked = {
             n: body.surface.groups
             for n, body in enumerate(bodies)
@@ -256,7 +256,7 @@ def groups_named(
             )
         return named
 
-    groups: dict[int, Surface] = bodies[0].comm.bcast(on_root(bodies[0].comm, found))
+    groups: dict[int, Surface] = bodies[0].comm.bcast(on_root(bodies[0].comm, groups_by_body))
     return groups
 
 

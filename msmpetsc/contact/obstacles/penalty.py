@@ -21,7 +21,7 @@ from msmpetsc.contact.obstacles.friction import NodeFriction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
-# depth at which nodes are stopped [fraction]; above 0, so that the Hessian has a contact
+# depth at which nodes are stopped [fraction]; above 0, so that the Hessian has contact
 SHALLOW = 1e-3
 # duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
 Duals = list[Rows | None]

@@ -30,7 +30,7 @@ from msmpetsc.contact.obstacles.solids import TINY
 # speed a contact sticks
 STICK = 1e-2
 # smallest f' to divide by [-]; the square of the quotient does not overflow
-WEAK = 1e-100
+TINY_SLOPE = 1e-100
 
 # rows (a,) of pressed nodes, their depths (a,) [m] and normals (a, 3)
 Pressed = tuple[Indices, Floats, Rows]
@@ -136,7 +136,11 @@ class Friction:
         u, length = self.slip(q)
         slope = self.slope(length)
         d = u / np.maximum(length, np.finfo(float).tiny)[:, None]
-        w = d if duals is None else shortened(duals / np.maximum(slope * length, WEAK)[:, None])
+        w = (
+            d
+            if duals is None
+            else shortened(duals / np.maximum(slope * length, TINY_SLOPE)[:, None])
+        )
         mixed = 0.5 * (w[:, :, None] * d[:, None, :] + d[:, :, None] * w[:, None, :])
         blocks: Rows = slope[:, None, None] * plane + self._bend(length)[:, None, None] * mixed
         return self.limit[:, None, None] * blocks

@@ -22,7 +22,7 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 
 # depth at which nodes are stopped [fraction]; above 0, so that the Hessian has contact
-SHALLOW = 1e-3
+STOP_DEPTH = 1e-3
 # duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
 Duals = list[Rows | None]
 
@@ -33,7 +33,7 @@ class Penalty:
 
     stiffness   : k of each node [N/m]
     friction    : coefficient mu [-]
-    stick       : slip speed below which friction sticks [m/s]
+    stick       : slip speed below which a contact sticks [m/s]
     restitution : normal speed of a node after an impact over the speed before [-]; None: no change
                   of speed but by the penalty
     """
@@ -139,7 +139,7 @@ class ContactState:
         """
         rows, depth, normal = self.pressed(q)
         new = self.depths(base)[0][rows] <= 0
-        return rows[new], (1 - SHALLOW) * depth[new][:, None] * normal[new]
+        return rows[new], (1 - STOP_DEPTH) * depth[new][:, None] * normal[new]
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return the change [J] of the penalty energy from base to q (n, 3)."""

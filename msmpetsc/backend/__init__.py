@@ -1,5 +1,6 @@
-"""Where the arrays of a run are: NumPy's, in the memory of the CPU, or CuPy's, in that of a CUDA GPU.
+"""Arrays and kernels on a CPU (NumPy) or on a CUDA GPU (CuPy).
 
-The arrays' type decides, and code that works on them does not ask: NumPy's functions hand CuPy's arrays to CuPy,
-``kernel`` compiles a body for either, and the few sums that a loop on the CPU does best have a form for each.
+The type of a run's arrays selects the device, so most code is the same for both. NumPy's functions
+dispatch CuPy's arrays to CuPy, and ``kernel`` compiles a function for either device. A few sums
+have a loop for each device.
 """

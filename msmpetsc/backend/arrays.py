@@ -1,35 +1,39 @@
-"""Arrays, which may be on a GPU: the types that signatures name, and what works wherever they are."""
+"""Types of arrays in signatures, and functions for arrays on either device."""
 
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-Array: TypeAlias = npt.NDArray[Any]  # of any numbers
-Floats: TypeAlias = npt.NDArray[np.float64]  # (n,) one number a node, spring, cell or point
-Positions: TypeAlias = npt.NDArray[np.float64]  # (n, 3) [m]
-Rows: TypeAlias = npt.NDArray[np.float64]  # (n, k) other rows: forces, velocities, normals, blocks
-Indices: TypeAlias = npt.NDArray[
-    np.signedinteger[Any]
-]  # numbers of nodes, springs, cells, points, triangles
-Mask: TypeAlias = npt.NDArray[np.bool_]  # (n,) which of them
+# numbers of any type
+Array: TypeAlias = npt.NDArray[Any]
+# (n,) a number per node, spring, cell or point
+Floats: TypeAlias = npt.NDArray[np.float64]
+# (n, 3) [m]
+Positions: TypeAlias = npt.NDArray[np.float64]
+# (n, k) forces, velocities, normals or blocks
+Rows: TypeAlias = npt.NDArray[np.float64]
+# numbers of nodes, springs, cells, points or triangles
+Indices: TypeAlias = npt.NDArray[np.signedinteger[Any]]
+# (n,) selection of nodes, springs, cells or points
+Mask: TypeAlias = npt.NDArray[np.bool_]
 
 
 def on_host(array: Array) -> bool:
-    """Return whether an array is in the memory of the CPU."""
+    """Return whether an array is in CPU memory."""
     return isinstance(array, np.ndarray)
 
 
 def to_host(array: Array) -> Array:
-    """Return an array in the memory of the CPU; the very same if it already is."""
+    """Return an array in CPU memory; the same object if it is there already."""
     return array if on_host(array) else array.get()  # type: ignore[attr-defined]  # CuPy's
 
 
 def like(array: Array, values: Array) -> Array:
-    """Return ``values`` in the memory that ``array`` is in; the very same if they already are."""
+    """Return ``values`` on the device of ``array``; the same object if it is there already."""
     return to_host(values) if on_host(array) else np.asarray(values, like=array)
 
 
 def greatest(array: Array) -> float:
-    """Return the greatest of numbers that are not negative, 0 if there are none."""
+    """Return the maximum of non-negative numbers; 0 for an empty array."""
     return float(array.max()) if array.size else 0.0

@@ -1,4 +1,4 @@
-"""One body for every index, where the arrays are: a compiled loop on the CPU, one thread an index on a GPU."""
+"""Kernels for CPU and GPU: a compiled loop over indices on a CPU, a thread per index on a GPU."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -13,7 +13,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def njit(**options: Any) -> Callable[[Function], Function]:
-    """Compile a function as ``numba.njit(**options)`` does, and keep its machine code for later processes."""
+    """Compile a function as ``numba.njit(**options)`` does, with this package's cache on disk."""
 
     def compiled(function: Function) -> Function:
         dispatcher: Any = numba.njit(**options)(function)
@@ -24,15 +24,14 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 
 
 def kernel(body: Callable[..., None]) -> Callable[..., None]:
-    """Make of ``body(first, count, step, *arguments)``, for every i in range(first, count, step), a kernel.
+    """Return a kernel that runs a body for all indices: ``kernel(body)(count, *arguments)``.
 
-    ``kernel(body)(count, *arguments)`` does the same for all i below a count, in any order.
-
-    The first argument is an array, whose type tells where. The body calls functions compiled by ``njit``
-    and takes its roots from ``math``; no two indices write to the same place. The loop stands in the
-    body, and not here, so that its machine code is found again.
+    ``body(first, count, step, *arguments)`` must loop over range(first, count, step). The type of
+    the first argument, an array, selects the device. The order of indices is arbitrary, so no two
+    indices may write to the same place. The body may call functions of ``math`` and functions
+    compiled by ``njit``.
     """
-    # A division by zero is infinite, as on a GPU: the step then tells of a number that is not finite.
+    # Division by zero gives infinity, as on a GPU. A step detects it.
     compiled = njit(error_model="numpy")(body)
 
     @wraps(body)
@@ -40,9 +39,11 @@ def kernel(body: Callable[..., None]) -> Callable[..., None]:
         if on_host(arguments[0]):
             compiled(0, count, 1, *arguments)
         else:
-            from msmpetsc.backend.launcher import launcher  # and CuPy: a CPU's run needs neither
+            # A run on a CPU must not import CuPy.
+            from msmpetsc.backend.launcher import launcher
 
             launcher(body)(count, *arguments)
 
-    everywhere.compiled = compiled  # type: ignore[attr-defined]  # for tests, which run bodies on what is no GPU
+    # Tests call the compiled body on their own.
+    everywhere.compiled = compiled  # type: ignore[attr-defined]
     return everywhere

@@ -1,8 +1,11 @@
-"""Compiled kernels on disk: found by later processes of the same sources, never by changed ones.
+"""Cache of compiled kernels on disk, for all processes that run the same sources.
 
-numba's own cache looks for changes in a kernel's file alone, fails where nothing can be written, and lets two processes
-mix up their files. Here a folder's name has a digest of all sources with kernels, and a file's name one of the kernel,
-its arguments and the constants that it reads. The files hold code: no folder is read that somebody else may write to.
+It replaces numba's cache, which checks a kernel's own file alone for changes, fails in read-only
+directories, and lets two processes mix up their files.
+
+- The name of a directory has a digest of all sources with kernels.
+- The name of a file is a digest of the kernel, its argument types and the constants that it reads.
+- The files are executable code, so a directory is read only if no other user may write to it.
 """
 
 import hashlib
@@ -28,38 +31,43 @@ from numba.core.serialize import dumps
 import msmpetsc
 
 PACKAGE = Path(msmpetsc.__file__).parent
-PROBE = (
-    1 << 16
-)  # [byte] that a folder must take to be written to; a full disk may still take some bytes
-CHECK = hashlib.sha256().digest_size  # [byte] at the start of a file, a digest of the rest
+# size of a test file [byte]; a full disk may still accept a few bytes
+PROBE = 1 << 16
+# size of the digest at the start of a file [byte]; it detects damaged files
+CHECK = hashlib.sha256().digest_size
 
 
 def _digest_of_sources() -> str:
-    """Return a digest of all sources that have kernels and of the versions that compile them."""
+    """Return a digest of all sources with kernels and of the compilers' versions."""
     sources = [path.read_bytes() for path in sorted(PACKAGE.rglob("*.py"))]
     kernels = [source for source in sources if b"njit" in source or b"@kernel" in source]
     versions = f"{msmpetsc.__version__} {numba.__version__} {sys.implementation.cache_tag}"
     return hashlib.sha256(b"".join(kernels) + versions.encode()).hexdigest()[:16]
 
 
-# read before the kernels are imported: an update during a run must not name them after its own sources
+# Read before the kernels are imported: an update of the package during a run must not
+# store kernels of the old sources under the new digest.
 SOURCES = _digest_of_sources()
 
 
 def _candidates() -> Iterator[Path]:
-    """Yield the folders that may hold kernels: the user's choice, the package's, the home's, a temporary one."""
+    """Yield the candidates for the cache directory, by preference.
+
+    They are in the user's choice, the package, the home directory and the temporary directory.
+    """
     own = f"msmpetsc-kernels-{os.getuid()}-{SOURCES}"
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         yield Path(chosen) / own
     yield PACKAGE / "__pycache__" / f"kernels-{SOURCES}"
-    with suppress(RuntimeError):  # a user without a home
+    # Path.home() raises RuntimeError for a user without a home directory.
+    with suppress(RuntimeError):
         yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / own
     with suppress(FileNotFoundError):
         yield Path(tempfile.gettempdir()) / own
 
 
 def _is_safe(folder: Path) -> bool:
-    """Return whether this user, root or the owner of the package alone may write to a folder."""
+    """Return whether only this user, root or the package's owner may write to a directory."""
     status = folder.lstat()
     is_ours = status.st_uid in (os.getuid(), 0, PACKAGE.stat().st_uid)
     return (
@@ -71,7 +79,7 @@ def _is_safe(folder: Path) -> bool:
 
 @cache
 def folders() -> tuple[list[Path], Path | None]:
-    """Return the folders to look for kernels in, and the last of them if it can be written."""
+    """Return the cache directories to read, and the directory to write; None if there is none."""
     safe = []
     for folder in map(Path.absolute, _candidates()):
         with suppress(OSError):
@@ -85,17 +93,17 @@ def folders() -> tuple[list[Path], Path | None]:
 
 
 def writable() -> Path | None:
-    """Return the folder that kernels are kept in; None if each process must compile its own."""
+    """Return the cache directory to write; None if each process must compile its own kernels."""
     return folders()[1]
 
 
 def is_empty() -> bool:
-    """Return whether no kernel of these sources is kept."""
+    """Return whether the cache has no kernel of these sources."""
     return not any(any(folder.iterdir()) for folder in folders()[0])
 
 
 def load(name: str) -> bytes | None:
-    """Return what is kept under a name; None if nothing is, or if its file is damaged."""
+    """Return the data stored under a name; None if there is no file, or a damaged file."""
     for folder in folders()[0]:
         with suppress(OSError):
             content = (folder / _file(name)).read_bytes()
@@ -105,7 +113,7 @@ def load(name: str) -> bytes | None:
 
 
 def save(name: str, data: bytes) -> None:
-    """Keep data under a name, if the disk has room: other processes see the whole file or none."""
+    """Store data under a name, if the disk has room. The write is atomic for other processes."""
     if folder := writable():
         new = folder / f"{uuid.uuid4().hex}.part"
         try:
@@ -121,13 +129,13 @@ def _file(name: str) -> str:
 
 
 class KernelCache(NullCache):
-    """A function's machine code for each of its signatures, as numba's dispatcher asks for it."""
+    """Cache of a function's machine code by signature, with the interface of numba's dispatcher."""
 
     def __init__(self, function: Callable[..., Any]):
         self._function = function
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return the compiled function of a signature, if it is kept."""
+        """Return the compiled function of a signature; None if the cache does not have it."""
         target.refresh()
         kept = load(self._key(signature, target.codegen()))
         if kept is None:
@@ -135,7 +143,7 @@ class KernelCache(NullCache):
         return CompileResult._rebuild(target, *pickle.loads(kept))  # type: ignore[no-untyped-call]
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Keep the compiled function of a signature, unless it holds addresses of this process."""
+        """Store the compiled function of a signature, unless it has addresses of this process."""
         if not compiled.library.has_dynamic_globals:
             data = dumps(compiled._reduce())  # type: ignore[no-untyped-call]
             save(self._key(signature, compiled.codegen), data)
@@ -145,7 +153,7 @@ class KernelCache(NullCache):
 
 
 def key(function: Callable[..., Any], types: Iterable[Any], target: object) -> str:
-    """Return the key of a function, compiled for arguments of these types and for a processor."""
+    """Return the cache key of a function for argument types and a target processor."""
     constants = sorted(_constants(function).items())
     return repr(
         (function.__module__, function.__qualname__, target, [*map(_described, types)], constants)
@@ -153,23 +161,23 @@ def key(function: Callable[..., Any], types: Iterable[Any], target: object) -> s
 
 
 def _described(kind: Any) -> tuple[Any, ...]:
-    """Return the name of a type with the fields of named tuples, which numba's name of it lacks."""
+    """Return the name of a numba type, and the fields of named tuples, which the name lacks."""
     return (
         str(kind),
         getattr(kind, "fields", ()),
-        [_described(one) for one in getattr(kind, "types", ())],
+        [_described(item) for item in getattr(kind, "types", ())],
     )
 
 
 @cache
 def _constants(function: Callable[..., Any]) -> dict[str, bytes]:
-    """Return the constants that a function and the kernels it calls read, by name."""
-    read = inspect.getclosurevars(function)
-    found: dict[str, bytes] = {}
-    for name, value in {**read.globals, **read.nonlocals}.items():
+    """Return the pickled constants, by name, that a function and the kernels it calls read."""
+    variables = inspect.getclosurevars(function)
+    constants: dict[str, bytes] = {}
+    for name, value in {**variables.globals, **variables.nonlocals}.items():
         if kernel := getattr(value, "py_func", None):
-            found |= _constants(kernel)
+            constants |= _constants(kernel)
         elif not isinstance(value, ModuleType):
             place = f"{function.__module__}.{function.__qualname__}.{name}"
-            found[place] = pickle.dumps((value, getattr(value, "_fields", ())))
-    return found
+            constants[place] = pickle.dumps((value, getattr(value, "_fields", ())))
+    return constants

@@ -1,7 +1,8 @@
-"""Threads on a CUDA GPU: bodies compiled by numba, launched by the driver. Imported by those alone who have a GPU.
+"""Kernel launches on a CUDA GPU: numba compiles the body, the CUDA driver launches it.
 
-A step of some thousand nodes is many launches of little work. numba's own launch takes 90 us for ten arrays, the one
-here a tenth of that: the words of an array's description are put together once, and the driver is called directly.
+The module imports CuPy. A time step of a small lattice launches many short kernels, so the overhead
+of a launch counts. It is lower than numba's, because array descriptors are cached and the driver is
+called directly.
 """
 
 import ctypes
@@ -23,22 +24,24 @@ from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import MsmpetscError
 
 cuda: Any = untyped
-THREADS = 128  # of a block: registers, not their number, bound the kernels that look at all neighbours of a node
-KEPT = 4096  # descriptions of arrays
-SCALARS = {
-    bool: "?7x",
-    int: "q",
-    float: "d",
-}  # as the driver takes them (struct): each in eight bytes of its own
+# threads of a block [-]; registers limit kernels that visit all neighbours of a node
+THREADS = 128
+# array descriptors in the cache [-]; bounds its memory
+KEPT = 4096
+# struct format of a scalar [-]; the driver takes each in eight bytes
+SCALARS = {bool: "?7x", int: "q", float: "d"}
 TYPES = {"?7x": numba.types.boolean, "q": numba.types.int64, "d": numba.types.float64}
 
-Words = tuple[float, ...]  # of an argument, as the kernel takes them
-Kind = Any  # of an argument: a scalar's format, an array's description, or a NamedTuple's class and its fields' kinds
+# words of an argument, as the kernel takes them
+Words = tuple[float, ...]
+# kind of an argument: a scalar's format, an array's type as in "f8 2 C", or the class
+# of a NamedTuple and the kinds of its fields
+Kind = Any
 
 
 @cache
 def launcher(body: Callable[..., None]) -> Callable[..., None]:
-    """Return what backend.kernel calls: one thread for each index below a count, in CuPy's current stream."""
+    """Return the GPU kernel of a body. It launches a thread per index in CuPy's current stream."""
     known: dict[tuple[Kind, ...], Launch] = {}
 
     def launch(count: int, *arguments: Any) -> None:
@@ -52,7 +55,7 @@ def launcher(body: Callable[..., None]) -> Callable[..., None]:
 
 
 def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
-    """Return an argument's kind, which its type and its words' format follow from, and the words."""
+    """Return the kind of an argument and its words."""
     if isinstance(value, tuple):
         kinds, words = zip(*map(as_argument, value), strict=True)
         return (type(value), *kinds), tuple(chain.from_iterable(words))
@@ -66,29 +69,28 @@ def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
 def described(
     pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: str
 ) -> tuple[str, Words]:
-    """Return the kind of an array, "f8 2 C", and the words that numba's kernels take for it.
+    """Return the kind of an array, as in "f8 2 C", and the words that numba's kernels take for it.
 
-    These are no owner, no parent, its size, and where it lies.
+    The words are numba's array structure: owner and parent (both null), number of items, item size,
+    pointer, shape and strides.
     """
     size = np.dtype(dtype).itemsize
     by_row = tuple(np.cumprod((size, *shape[:0:-1]))[::-1])
     by_column = tuple(np.cumprod((size, *shape[:-1])))
-    layout = "C" if strides == by_row or 0 in shape else "F" if strides == by_column else "A"
-    return f"{dtype} {len(shape)} {layout}", (
-        0,
-        0,
-        int(np.prod(shape)),
-        size,
-        pointer,
-        *shape,
-        *strides,
-    )
+    if strides == by_row or 0 in shape:
+        layout = "C"
+    elif strides == by_column:
+        layout = "F"
+    else:
+        layout = "A"
+    words = 0, 0, int(np.prod(shape)), size, pointer, *shape, *strides
+    return f"{dtype} {len(shape)} {layout}", words
 
 
 def type_of(kind: Kind) -> object:
-    """Return numba's type of a kind of argument."""
+    """Return numba's type of an argument of this kind."""
     if isinstance(kind, tuple):
-        fields = [type_of(one) for one in kind[1:]]
+        fields = [type_of(field) for field in kind[1:]]
         return numba.types.BaseTuple.from_types(fields, kind[0])  # type: ignore[no-untyped-call]
     if kind in TYPES:
         return TYPES[kind]
@@ -97,14 +99,14 @@ def type_of(kind: Kind) -> object:
 
 
 def format_of(kind: Kind) -> str:
-    """Return how the words of an argument are packed (struct)."""
+    """Return the struct format of the words of an argument."""
     if isinstance(kind, tuple):
         return "".join(map(format_of, kind[1:]))
     return kind if kind in TYPES else f"{5 + 2 * int(kind.split()[1])}q"
 
 
 class Launch:
-    """A body compiled for arguments of some types, and the memory that its words are handed over in."""
+    """A body compiled for arguments of given kinds, with the buffer for their words."""
 
     def __init__(self, body: Callable[..., None], kinds: tuple[Kind, ...]):
         self.module = cupy.cuda.function.Module()
@@ -119,7 +121,8 @@ class Launch:
         self.pointers = (ctypes.c_void_p * number)(*range(first, first + 8 * number, 8))
 
     def __call__(self, count: int, words: chain[float]) -> None:
-        self.pack(self.memory, 0, count, *words)  # the driver copies them before it returns
+        # The driver copies the words before it returns, so the buffer can be reused.
+        self.pack(self.memory, 0, count, *words)
         stream = cupy.cuda.get_current_stream().ptr
         blocks = -(-count // THREADS)
         status = driver()(
@@ -130,7 +133,7 @@ class Launch:
 
 
 def compiled(body: Callable[..., None], kinds: tuple[Kind, ...]) -> str:
-    """Return the PTX of a body for these arguments and this GPU, kept as other kernels are."""
+    """Return the PTX of a body for arguments of these kinds and the current GPU, from the cache."""
     capability = cupy.cuda.Device().compute_capability
     name = kernel_cache.key(body, map(type_of, kinds), ("PTX", capability, version("numba-cuda")))
     if kept := kernel_cache.load(name):
@@ -141,7 +144,7 @@ def compiled(body: Callable[..., None], kinds: tuple[Kind, ...]) -> str:
 
 
 def ptx_of(body: Callable[..., None], kinds: tuple[Kind, ...], capability: tuple[int, int]) -> str:
-    """Return the PTX of a body for arguments of these kinds."""
+    """Compile a body to PTX for arguments of these kinds and a compute capability."""
     arguments = numba.types.Tuple([type_of(kind) for kind in kinds])  # type: ignore[no-untyped-call]
     signature = numba.types.void(numba.types.int64, arguments)
     ptx, _ = cuda.compile_ptx(kernel_of(body), signature, cc=capability)
@@ -149,7 +152,7 @@ def ptx_of(body: Callable[..., None], kinds: tuple[Kind, ...], capability: tuple
 
 
 def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
-    """Return the kernel of a body: it takes a count and the tuple of the further arguments."""
+    """Return the CUDA kernel of a body, which takes a count and a tuple of arguments."""
     inlined = cuda.jit(device=True)(body)
 
     def threads(count: int, arguments: tuple[Any, ...]) -> None:
@@ -160,7 +163,7 @@ def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
 
 @cache
 def driver() -> Callable[..., int]:
-    """Return cuLaunchKernel of CUDA's driver."""
+    """Return cuLaunchKernel of the CUDA driver."""
     launch = ctypes.CDLL("libcuda.so.1").cuLaunchKernel
     launch.argtypes = [ctypes.c_void_p, *[ctypes.c_uint] * 7, *[ctypes.c_void_p] * 3]
     return launch

@@ -1,4 +1,4 @@
-"""The machine that a program runs on, and the memory that it takes of it."""
+"""The machine that a program runs on, and the memory of the process."""
 
 import platform
 from pathlib import Path
@@ -8,10 +8,9 @@ import psutil
 
 
 def machine() -> dict[str, Any]:
-    """Return processor, cores, memory [byte] and system."""
-    path = Path(
-        "/proc/cpuinfo"
-    )  # where Linux has the model's name: Python's platform does not look there
+    """Return the machine's processor, cores, memory [byte] and system."""
+    # Python's platform module does not read the processor's model name on Linux.
+    path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.exists() else []
     models = (line.partition(": ")[2] for line in lines if line.startswith("model name"))
     cpu = next(models, "") or platform.processor() or platform.machine()
@@ -25,9 +24,9 @@ def machine() -> dict[str, Any]:
 
 
 def peak_memory() -> int:
-    """Return the most memory of this process that ever was resident [byte].
+    """Return the peak resident memory of this process [byte].
 
-    getrusage counts that of its parent, too, as it was when this process was started; the kernel's own count does not.
+    On Linux it is VmHWM. getrusage would include the peak of the parent process.
     """
     lines = Path("/proc/self/status").read_text().splitlines() if psutil.LINUX else []
     peaks = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]

@@ -1,4 +1,4 @@
-"""Forces and anchors that act at a time."""
+"""External forces and prescribed displacements that act at a time."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -12,7 +12,7 @@ from msmpetsc.lattice.lattice import Lattice
 
 
 class ActingForces:
-    """External forces on the nodes. Positions are local, (l, 3) [m], ghosts included; times are in [s]."""
+    """External forces on the nodes of a rank. Local positions (l, 3) [m] include ghosts."""
 
     def __init__(self, lattice: Lattice, loads: Sequence[Load], own_forces: Sequence[OwnForce]):
         self.lattice, self.loads, self.own_forces = lattice, loads, own_forces
@@ -22,9 +22,13 @@ class ActingForces:
         self._load = np.zeros((lattice.owned, 3), like=lattice.nodes)
 
     def begin_step(self, q: Positions, v: Rows, time: float) -> None:
-        """Evaluate the forces that are functions, at the state (l, 3) [m], [m/s] that starts a step; they then stay.
+        """Evaluate the users' force functions at the state at which a step begins.
 
-        So a step is explicit in them: they are of first order in its length, with any integrator.
+        The forces stay constant within the step. So they are explicit, and accurate to first order
+        in the step's length with any integrator.
+
+        q, v : positions (l, 3) [m] and velocities (l, 3) [m/s]
+        time : begin of the step [s]
         """
         owned = self.lattice.owned
         for number, force in enumerate(self.own_forces):
@@ -33,7 +37,7 @@ class ActingForces:
             )
 
     def at(self, time: float) -> Rows:
-        """Return the external force f_ext (owned, 3) [N], not to be written to."""
+        """Return the external force f_ext (owned, 3) [N] at a time [s], as a read-only array."""
         load = self.given(time)
         for force, own in zip(self.own_forces, self._own, strict=True):
             if force.acts_at(time) and len(own):
@@ -41,7 +45,7 @@ class ActingForces:
         return load
 
     def given(self, time: float) -> Rows:
-        """Return the part of f_ext that has a potential, (owned, 3) [N]: gravity and forces that are no functions."""
+        """Return f_ext (owned, 3) [N] without the users' functions: the part with a potential."""
         states = [load.state_at(time) for load in self.loads]
         if states != self._states_of_loads:
             self._states_of_loads = states
@@ -51,31 +55,33 @@ class ActingForces:
         return self._load
 
     def beyond(self, time: float, end: float) -> Rows | None:
-        """Return how much more forces (owned, 3) [N] that change pull at a time than at the end of its step; or None.
+        """Return f(time) - f(end) (owned, 3) [N] of time-dependent forces that act at both times.
 
-        None stands for a scene without such forces.
+        end : end of the step that contains ``time`` [s]
+
+        The result is None if no force depends on time.
         """
-        beyond = None
+        difference = None
         for load in self.loads:
             if len(load.total.times) > 1:
-                beyond = np.zeros_like(self._load) if beyond is None else beyond
+                difference = np.zeros_like(self._load) if difference is None else difference
                 if load.acts_at(time) and load.acts_at(end):
-                    beyond += load.force_at(time) - load.force_at(end)
-        return beyond
+                    difference += load.force_at(time) - load.force_at(end)
+        return difference
 
 
 class Anchors:
-    """Anchors, and the nodes that they and pins hold. Positions are local, (l, 3) [m]; times are in [s]."""
+    """Anchors, and the nodes that pins and anchors hold. Positions are local, (l, 3) [m]."""
 
     def __init__(self, lattice: Lattice, anchors: Sequence[Anchor]):
         self.lattice, self.all = lattice, anchors
 
     def acting(self, time: float) -> list[Anchor]:
-        """Return the anchors that have not let go."""
+        """Return the anchors that act at a time [s]."""
         return [anchor for anchor in self.all if anchor.acts_at(time)]
 
     def fixed_at(self, time: float) -> Mask:
-        """Return the nodes (l,) bool that are no unknowns, pinned or held by an anchor."""
+        """Return the mask (l,) of nodes that are pinned or anchored at a time [s]: no unknowns."""
         return reduce(
             np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.pinned
         )
@@ -83,9 +89,9 @@ class Anchors:
     def prescribed(
         self, q: Positions, time: float, begin: float = 0.0, share: float = 1.0
     ) -> Positions | None:
-        """Return q with the anchored nodes where they will be; None if there are none.
+        """Return q with the anchored nodes at their prescribed positions; None without anchors.
 
-        begin, share : they have made but this share of their path from begin [s] to ``time`` [s]
+        begin, share : the anchors made this share of their motion from ``begin`` [s] to ``time``
         """
         anchors = self.acting(time)
         if not anchors:

@@ -1,16 +1,15 @@
-"""Pins and anchors: the nodes that each holds, what their edges cut, and their reactions.
+"""Pins and anchors: their nodes, the springs and cells that a clamp's edge cuts, and reactions.
 
-Springs, and cells of a solid, that the edge of a clamp cuts: a pin holds nodes, but its region ends between them. Of a
-spring from a free node to a held one a part theta is free, and only that gives: it is 1 / theta as stiff. Where the
-held node sticks out of the body, as at a clamped face, the spring has been made of what is inside, a part sigma of its
-length (cut_cells), and is 1 / (sigma theta) as stiff. Along a row of cells both are exact, and a clamp askew in
-the grid is where it should be to second order, as Gibou, Fedkiw, Cheng and Kang (2002) have it for the Poisson
-equation. A cell of a solid takes the mean of sigma theta over its pairs of a free and a held corner: along the clamp,
-where that is too much, nothing strains.
+A pin's region ends between nodes. A spring from a free to a held node deforms only outside the
+region, on the fraction theta of its length. So its stiffness is multiplied by 1 / theta. If the
+held node lies outside the body, as at a clamped face, the factor is 1 / (sigma theta). The spring
+then stands for the fraction sigma of its length (cut_cells). Along a row of cells both are exact. A
+clamp oblique to the grid is second-order accurate, like the Poisson equation of Gibou, Fedkiw,
+Cheng and Kang (2002). A solid's cell uses the mean of sigma theta over its pairs of a free and a
+held corner. This is too stiff along the clamp, but no strain occurs there.
 
-Reactions: of a node that is held, what moves and pulls it leaves  m a + grad E - f_ext - push,  with which the pin or
-anchor keeps it where it is. So the forces on a body add up: reactions + loads + pushes = sum of m a, as grad E adds up
-to nothing.
+The reaction on a held node is  m a + grad E - f_ext - push.  grad E sums to zero over a body, so
+reactions + loads + pushes = sum of m a.
 """
 
 import math
@@ -30,19 +29,24 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.reading import Scene
 
-LEAST = 0.1  # free part of a spring: what is stiffer costs iterations, and short explicit steps
-HALVINGS = 20  # of the way to the edge
+# least free fraction of a spring [-]; stiff springs cost iterations and substeps
+LEAST = 0.1
+# bisections towards the edge of a region [-]; the edge is exact to 1e-6 of a spring
+HALVINGS = 20
 
-Within = Callable[[Positions], Mask]  # points (n, 3) [m] -> (n,) bool
-Regions = Mapping[str, Mask]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
+# mask (n,) of the points (n, 3) [m] in a region
+Within = Callable[[Positions], Mask]
+# local nodes (l,) bool by the table's key in the scene, such as "pin.0"
+Regions = Mapping[str, Mask]
 
 
 @dataclass(frozen=True)
 class Holders:
-    """The pins of a scene and then its anchors, by their keys, and whose each node is.
+    """The pins and then the anchors of a scene, and the pin or anchor that holds each node.
 
-    number  : (owned,) of the pin or anchor that has a node, the number of keys where none does
-    centers : (a, 3) of mass of their nodes at rest [m]
+    keys    : keys of their tables in the scene
+    number  : (owned,) index in ``keys`` of a node's holder; len(keys) for a free node
+    centers : (a, 3) centre of mass of each holder's nodes at rest [m]
     """
 
     keys: tuple[str, ...]
@@ -51,7 +55,7 @@ class Holders:
 
     @classmethod
     def of_masks(cls, masks: dict[str, Mask], lattice: Lattice) -> "Holders":
-        """Return those of the nodes (l,) of each table; of two tables on a node the first has it (collective)."""
+        """Return the holders with these nodes (l,). A shared node is the first's (collective)."""
         number = np.full(lattice.owned, len(masks))
         for holder, where in reversed([*enumerate(masks.values())]):
             number[where[: lattice.owned]] = holder
@@ -63,20 +67,23 @@ class Holders:
         )
 
     def totals(self, forces: Rows) -> Rows:
-        """Return the sum (a, 3) over the nodes of each of what holds nodes (owned, 3), of this rank's."""
+        """Return the sum (a, 3) of ``forces`` (owned, 3) over each holder's nodes on this rank."""
         return sums_by(self.number, forces, len(self.keys))
 
     def torques(self, q: Positions, forces: Rows, points: Positions) -> Rows:
-        """Return the sums (a, 3) [N m] of (q - p) x f over the nodes (owned, 3) of each, of this rank's.
+        """Return the torque (a, 3) [N m] of ``forces`` (owned, 3) on each holder's owned nodes.
 
-        points : p (a, 3) [m] of each
+        points : (a, 3) reference point of each holder [m]
         """
         of_node = like(q, np.vstack([points, np.zeros(3)]))[self.number]
         return self.totals(np.cross(q - of_node, forces))
 
 
 def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
-    """Return the sums (count, k) of vectors (n, k) by their numbers (n,), which are where these are."""
+    """Return the sum (count, k) of vectors (n, k) for each number below count.
+
+    number : (n,) number of each vector, on the same device
+    """
     sums = np.zeros((count, vectors.shape[1]))
     for which in range(count):
         sums[which] = to_host(vectors[number == which].sum(axis=0))
@@ -86,16 +93,17 @@ def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
 def clamped(
     scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions
 ) -> Lattice:
-    """Return the lattice with the springs, or cells, cut by pins and by anchors that never let go.
+    """Return the lattice with stiffer springs, or cells, where pins and lasting anchors end.
 
-    points : (l, 3) of the bodies that nodes are nearest to [m]
+    masks  : local nodes (l,) of each table
+    points : (l, 3) body points nearest to the nodes [m]
     """
     lasting = (table for table in scene.tables("anchor") if table.table.stop is None)
     tables = [t for t in chain(scene.tables("pin"), lasting) if not t.table.region.is_of_mesh]
     held = np.any([np.zeros(len(points), bool), *(masks[table.key] for table in tables)], axis=0)
 
-    def stiffer(free: Indices, fast: Indices) -> Floats:
-        """Return how much stiffer (n,) what joins a free node (n,) to a held one (n,) is: 1 / (sigma theta)."""
+    def stiffening(free: Indices, fixed: Indices) -> Floats:
+        """Return 1 / (sigma theta) (n,) [-] for pairs of a free (n,) and a held node (n,)."""
         body = lattice.body[free]
 
         def within(x: Positions) -> Mask:
@@ -105,57 +113,65 @@ def clamped(
             return where
 
         start = lattice.nodes[free]
-        theta = _free_part(within, start, lattice.nodes[fast])
-        of_body = _free_part(within, start, points[fast])
-        return np.maximum(of_body / theta**2, 1.0)  # sigma = theta / of_body
+        theta = _free_fraction(within, start, lattice.nodes[fixed])
+        of_body = _free_fraction(within, start, points[fixed])
+        # sigma = theta / of_body
+        return np.maximum(of_body / theta**2, 1.0)
 
     if lattice.solid is not None:
-        return _with_cut_cells(lattice, held, stiffer)
+        return _with_cut_cells(lattice, held, stiffening)
     a, b = lattice.springs.T
     cut = np.flatnonzero(held[a] != held[b])
-    fast, free = np.where(held[a], (a, b), (b, a))[:, cut]
+    fixed, free = np.where(held[a], (a, b), (b, a))[:, cut]
     stiffness = lattice.stiffness.copy()
-    stiffness[cut] *= stiffer(free, fast)
+    stiffness[cut] *= stiffening(free, fixed)
     return replace(lattice, stiffness=stiffness)
 
 
 def _with_cut_cells(
-    lattice: Lattice, held: Mask, stiffer: Callable[[Indices, Indices], Floats]
+    lattice: Lattice, held: Mask, stiffening: Callable[[Indices, Indices], Floats]
 ) -> Lattice:
-    """Return a solid whose cells with free and held corners are stiffer by the mean free part of their pairs."""
+    """Return a solid with stiffer cells between free and held corners.
+
+    The factor of a cell is 1 over the mean of sigma theta over its pairs of corners.
+    """
     assert lattice.solid is not None
-    fast, corners = held[lattice.local_cells], lattice.local_cells
-    cell, far, near = np.nonzero(fast[:, :, None] & ~fast[:, None, :])
-    free = 1 / stiffer(corners[cell, near], corners[cell, far])
-    mean = np.ones(len(corners))
+    corners = lattice.local_cells
+    is_held = held[corners]
+    cell, fixed, free = np.nonzero(is_held[:, :, None] & ~is_held[:, None, :])
+    sigma_theta = 1 / stiffening(corners[cell, free], corners[cell, fixed])
+    factor = np.ones(len(corners))
     cut = np.unique(cell)
-    mean[cut] = (np.bincount(cell) / np.maximum(np.bincount(cell, free), LEAST**2))[cut]
-    solid = lattice.solid._replace(shear=mean * lattice.solid.shear, lame=mean * lattice.solid.lame)
+    factor[cut] = (np.bincount(cell) / np.maximum(np.bincount(cell, sigma_theta), LEAST**2))[cut]
+    solid = lattice.solid
+    solid = solid._replace(shear=factor * solid.shear, lame=factor * solid.lame)
     return replace(lattice, solid=solid)
 
 
-def _free_part(within: Within, start: Positions, end: Positions) -> Floats:
-    """Return which part (n,) of the way from start to end (n, 3) lies before what is ``within``.
+def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:
+    """Return the fraction (n,) of each segment, start to end (n, 3), before it enters the region.
 
-    It is LEAST at least, and 1 where the way does not lead in from outside.
+    It is at least LEAST, and 1 if the segment does not enter from outside.
     """
-    leads_in = within(end) & ~within(start)
+    enters = within(end) & ~within(start)
     low, high = np.zeros(len(start)), np.ones(len(start))
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         inside = within(start + middle[:, None] * (end - start))
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
-    return np.where(leads_in, np.maximum(high, LEAST), 1.0)
+    return np.where(enters, np.maximum(high, LEAST), 1.0)
 
 
 def taken(
     comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions
 ) -> tuple[str, ...]:
-    """Return what anchors and forces take, in words; warn of what is overruled (collective).
+    """Return descriptions of the nodes of anchors and forces, and warn of conflicts (collective).
 
-    lattice : with its pins
-    anchors : each with the nodes that it leads, those of its region aside that a pin or an earlier anchor has
-    Raises InputError on all ranks for an anchor or a force that does nothing.
+    lattice : the lattice with its pins
+    anchors : the anchors without nodes that a pin or an earlier anchor holds
+    masks   : local nodes (l,) in the region of each table
+
+    Raises InputError on all ranks if an anchor or a force has no effect.
     """
 
     def count(where: Mask) -> int:
@@ -164,24 +180,27 @@ def taken(
     words = []
     for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
         where = masks[table.key]
-        nodes, pinned, led = map(count, (where, where & lattice.pinned, anchor.where))
-        if led < nodes:
+        nodes = count(where)
+        pinned = count(where & lattice.pinned)
+        anchored = count(anchor.where)
+        if anchored < nodes:
             text = f"{table.key}: of {nodes} nodes in its region pins hold {pinned}, "
-            text += f"and anchors before it lead {nodes - pinned - led}"
-            if not led:
+            text += f"and anchors before it lead {nodes - pinned - anchored}"
+            if not anchored:
                 raise InputError(f"{text}: it leads none")
             log.warning("%s, which it does not lead", text)
-        words.append(f"{table.key} leads {led} nodes")
+        words.append(f"{table.key} leads {anchored} nodes")
     for table in scene.tables("force"):
         where, force = masks[table.key], table.table
         until = math.inf if force.stop is None else force.stop
-        lasting = [
-            a.where for a in anchors if a.stop is None or a.stop >= until
-        ]  # hold all the while
+        # An anchor annuls a force only if it holds the node as long as the force acts.
+        lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
         nodes = count(where)
         held = count(where & reduce(np.logical_or, lasting, lattice.pinned))
         if held == nodes and force.pulls:
-            why = f"of {nodes} nodes in its region none is free while it acts, pins and anchors hold all"
-            raise InputError(f"{table.key} moves nothing: {why}")
+            raise InputError(
+                f"{table.key} moves nothing: of {nodes} nodes in its region none is free "
+                "while it acts, pins and anchors hold all"
+            )
         words.append(f"{table.key} pulls {nodes} nodes" + f" ({held} of them held)" * bool(held))
     return tuple(words)

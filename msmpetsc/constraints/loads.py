@@ -1,4 +1,4 @@
-"""What a scene does to nodes, and when: forces, anchors that lead them, and the motion of anchors and obstacles."""
+"""Forces on nodes, anchors, and the prescribed motion of anchors and obstacles."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,38 +17,45 @@ from msmpetsc.scene.values import Vector
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-SAME = 1e-12  # relative: a number of steps may come out a little less than the time meant
+# relative tolerance of times [-]; a multiple of the time step may be rounded down
+SAME = 1e-12
 
 
 def within(time: float, start: float, stop: float | None) -> bool:
-    """Return whether start <= time < stop [s], whatever was rounded; a stop of None never comes."""
+    """Return whether start <= time < stop [s], up to rounding; a stop of None is infinite."""
     return time >= start * (1 - SAME) and (stop is None or time < stop * (1 - SAME))
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Vectors (k, c) at ascending times (k,) [s], straight lines between them; before and after, the first and last."""
+    """A piecewise linear function of time, constant before the first and after the last time.
+
+    times   : (k,) ascending [s]
+    vectors : (k, c) values at the times
+    """
 
     times: Floats
     vectors: Rows
 
     def value_at(self, time: float) -> Floats:
         """Return the vector (c,) at a time [s]."""
-        return np.array([np.interp(time, self.times, along) for along in self.vectors.T])
+        return np.array([np.interp(time, self.times, column) for column in self.vectors.T])
 
 
 @dataclass(frozen=True)
 class Motion(Lines):
-    """Displacements [m] and rotation vectors [rad], side by side (k, 6); none at time 0, the first.
+    """A rigid motion over time: displacements [m] and rotation vectors [rad], side by side (k, 6).
 
-    center : (3,) about which it turns [m], at rest
+    The first time is 0, with the zero vector.
+
+    center : (3,) centre of rotation at rest [m]
     """
 
     center: Floats
 
     @classmethod
     def through(cls, poses: Iterable[Pose], center: ArrayLike | None = None) -> "Motion":
-        """Return the motion along a scene's path; one without a center does not turn."""
+        """Return the motion along a scene's path. A path without a center has no rotations."""
         stops = [
             (0.0, np.zeros(6)),
             *((p.time, np.hstack([p.by, np.radians(p.turn)])) for p in poses),
@@ -59,8 +66,8 @@ class Motion(Lines):
         )
 
     @property
-    def leads_away(self) -> bool:
-        """Return whether the motion leaves where it starts."""
+    def is_moving(self) -> bool:
+        """Return whether the motion has a pose after the first."""
         return len(self.times) > 1
 
     def displacement_at(self, time: float) -> Floats:
@@ -68,27 +75,30 @@ class Motion(Lines):
         return self.value_at(time)[:3]
 
     def displacement_between(self, begin: float, end: float) -> Floats:
-        """Return the way (3,) [m] that the motion makes good from one time [s] to another, but for turns."""
+        """Return the displacement (3,) [m] of the center between two times [s]."""
         return self.displacement_at(end) - self.displacement_at(begin)
 
     def unmoved(self, q: Positions, pose: Floats) -> Positions:
-        """Return where points q (n, 3) [m] of a pose (6,) are at time 0: what ``moved`` takes."""
-        at_rest: Positions = (q - self.center - pose[:3]) @ Rotation.from_rotvec(
-            pose[3:]
-        ).as_matrix() + self.center
+        """Return the positions (n, 3) [m] at time 0 of points q (n, 3) in a pose (6,).
+
+        This is the inverse of ``moved``.
+        """
+        rotation = Rotation.from_rotvec(pose[3:]).as_matrix()
+        at_rest: Positions = (q - self.center - pose[:3]) @ rotation + self.center
         return at_rest
 
     def moved(self, x: Positions, pose: Floats) -> Positions:
-        """Return where points x (n, 3) [m] are in a pose (6,): c + R (x - c) + by."""
+        """Return the positions c + R (x - c) + by (n, 3) [m] of points x (n, 3) in a pose (6,)."""
         by, turn = like(x, pose[:3]), pose[3:]
         if not turn.any():
             return x + by
-        center, rotation = like(x, self.center), like(x, Rotation.from_rotvec(turn).as_matrix())
+        center = like(x, self.center)
+        rotation = like(x, Rotation.from_rotvec(turn).as_matrix())
         return (x - center) @ rotation.T + center + by
 
 
 def total_of(total: Vector | ForceTable) -> Lines:
-    """Return the total [N] of a scene's force over time; of one that is always the same a table of one time."""
+    """Return the total [N] of a scene's force over time; a constant force has a single time."""
     if isinstance(total, ForceTable):
         return Lines(np.array(total.times), np.array(total.values))
     return Lines(np.zeros(1), np.array([total]))
@@ -96,28 +106,28 @@ def total_of(total: Vector | ForceTable) -> Lines:
 
 @dataclass(frozen=True, kw_only=True)
 class Timed:
-    """What acts while start <= time < stop [s]; a stop of None never comes."""
+    """A load that acts while start <= time < stop [s]; a stop of None is infinite."""
 
     start: float = 0.0
     stop: float | None = None
 
     def acts_at(self, time: float) -> bool:
-        """Return whether it acts at a time [s]."""
+        """Return whether the load acts at a time [s]."""
         return within(time, self.start, self.stop)
 
     @property
     def events(self) -> list[float]:
-        """Return the times [s] at which it begins, ends or turns."""
+        """Return the times [s] at which the load begins, ends or changes its slope."""
         return [self.start, *([] if self.stop is None else [self.stop])]
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
-        """Return what tells the force at a time from that at another."""
+        """Return a state at a time [s]: times of equal state have the same load."""
         return self.acts_at(time)
 
 
 @dataclass(frozen=True)
 class Anchor(Timed):
-    """Nodes that a scene leads along a path, and lets go.
+    """Nodes with a prescribed displacement along a path, until the anchor releases them.
 
     where : (l,) bool, the nodes, ghosts included
     """
@@ -128,37 +138,37 @@ class Anchor(Timed):
 
 @dataclass(frozen=True)
 class Load(Timed):
-    """A force of nodes.
+    """A force on nodes, a share of a total. Gravity is the acceleration times the mass.
 
-    share : (owned, 1) of each node in the total [-]; of gravity its mass [kg]
-    total : what they share [N]; of gravity the acceleration [m/s^2]
+    share : (owned, 1) share of each node in the total [-]; for gravity, its mass [kg]
+    total : total force [N]; for gravity, the acceleration [m/s^2]
     """
 
     share: Rows
     total: Lines
 
     def force_at(self, time: float) -> Rows:
-        """Return the force (owned, 3) [N] that acts at a time [s]."""
+        """Return the force (owned, 3) [N] on the nodes at a time [s]."""
         return self.share * like(self.share, self.total.value_at(time))
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
-        """Return the total, or False where it does not act."""
+        """Return the total at a time [s]; False if the force does not act."""
         return self.acts_at(time) and tuple(self.total.value_at(time).tolist())
 
     @property
     def events(self) -> list[float]:
-        """Return the times [s] at which the force begins, ends or turns."""
+        """Return the times [s] at which the force begins, ends or changes its slope."""
         return [*super().events, *self.total.times.tolist()]
 
 
 @dataclass(frozen=True)
 class OwnForce(Timed):
-    """A force that is a function of the user's (extensions.register_force).
+    """A force that a user's function defines (extensions.register_force).
 
-    key      : of its table in the scene, for messages
-    function : of positions (k, 3) [m], velocities (k, 3) [m/s] and time [s]; returns (k, 3) [N/kg]
+    key      : key of its table in the scene, for messages
+    function : from positions (k, 3) [m], velocities (k, 3) [m/s] and time [s] to (k, 3) [N/kg]
     rows     : (k,) owned nodes in its region
-    mass     : (k,) [kg]
+    mass     : (k,) their masses [kg]
     """
 
     key: str
@@ -167,11 +177,15 @@ class OwnForce(Timed):
     mass: Floats
 
     def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
-        """Return the force (owned, 3) [N] at positions and velocities (owned, 3). Raises InputError for no numbers."""
+        """Return the force (owned, 3) [N] at positions q and velocities v (owned, 3).
+
+        Raises InputError if the function's result has a wrong shape or is not finite.
+        """
         force = np.zeros((len(q), 3))
         if not len(self.rows):
             return force
-        with np.errstate(all="warn"):  # it is the user's own
+        # A user's function may divide by zero: its result is checked below.
+        with np.errstate(all="warn"):
             per_mass = np.asarray(self.function(q[self.rows], v[self.rows], time), float)
         try:
             force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
@@ -186,7 +200,7 @@ class OwnForce(Timed):
 
 
 def shares_by_mass(comm: "MPI.Comm", where: Mask, mass: Floats) -> Rows:
-    """Return the parts (owned, 1) that nodes (owned,) bool have of a force, by mass (collective)."""
+    """Return each node's share (owned, 1) by mass of a force on ``where`` (owned,) (collective)."""
     loaded = np.where(where, mass, 0.0)
     share: Rows = loaded[:, None] / comm.allreduce(loaded.sum())
     return share

@@ -1,6 +1,6 @@
-"""The cells of a solid around a rank's nodes, in blocks of eight, as loops and threads take them.
+"""Storage of a solid's cells in blocks of eight, for vectorised loops and for GPU threads.
 
-Numbers of a block's cells stand beside each other: number i of the cell in a lane is row[lane + LANES * i].
+The numbers of a block are interleaved: number i of the cell in a lane is row[lane + LANES * i].
 """
 
 from collections.abc import Callable
@@ -14,23 +14,27 @@ from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
-ROWS = (
-    FORM + 2
-)  # of a cell's constants: its form, modes times m = mu V / (16 h^2); m; lambda V / (16 h^2)
-STATE = 11  # F by rows, V U' / (16 h^2), V U'' / (16 h^2)
-BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of VTK's order, x fastest, then y
+# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2);
+# then m and lambda V / (16 h^2)
+ROWS = FORM + 2
+# entries of a cell in a Hessian's state [-]: F by rows, then V U' and V U'' over 16 h^2
+STATE = 11
+# VTK's corner number at each place of the order with x fastest, then y [-]
+BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]
 
 
 class Blocks(NamedTuple):
-    """Cells, those first that a rank owns; the last block of a kind is filled up with cells of no stiffness.
+    """A solid's cells in blocks of LANES; the blocks of cells that the rank owns come first.
 
-    nodes     : (b, LANES, 8) local corner nodes, x fastest; unsigned, so that no index is looked at for being negative
-    which     : (b,) row of the constants
-    constants : (k, ROWS * LANES), LANES of each number
-    around    : (8, n) on a GPU the corners at each node that the rank owns, by their number in (b, 8, LANES), one past
-        the last where a node has fewer; (8, 0) on a CPU
+    The last owned block and the last of all are filled up with cells of zero stiffness.
+
+    nodes     : (b, LANES, 8) local corner nodes, x fastest; unsigned, to save a test of their sign
+    which     : (b,) row of ``constants`` for each block
+    constants : (k, ROWS * LANES) distinct rows of constants, LANES of each number
+    around    : (8, n) on a GPU the cell corners at each owned node, as indices into (b, 8, LANES),
+                filled up with an index past the end; (8, 0) on a CPU
     owned     : number of blocks of cells that the rank owns
-    h4        : four times the side of a cell [m]
+    h4        : four times the side h of a cell [m]
     """
 
     nodes: Indices
@@ -42,12 +46,12 @@ class Blocks(NamedTuple):
 
 
 class CellRows(NamedTuple):
-    """The same cells one after another, as kernels take them: cell i is in lane i % LANES of block i // LANES.
+    """Cells in sequence, as kernels take them: cell i is in lane i % LANES of block i // LANES.
 
-    nodes     : (c, 8)
-    constants : rows of ``Blocks.constants``, one after another
-    by_node   : a corner adds to the row of its node; on a GPU to one of its own, of which Blocks.around has the number
-    state     : what a Hessian keeps of each (b, STATE, LANES), one row of numbers; none where nothing asks for it
+    nodes     : (c, 8) local corner nodes, x fastest
+    constants : ``Blocks.constants``, flat
+    by_node   : True on a CPU, where a corner adds to its node's row; on a GPU it has its own row
+    state     : (b, STATE, LANES) state of a Hessian, flat; empty if the kernel needs none
     """
 
     nodes: Indices
@@ -59,19 +63,23 @@ class CellRows(NamedTuple):
 
 
 def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
-    """Return cells as kernels take them."""
+    """Return the cells of blocks in sequence, with the ``state`` of a Hessian if given."""
     constants, by_node = blocks.constants.ravel(), on_host(blocks.nodes)
     own = constants[:0] if state is None else state.ravel()
     return CellRows(blocks.nodes.reshape(-1, 8), blocks.which, constants, blocks.h4, by_node, own)
 
 
 def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
-    """Return the lattice's cells with their constants (c, ROWS), in the memory that its nodes are in."""
-    cells, kinds, number = to_host(lattice.local_cells)[:, BY_AXIS], [], np.arange(len(constants))
+    """Return the lattice's cells with their constants (c, ROWS), on the device of its nodes.
+
+    Cells with equal constants share blocks, so that few distinct rows are stored.
+    """
+    cells = to_host(lattice.local_cells)[:, BY_AXIS]
+    number = np.arange(len(constants))
+    kinds = []
     _, alike, count = np.unique(_whole_rows(constants), return_inverse=True, return_counts=True)
-    rank = np.where(
-        count[alike] < LANES, len(count), alike
-    )  # those that fill no block stay where they are
+    # Cells with constants too rare to fill a block keep their order, for locality.
+    rank = np.where(count[alike] < LANES, len(count), alike)
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
         own = np.flatnonzero(kind)
         order = own[np.argsort(rank[own], kind="stable")]
@@ -80,7 +88,8 @@ def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
     _, first, which = np.unique(_whole_rows(rows), return_index=True, return_inverse=True)
     around = np.empty((8, 0), np.int64)
     if not on_host(lattice.nodes):
-        is_cell = rows.reshape(-1, ROWS, LANES)[:, -2] > 0  # and does not fill up a last block
+        # Cells that only fill up a block have no stiffness. Their corners get no row.
+        is_cell = rows.reshape(-1, ROWS, LANES)[:, -2] > 0
         corners = np.where(is_cell[:, None], nodes.transpose(0, 2, 1), lattice.owned)
         around = rows_of(corners.ravel().astype(np.int64), lattice.owned)
     arrays = nodes, which.astype(np.int32), rows[first], around
@@ -89,7 +98,10 @@ def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
 
 
 def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
-    """Return cells in blocks (b, LANES, 8) and their constants (b, ROWS * LANES); the last is filled up by no cells."""
+    """Return the nodes (b, LANES, 8) and the constants (b, ROWS * LANES) of cells in blocks.
+
+    The last block is filled up with cells of zero stiffness.
+    """
     lacking = -len(nodes) % LANES
     nodes = np.concatenate([nodes, np.repeat(nodes[-1:], lacking, axis=0)]).astype(np.uint32)
     rows = np.concatenate([constants, np.zeros((lacking, ROWS))]).reshape(-1, LANES, ROWS)
@@ -97,21 +109,24 @@ def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
 
 
 def _whole_rows(rows: Rows) -> Array:
-    """Return rows as one thing each, (n,), which are sorted and compared bit by bit."""
+    """Return each row as a single item (n,), which sorts and compares bit by bit."""
     return (
         np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
     )
 
 
 def add_corners(write: Callable[[Rows], None], around: Indices, corners: int, rows: Rows) -> None:
-    """Let a loop add to the rows (l, k) of nodes; on a GPU to so many of its own, one a corner of cells, which each
-    owned node then sums.
+    """Add the results of a loop over cell corners to the rows (l, k) of nodes.
 
-    around : of ``rows_of``
+    On a CPU ``write`` adds to ``rows``. On a GPU it writes a row per corner, and each owned node
+    sums the rows of its corners.
+
+    around : (w, owned) rows of each owned node (see ``rows_of``)
     """
     if on_host(rows):
         write(rows)
         return
-    own = np.zeros((corners + 1, rows.shape[1]), like=rows)  # the last is of no corner
+    # The last row stays zero: ``around`` refers to it if a node has fewer corners.
+    own = np.zeros((corners + 1, rows.shape[1]), like=rows)
     write(own)
     rows[: around.shape[1]] += own[around].sum(axis=0)

@@ -1,8 +1,13 @@
-"""The loops over cells that steps spend their time in, on a CPU: eight cells at once, in the lanes of vectors.
+"""Vectorised loops over cells on a CPU: energy change, gradient and Hessian product.
 
-numba makes vectors of loops over the lanes of one work array with constant offsets. It holds, LANES numbers each, the
-values at a cell's 8 corners (3 components each), its constants, what a law keeps of it, and 3 components of the result
-at 8 corners. The formulas are those of elasticity.cell_strain and elasticity.neo_hookean.
+Eight cells are computed at once, each in its lane. The work array holds, LANES numbers per entry:
+
+- the values at the 8 corners, 3 components per corner;
+- the cell's constants, then its entries of a Hessian's state;
+- the result at the 8 corners, 3 components per corner.
+
+numba vectorises loops over the lanes, because all offsets into the work array are constants.
+The formulas are in elasticity.cell_strain and elasticity.neo_hookean.
 """
 
 import numpy as np
@@ -12,40 +17,35 @@ from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
-    changes,
+    determinant_and_change,
     gradient_of,
-    pull,
     quadratic_change,
-    turned_pull,
+    slope_gradient,
+    slope_product,
     volume_change,
 )
 
-# where things stand in the work array, after the corners' values
+# offsets into the work array [-]; the corners' values come first
 CONSTANTS = 24 * LANES
 AT_STATE = CONSTANTS + ROWS * LANES
 RESULT = AT_STATE + STATE * LANES
 WORK = RESULT + 24 * LANES
 
-FAST = {"contract", "nsz", "reassoc", "arcp"}  # numba: sums may be reordered, for lanes
+# numba's fastmath flags [-]; vectorisation needs sums that may be reordered
+FAST = {"contract", "nsz", "reassoc", "arcp"}
 
 
 @njit(inline="always")
 def _component_in(w: Floats, at: int) -> Eight:
     return (
-        w[at],
-        w[at + 24],
-        w[at + 48],
-        w[at + 72],
-        w[at + 96],
-        w[at + 120],
-        w[at + 144],
-        w[at + 168],
-    )
+        w[at], w[at + 24], w[at + 48], w[at + 72],
+        w[at + 96], w[at + 120], w[at + 144], w[at + 168],
+    )  # fmt: skip
 
 
 @njit(inline="always")
 def _strains_in(w: Floats, lane: int, at: int = 0) -> Strains:
-    """Return the strains of the cell in a lane, by the corners' values from ``at`` on."""
+    """Return the strains of the cell in a lane, from the corners' values that begin at ``at``."""
     form = form_of(w, CONSTANTS + lane)
     return (
         strain(_component_in(w, at + lane), form),
@@ -82,12 +82,15 @@ def _load(rows: Rows, row: int, w: Floats, at: int) -> None:
 def _product_lanes(w: Floats) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        write_forces(w, RESULT + lane, w, k, turned_pull(e, w[k + 104], w, AT_STATE + lane), e)
+        write_forces(w, RESULT + lane, w, k, slope_product(e, w[k + 104], w, AT_STATE + lane), e)
 
 
 @njit()
 def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
-    """Add (Hessian) v [N] to ``product`` (l, 3), its ``state`` that of ``linearise``; all of one dtype."""
+    """Add (Hessian) v [N] to ``product`` (l, 3), with the ``state`` of ``linearise``.
+
+    All arrays have the same dtype.
+    """
     w = np.zeros(WORK, v.dtype)
     for b in range(len(blocks.nodes)):
         _gather(blocks.nodes, b, v, w)
@@ -101,7 +104,7 @@ def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
 def _gradient_lanes(w: Floats, h4: float) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        write_forces(w, RESULT + lane, w, k, pull(e, w[k + 104], w[k + 112], h4), e)
+        write_forces(w, RESULT + lane, w, k, slope_gradient(e, w[k + 104], w[k + 112], h4), e)
 
 
 @njit()
@@ -116,16 +119,21 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
 
 
 @njit(fastmath=FAST, error_model="numpy")
-def _change_lanes(w: Floats, over: float) -> None:
+def _change_lanes(w: Floats, inverse_h4: float) -> None:
     for lane in range(LANES):
         moved, base, s = _strains_in(w, lane), _strains_in(w, lane, RESULT), AT_STATE + lane
-        w[s], w[s + 8] = changes(gradient_of(moved, over), gradient_of(base, over))
+        w[s], w[s + 8] = determinant_and_change(
+            gradient_of(moved, inverse_h4), gradient_of(base, inverse_h4)
+        )
         w[s + 16] = quadratic_change(w, CONSTANTS + lane, moved, base)
 
 
 @njit()
 def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
-    """Return E(q) - E(base) [J] of the cells that the rank owns, by how the nodes moved: it keeps its digits."""
+    """Return E(q) - E(base) [J] of the cells that the rank owns.
+
+    The change is computed from the displacement q - base, so a small change keeps its digits.
+    """
     moved, w, change = q - base, np.zeros(WORK), 0.0
     for b in range(blocks.owned):
         _gather(blocks.nodes, b, moved, w)
@@ -134,9 +142,9 @@ def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
         _change_lanes(w, 1.0 / blocks.h4)
         for lane in range(LANES):
             s, m, lame = AT_STATE + lane, w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
-            before, more = w[s], w[s + 8]
+            j_base, j_change = w[s], w[s + 8]
             if m > 0.0:
                 change += w[s + 16] + blocks.h4**2 * volume_change(
-                    before + more, before, more, m, lame
+                    j_base + j_change, j_base, j_change, m, lame
                 )
     return change

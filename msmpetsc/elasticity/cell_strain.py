@@ -1,7 +1,7 @@
-"""Strain within one cell, and the forces that it asks of the corners: formulas for lanes of vectors and for threads.
+"""Strain within a cell, and the corner forces of a stress: formulas that all loops share.
 
-Rows of numbers hold LANES cells: number i of the cell at k is c[k + LANES * i]. A component's strain is the three mean
-slopes and the four modes of lattice.cell_moments.
+The strain of a component is its three mean slopes and its four modes (lattice.cell_moments).
+Constants are interleaved for LANES cells: number i of the cell at k is c[k + LANES * i].
 """
 
 from typing import TypeAlias
@@ -10,36 +10,31 @@ from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.springs import Four, Vector
 
+# cells of a block [-]; eight doubles fill the widest vector register
 LANES = 8
 
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 Seven: TypeAlias = tuple[float, float, float, float, float, float, float]
 Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
-Strains: TypeAlias = tuple[Seven, Seven, Seven]  # of x, y and z
+# strains of the components x, y and z
+Strains: TypeAlias = tuple[Seven, Seven, Seven]
 
 
 @njit(inline="always")
 def form_of(c: Floats, k: int) -> Six:
-    """Return the first six constants of a cell, which mean slopes depend on."""
+    """Return the first six constants of a cell, which define its mean slopes."""
     return c[k], c[k + 8], c[k + 16], c[k + 24], c[k + 32], c[k + 40]
 
 
 @njit(inline="always")
 def strain(u: Eight, form: Six) -> Seven:
-    """Return 4 h times a component's mean slope, and its modes, by the corners' values, x fastest."""
+    """Return the strain of corner values u (8,), x fastest: mean slopes times 4 h, then modes."""
     a, b, c, d, e, f, g, h = u
     s0, d0, s1, d1, s2, d2, s3, d3 = a + b, b - a, c + d, d - c, e + f, f - e, g + h, h - g
     x0, y0, xy0, x1, y1, xy1 = d0 + d1, s1 - s0, d1 - d0, d2 + d3, s3 - s2, d3 - d2
-    x, y, z, xy, xz, yz, xyz = (
-        x0 + x1,
-        y0 + y1,
-        (s2 + s3) - (s0 + s1),
-        xy0 + xy1,
-        x1 - x0,
-        y1 - y0,
-        xy1 - xy0,
-    )
+    x, y, z = x0 + x1, y0 + y1, (s2 + s3) - (s0 + s1)
+    xy, xz, yz, xyz = xy0 + xy1, x1 - x0, y1 - y0, xy1 - xy0
     cx, cy, cz, mxy, mxz, myz = form
     return (
         x + xy * cy + xz * cz + xyz * myz,
@@ -54,7 +49,7 @@ def strain(u: Eight, form: Six) -> Seven:
 
 @njit(inline="always")
 def corner_strain(a: int, form: Six) -> Seven:
-    """Return 4 h times the mean slopes, and the modes, of what is 1 at corner a and 0 at the others."""
+    """Return the ``strain`` of the trilinear function that is 1 at corner a."""
     x, y, z = 2.0 * (a & 1) - 1.0, 1.0 * (a & 2) - 1.0, 0.5 * (a & 4) - 1.0
     cx, cy, cz, mxy, mxz, myz = form
     return (
@@ -70,15 +65,9 @@ def corner_strain(a: int, form: Six) -> Seven:
 
 @njit(inline="always")
 def modes_forces(c: Floats, k: int, e: Seven) -> Four:
-    """Return the slopes of the modes' energy by the modes of a strain."""
-    xy, xz, yz, of_yz, of_xz, of_xy = (
-        c[k + 48],
-        c[k + 56],
-        c[k + 64],
-        c[k + 72],
-        c[k + 80],
-        c[k + 88],
-    )
+    """Return the derivatives (4,) of the modes' energy with respect to the modes of a strain."""
+    xy, xz, yz = c[k + 48], c[k + 56], c[k + 64]
+    of_yz, of_xz, of_xy = c[k + 72], c[k + 80], c[k + 88]
     return (
         xy * e[3] + of_yz * e[4] + of_xz * e[5],
         of_yz * e[3] + xz * e[4] + of_xy * e[5],
@@ -89,7 +78,11 @@ def modes_forces(c: Floats, k: int, e: Seven) -> Four:
 
 @njit(inline="always")
 def write_forces(store: Floats, at: int, c: Floats, k: int, slopes: Nine, e: Strains) -> None:
-    """Write a cell's forces on its corners into 24 numbers: ``slopes`` by 4 h times the mean slopes, and the modes'."""
+    """Write the gradient at a cell's corners, 24 numbers, into ``store`` from index ``at``.
+
+    slopes : (9,) derivative of E with respect to 4 h times the mean slopes
+    e      : strains, whose modes give the rest of the gradient
+    """
     _write_component(store, at, c, k, (slopes[0], slopes[1], slopes[2]), e[0])
     _write_component(store, at + 8, c, k, (slopes[3], slopes[4], slopes[5]), e[1])
     _write_component(store, at + 16, c, k, (slopes[6], slopes[7], slopes[8]), e[2])

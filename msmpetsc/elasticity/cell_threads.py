@@ -1,7 +1,8 @@
-"""Loops over cells one by one: on a CPU those that are rare, on a GPU all. There a thread a cell writes what it adds at
-its corners, and a thread a node sums what the cells around it have written, so that sums come out the same every time.
+"""Loops over single cells: all loops of a GPU, and the rare loops of a CPU.
 
-What a kernel writes at corner a of a cell has the place (block, a, component, lane).
+On a GPU a thread per cell writes the forces at the cell's corners. A thread per node then sums the
+forces of the cells around the node, so that the sums are reproducible. The force at corner a of a
+cell is stored at (block, a, component, lane).
 """
 
 from collections.abc import Callable
@@ -13,80 +14,47 @@ from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
-    changes,
+    determinant_and_change,
     gradient_of,
-    pull,
     quadratic_change,
+    slope_gradient,
+    slope_product,
     slopes_at,
-    turned_pull,
     volume_change,
     write_state,
 )
-from msmpetsc.elasticity.springs import Way
+from msmpetsc.elasticity.springs import Displacement
 
 
 @njit(inline="always")
 def constants_at(cells: CellRows, i: int) -> int:
-    """Return where the constants of cell i begin."""
+    """Return the index at which the constants of cell i begin."""
     return int(cells.which[i // LANES]) * ROWS * LANES + i % LANES
 
 
 @njit(inline="always")
 def state_at(i: int) -> int:
-    """Return where what a Hessian keeps of cell i begins."""
+    """Return the index at which the Hessian's state of cell i begins."""
     return (i // LANES) * STATE * LANES + i % LANES
 
 
 @njit(inline="always")
 def strains_at(q: Positions, cells: CellRows, i: int) -> Strains:
-    """Return the strains of cell i."""
+    """Return the strains of cell i for the values q (l, 3) of nodes."""
     c, form = cells.nodes[i], form_of(cells.constants, constants_at(cells, i))
     return (
-        strain(
-            (
-                q[c[0], 0],
-                q[c[1], 0],
-                q[c[2], 0],
-                q[c[3], 0],
-                q[c[4], 0],
-                q[c[5], 0],
-                q[c[6], 0],
-                q[c[7], 0],
-            ),
-            form,
-        ),
-        strain(
-            (
-                q[c[0], 1],
-                q[c[1], 1],
-                q[c[2], 1],
-                q[c[3], 1],
-                q[c[4], 1],
-                q[c[5], 1],
-                q[c[6], 1],
-                q[c[7], 1],
-            ),
-            form,
-        ),
-        strain(
-            (
-                q[c[0], 2],
-                q[c[1], 2],
-                q[c[2], 2],
-                q[c[3], 2],
-                q[c[4], 2],
-                q[c[5], 2],
-                q[c[6], 2],
-                q[c[7], 2],
-            ),
-            form,
-        ),
-    )
+        strain((q[c[0], 0], q[c[1], 0], q[c[2], 0], q[c[3], 0],
+                q[c[4], 0], q[c[5], 0], q[c[6], 0], q[c[7], 0]), form),
+        strain((q[c[0], 1], q[c[1], 1], q[c[2], 1], q[c[3], 1],
+                q[c[4], 1], q[c[5], 1], q[c[6], 1], q[c[7], 1]), form),
+        strain((q[c[0], 2], q[c[1], 2], q[c[2], 2], q[c[3], 2],
+                q[c[4], 2], q[c[5], 2], q[c[6], 2], q[c[7], 2]), form),
+    )  # fmt: skip
 
 
 @njit(inline="always")
 def gradient_at(q: Positions, cells: CellRows, i: int) -> Nine:
-    """Return F of cell i."""
+    """Return F (9,) of cell i at positions q (l, 3) [m]."""
     return gradient_of(strains_at(q, cells, i), 1.0 / cells.h4)
 
 
@@ -96,7 +64,7 @@ def _write_products(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(v, cells, i)
-        slopes = turned_pull(e, cells.constants[k + 104], cells.state, state_at(i))
+        slopes = slope_product(e, cells.constants[k + 104], cells.state, state_at(i))
         write_forces(store, (i // LANES) * 24 * LANES + i % LANES, cells.constants, k, slopes, e)
 
 
@@ -106,7 +74,7 @@ def _write_gradients(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
-        slopes = pull(e, cells.constants[k + 104], cells.constants[k + 112], cells.h4)
+        slopes = slope_gradient(e, cells.constants[k + 104], cells.constants[k + 112], cells.h4)
         write_forces(store, (i // LANES) * 24 * LANES + i % LANES, cells.constants, k, slopes, e)
 
 
@@ -139,29 +107,31 @@ def _write_states(
 
 @kernel
 def _write_changes(
-    first: int, count: int, step: int, parts: Floats, cells: CellRows, way: Way
+    first: int, count: int, step: int, parts: Floats, cells: CellRows, displacement: Displacement
 ) -> None:
-    base, _, moved = way
+    base, _, moved = displacement
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
-        before, more = changes(gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4))
+        j_base, j_change = determinant_and_change(
+            gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)
+        )
         m, parts[i] = cells.constants[k + 104], 0.0
         if m > 0.0:
-            volume = volume_change(before + more, before, more, m, cells.constants[k + 112])
+            volume = volume_change(j_base + j_change, j_base, j_change, m, cells.constants[k + 112])
             parts[i] = quadratic_change(cells.constants, k, d, e) + cells.h4**2 * volume
 
 
 def _add(
     kernel: Callable[..., None], array: Array, cells: CellRows, around: Indices, rows: Rows
 ) -> None:
-    """Let cells write 3 numbers a corner, and add them to the owned rows (l, 3)."""
+    """Run a kernel that writes three numbers per corner, and add them to the owned rows (l, 3)."""
     store = np.empty(24 * len(cells.nodes), like=rows)
     kernel(len(cells.nodes), array, cells, store)
     _add_around(around.shape[1], store, around, rows)
 
 
 def add_product(blocks: Blocks, state: Rows, v: Array, product: Array) -> None:
-    """Add (Hessian) v [N] to the owned rows of ``product`` (l, 3), its ``state`` that of ``linearise``."""
+    """Add (Hessian) v [N] to the owned rows of ``product`` (l, 3), from a ``linearise`` state."""
     _add(_write_products, v, one_by_one(blocks, state), blocks.around, product)
 
 
@@ -171,14 +141,14 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
 
 
 def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> None:
-    """Write what a Hessian keeps of each cell into ``state`` (b, STATE * LANES)."""
+    """Write F, V U' and V U'' of each cell at q (l, 3) [m] into ``state`` (b, STATE * LANES)."""
     _write_states(LANES * len(blocks.nodes), q, one_by_one(blocks, state), projected)
 
 
 def cell_changes(blocks: Blocks, count: int, q: Positions, base: Positions) -> Floats:
-    """Return E(q) - E(base) [J] of the first cells (count,), by how nodes moved: it keeps digits."""
+    """Return E(q) - E(base) [J] of each of the first cells (count,)."""
     parts: Floats = np.empty(count, like=q)
-    _write_changes(count, parts, one_by_one(blocks), Way.to(q, base))
+    _write_changes(count, parts, one_by_one(blocks), Displacement.to(q, base))
     return parts
 
 

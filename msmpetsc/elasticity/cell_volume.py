@@ -1,6 +1,6 @@
-"""Signed volumes of cells, which tell a cell that is turned inside out: of its corners, and of its mean strain.
+"""Signed volumes that reveal inverted cells: the volumes at a cell's corners, and its mean J.
 
-Each corner of a cell spans a box with the three edges that meet there. Positions are local, (l, 3) [m].
+The three edges at a corner span the corner's volume. Positions are local, (l, 3) [m].
 """
 
 from typing import NamedTuple
@@ -10,7 +10,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_strain import Six, strain
-from msmpetsc.elasticity.springs import Vector, between, dot
+from msmpetsc.elasticity.springs import Vector, dot, edge
 
 
 class Shapes(NamedTuple):
@@ -33,35 +33,17 @@ def _volume(a: Vector, b: Vector, c: Vector) -> float:
 
 @njit()
 def least_volume(q: Positions, c: Indices) -> float:
-    """Return the least of the eight corner volumes of a cell [m^3]; each edge is read once."""
-    x0, x1, x2, x3 = (
-        between(q, c[0], c[1]),
-        between(q, c[3], c[2]),
-        between(q, c[4], c[5]),
-        between(q, c[7], c[6]),
-    )
-    y0, y1, y2, y3 = (
-        between(q, c[0], c[3]),
-        between(q, c[1], c[2]),
-        between(q, c[4], c[7]),
-        between(q, c[5], c[6]),
-    )
-    z0, z1, z2, z3 = (
-        between(q, c[0], c[4]),
-        between(q, c[1], c[5]),
-        between(q, c[2], c[6]),
-        between(q, c[3], c[7]),
-    )
-    volume = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
-    return float(
-        min(
-            volume,
-            _volume(x2, y2, z0),
-            _volume(x2, y3, z1),
-            _volume(x3, y3, z2),
-            _volume(x3, y2, z3),
-        )
-    )
+    """Return the smallest of the eight corner volumes of a cell [m^3]."""
+    x0, x1 = edge(q, c[0], c[1]), edge(q, c[3], c[2])
+    x2, x3 = edge(q, c[4], c[5]), edge(q, c[7], c[6])
+    y0, y1 = edge(q, c[0], c[3]), edge(q, c[1], c[2])
+    y2, y3 = edge(q, c[4], c[7]), edge(q, c[5], c[6])
+    z0, z1 = edge(q, c[0], c[4]), edge(q, c[1], c[5])
+    z2, z3 = edge(q, c[2], c[6]), edge(q, c[3], c[7])
+    low = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
+    v4, v5 = _volume(x2, y2, z0), _volume(x2, y3, z1)
+    v6, v7 = _volume(x3, y3, z2), _volume(x3, y2, z3)
+    return float(min(low, v4, v5, v6, v7))
 
 
 @kernel
@@ -73,7 +55,7 @@ def _least_volume_of(
 
 
 def least_volumes(q: Positions, cells: Indices) -> Floats:
-    """Return the least of the eight corner volumes of each cell (c,) [m^3]: not positive in an inverted one."""
+    """Return the smallest corner volume (c,) [m^3] of each cell; <= 0 if the cell is inverted."""
     least = np.empty(len(cells), like=q)
     _least_volume_of(len(cells), q, cells, least)
     return least
@@ -82,15 +64,9 @@ def least_volumes(q: Positions, cells: Indices) -> Floats:
 @njit(inline="always")
 def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
     corners = (
-        q[c[0], k],
-        q[c[1], k],
-        q[c[3], k],
-        q[c[2], k],
-        q[c[4], k],
-        q[c[5], k],
-        q[c[7], k],
-        q[c[6], k],
-    )
+        q[c[0], k], q[c[1], k], q[c[3], k], q[c[2], k],
+        q[c[4], k], q[c[5], k], q[c[7], k], q[c[6], k],
+    )  # fmt: skip
     x, y, z, _, _, _, _ = strain(corners, form)
     return x, y, z
 
@@ -109,7 +85,7 @@ def _mean_volume_of(
 
 
 def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -> Floats:
-    """Return J (c,) of a solid's cells: det of the mean slope of q (l, 3) [m] over what is inside, 1 at rest [-]."""
+    """Return J (c,) [-] of a solid's cells at q (l, 3) [m], of the mean deformation gradient."""
     volumes: Floats = np.empty(len(cells), like=q)
     _mean_volume_of(len(cells), volumes, q, Shapes(cells, forms))
     return volumes / (4.0 * cell_size) ** 3

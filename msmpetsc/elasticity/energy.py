@@ -1,4 +1,4 @@
-"""The elastic energy of a lattice, whatever its law: the interface of the solver to a material."""
+"""Elastic energy of a lattice for every material law: the interface between solver and material."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,14 @@ from msmpetsc.lattice.lattice import Lattice
 
 
 class Elasticity:
-    """E of this rank's part of a lattice, its gradient and its Hessian.
+    """Elastic energy E of this rank's part of a lattice, its gradient and its Hessian.
 
-    It is that of a neo-Hookean solid (elasticity.solid), or of Hooke's springs (elasticity.springs).
+    The law is a neo-Hookean solid (elasticity.solid) or linear springs (elasticity.springs).
+    ``springs``, ``solid`` and ``viscosity`` are None if the law has no such part. If the solid is
+    viscous, E includes the dissipation potential D of the step that ``viscosity`` began last.
 
-    Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the owned
-    nodes. ``springs``, ``solid`` and ``viscosity`` are None where the law has none. Where there is viscosity
-    E has its D, of the step that it was given last.
+    Positions are local (l, 3) [m]. Energies are sums over the springs or cells that this rank owns.
+    Gradients and products are complete in the owned rows.
     """
 
     def __init__(self, lattice: Lattice):
@@ -35,12 +36,12 @@ class Elasticity:
         self.parts = [part for part in (self.solid, self.springs, self.viscosity) if part]
 
     def energy(self, q: Positions) -> float:
-        """Return E [J] of what this rank owns: laws' changes from rest, where E is 0, and D."""
+        """Return this rank's part of E [J]: the energy change from rest, where E is 0, and D."""
         viscous = self.viscosity.energy(q) if self.viscosity else 0.0
         return viscous + sum(law.change(q, self.rest) for law in (self.solid, self.springs) if law)
 
     def change(self, q: Positions, base: Positions) -> float:
-        """Return E(q) - E(base) [J] of what this rank owns."""
+        """Return this rank's part of E(q) - E(base) [J]."""
         return sum(part.change(q, base) for part in self.parts)
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
@@ -50,18 +51,21 @@ class Elasticity:
 
     @property
     def corners(self) -> Indices:
-        """Corner nodes (c, 8) of the cells of the law that this rank owns, in its order; (0, 8) of springs alone."""
+        """Corner nodes (c, 8) of this rank's cells, in the solid's order; (0, 8) for springs."""
         return self.solid.corners if self.solid else np.empty((0, 8), np.int64)
 
     @property
     def bound(self) -> float | None:
-        """By how much the projected Hessian may exceed D of ``add_bound``; None where that is to be measured."""
+        """Factor c [-] for which c D, D of ``add_bound``, bounds the projected Hessian.
+
+        It is None if it must be measured.
+        """
         return None if self.solid else 2.0
 
     def concavity(self, q: Positions) -> Floats:
-        """Return the diagonal (owned,) [N/m] of a matrix: the Hessian is no less than minus that.
+        """Return a diagonal C >= 0 (owned,) [N/m]: Hessian + C is positive semidefinite at q.
 
-        It is 0 at a node without compressed springs, and where no cell around it is strained.
+        C is 0 at a node without compressed springs or, for a solid, without strained cells.
         """
         concavity = np.zeros(len(q), like=q)
         law = self.solid or self.springs
@@ -74,17 +78,16 @@ class Elasticity:
     ) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].
 
-        projected : without its negative parts, as of compressed springs
-        dtype     : of what is stored of it
+        projected : without its negative parts, so that it is positive semidefinite
+        dtype     : type of the stored numbers
         """
         return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add a block diagonal D, such that the projected Hessian at q is no more than ``bound`` D, to the
-        owned rows of ``blocks`` (l, 9) [N/m].
+        """Add a block diagonal D to the owned rows of ``blocks`` (l, 9) [N/m].
 
-        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its diagonal, and eight of
-        a cell, where it is seldom so much.
+        The projected Hessian at q is at most ``bound`` D. A semidefinite form of n nodes is at most
+        n times its block diagonal: n = 2 for a spring, and 8 for a cell, where less is usual.
         """
         for part in self.parts:
             part.add_bound(q, blocks)
@@ -92,7 +95,7 @@ class Elasticity:
 
 @dataclass(frozen=True)
 class Hessian:
-    """The Hessian of E at one q, ready for many products."""
+    """Hessian of E at a position, ready for many products."""
 
     parts: list[Product]
 

@@ -1,4 +1,4 @@
-"""Location of the worst node or cell, for messages: its point in the body at rest."""
+"""Descriptions of the worst node or cell for messages, with its place in the body at rest."""
 
 import numpy as np
 from mpi4py import MPI
@@ -9,9 +9,10 @@ from msmpetsc.lattice.lattice import Lattice
 
 
 def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: Floats) -> str:
-    """Describe the node where a measure is greatest, or not a number (collective).
+    """Return a description of the node at which a measure is greatest or NaN (collective).
 
-    rows, measure : (k,) local nodes, and what is measured of each
+    rows    : (k,) local nodes
+    measure : (k,) the measure at each
     """
     number, where = _least(
         comm, lattice, rows[:, None], -np.nan_to_num(to_host(measure), nan=np.inf)
@@ -20,9 +21,9 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 
 
 def _least(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) -> tuple[int, str]:
-    """Return where a measure (k,) is least: a node's global number, its place (collective).
+    """Return the global node number and the place at which a measure (k,) is least (collective).
 
-    corners : (k, c) local nodes of what is measured: its place is their mean, its node the first
+    corners : (k, c) local nodes of each item measured; its place is their mean, its node the first
     """
     candidate = np.inf, 0, np.zeros(3)
     if len(corners):
@@ -40,10 +41,11 @@ def _least(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) 
 def worst_inverted(
     comm: MPI.Comm, lattice: Lattice, q: Positions, corners: bool = False
 ) -> tuple[int, str]:
-    """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective).
+    """Return the number of inverted cells at q (l, 3) [m] and the place of the worst (collective).
 
-    A solid's cell is where what is inside the surface is, in the mean: corners of a sliver may fold far outside.
-    By its ``corners`` it is folded, too, where they are while the mean is not.
+    The place is "" if no cell is inverted. A solid's cell is inverted if its mean J, over the part
+    inside the surface, is <= 0: corners outside of the surface may fold. With ``corners`` it counts
+    if any of its corner volumes is <= 0, like a cell of springs.
     """
     cells, solid = lattice.local_cells[: lattice.cells_owned], lattice.solid
     if solid is None or corners:
@@ -57,7 +59,7 @@ def worst_inverted(
 
 
 def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
-    """Return ", 3 cells are inside out", and what to do about it; "" if none is (collective)."""
+    """Return ", 3 cells are inside out" and a remedy, or "" if no cell is inverted (collective)."""
     count, _ = worst_inverted(comm, lattice, q)
     if not count:
         return ""
@@ -67,5 +69,5 @@ def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
 
 
 def of_body(lattice: Lattice, number: int) -> str:
-    """Return "of body.1 ", the body of the node of this global number; "" where there is but one."""
+    """Return "of body.1 " for the body of a node by its global number; "" for a single body."""
     return f"of body.{lattice.body_of(number)} " if len(lattice.first_of_body) > 1 else ""

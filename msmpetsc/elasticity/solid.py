@@ -1,4 +1,4 @@
-"""A neo-Hookean solid on a lattice: what Elasticity asks of a law, by the loops of a CPU or of a GPU."""
+"""A neo-Hookean solid on a lattice, with the methods that Elasticity needs of a law."""
 
 import math
 from collections.abc import Iterator
@@ -31,14 +31,19 @@ from msmpetsc.elasticity.cell_blocks import (
 )
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, linearise, state_at
-from msmpetsc.elasticity.neo_hookean import along_cofactors, corner_stiffness, kept_cofactors, lost
+from msmpetsc.elasticity.neo_hookean import (
+    along_cofactors,
+    concavity_bound,
+    corner_stiffness,
+    kept_cofactors,
+)
 from msmpetsc.elasticity.springs import add_block
 from msmpetsc.lattice.lattice import Lattice
 
 
 @njit(inline="always")
 def _row_of(cells: CellRows, i: int, a: int) -> int:
-    """Return what corner a of cell i adds to."""
+    """Return the row that corner a of cell i adds to."""
     return int(cells.nodes[i, a]) if cells.by_node else (i // LANES * 8 + a) * LANES + i % LANES
 
 
@@ -52,16 +57,20 @@ def _size(a: int, constants: Floats, k: int) -> float:
 def _add_concavity(
     first: int, count: int, step: int, concavity: Rows, cells: CellRows, q: Positions
 ) -> None:
-    """V |G|^2 is no more than sum_a |g_a| (sum_b |g_b|) V |v_a|^2, with g_a the mean slope of corner a."""
+    """Add each cell's share of the concavity bound to its corners.
+
+    With g_a the mean slope of corner a, |G|^2 <= sum_a |g_a| (sum_b |g_b|) |v_a|^2.
+    """
     for i in range(first, count, step):
-        k, sizes = constants_at(cells, i), 0.0
+        k = constants_at(cells, i)
+        sizes = 0.0
         for a in range(8):
             sizes += _size(a, cells.constants, k)
-        taken = sizes * lost(
+        bound = sizes * concavity_bound(
             gradient_at(q, cells, i), cells.constants[k + 104], cells.constants[k + 112]
         )
         for a in range(8):
-            concavity[_row_of(cells, i, a), 0] += taken * _size(a, cells.constants, k)
+            concavity[_row_of(cells, i, a), 0] += bound * _size(a, cells.constants, k)
 
 
 @kernel
@@ -79,13 +88,16 @@ def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: Cell
 
 
 def _loops(array: Array) -> ModuleType:
-    """Return the loops over cells where an array is."""
+    """Return the module with the loops over cells for the device of an array."""
     return cell_lanes if on_host(array) else cell_threads
 
 
 @dataclass(frozen=True)
 class CellHessians:
-    """Hessians of cells, as ``linearise`` leaves them in ``state``: what adds their product with v [N]."""
+    """The Hessian of all cells, from the ``state`` of ``linearise``.
+
+    A call adds the product with v (l, 3) [N] to ``product`` (l, 3).
+    """
 
     blocks: Blocks
     state: Array
@@ -95,11 +107,11 @@ class CellHessians:
 
     @property
     def slopes(self) -> Array:
-        """V U' (b, LANES) of the cells, to be read or written: by it a cell's J bends with F."""
+        """V U' (b, LANES) of the cells, a view: the factor of the Hessian's term F x G."""
         return self.state[:, 9 * LANES : 10 * LANES]
 
     def add_diagonal(self, diagonal: Rows) -> None:
-        """Add the diagonal blocks to ``diagonal`` (l, 9) [N/m], but for what U' adds, which is none."""
+        """Add the diagonal blocks to ``diagonal`` (l, 9) [N/m]; the term of U' has none."""
         cells = one_by_one(self.blocks, self.state)
         count = len(cells.nodes)
         add_corners(
@@ -109,13 +121,13 @@ class CellHessians:
 
 @dataclass(frozen=True)
 class NeoHookean:
-    """The solid of the cells around this rank's nodes."""
+    """A neo-Hookean solid: the cells around this rank's owned nodes."""
 
     blocks: Blocks
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "NeoHookean":
-        """Return the solid of a lattice, in the memory that its nodes are in."""
+        """Return the solid of a lattice, on the device of its nodes."""
         assert lattice.solid is not None
         h4 = 4 * lattice.cell_size
         forms, volume, shear, lame = map(to_host, lattice.solid)
@@ -127,24 +139,24 @@ class NeoHookean:
 
     @property
     def corners(self) -> Indices:
-        """Corner nodes (c, 8) of the cells that this rank owns, in the order of its blocks."""
+        """Corner nodes (c, 8) of the cells that this rank owns, in the order of the blocks."""
         return to_host(self.blocks.nodes)[: self.blocks.owned].reshape(-1, 8)
 
     @property
     def _moduli(self) -> tuple[Array, Array]:
-        """V mu and V lambda (k, LANES) of the cells' constants, to be read or written."""
+        """V mu and V lambda (k, LANES) over 16 h^2 of the cells' constants, as views."""
         rows = self.blocks.constants.reshape(-1, ROWS, LANES)
         return rows[:, ROWS - 2], rows[:, ROWS - 1]
 
     @property
     def stiffest(self) -> float:
-        """The greatest lambda of a cell, in mu."""
+        """The greatest ratio lambda / mu of a cell [-]."""
         mu, lame = self._moduli
         return float(greatest(lame / np.where(mu > 0, mu, 1.0)))
 
     @contextmanager
     def softened(self, ratio: float) -> Iterator[None]:
-        """Take no lambda for more than ``ratio`` mu meanwhile."""
+        """Limit lambda to ``ratio`` mu within the context."""
         mu, lame = self._moduli
         true = lame.copy()
         np.minimum(true, ratio * mu, out=lame)
@@ -162,8 +174,9 @@ class NeoHookean:
         _loops(q).add_gradient(self.blocks, q, gradient)
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
-        """Add to ``concavity`` (l,) [N/m] how much less than 0 the Hessian may be."""
-        cells, of_nodes = one_by_one(self.blocks), concavity.reshape(-1, 1)
+        """Add a bound of the Hessian's negative part to ``concavity`` (l,) [N/m]."""
+        cells = one_by_one(self.blocks)
+        of_nodes = concavity.reshape(-1, 1)
         count = len(cells.nodes)
         add_corners(
             lambda rows: _add_concavity(count, rows, cells, q),
@@ -173,12 +186,15 @@ class NeoHookean:
         )
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
-        """Return what adds (Hessian of E at q) v [N] to its second argument: of F, V U' and V U'' of all cells."""
+        """Return the Hessian of E at q (l, 3) [m], ``projected`` to be positive semidefinite."""
         state: Rows = np.empty((len(self.blocks.nodes), STATE * LANES), dtype, like=q)
         linearise(self.blocks, q, projected, state)
         constants: Rows = self.blocks.constants.astype(dtype, copy=False)
         return CellHessians(self.blocks._replace(constants=constants), state)
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add the diagonal blocks of the projected Hessian to ``blocks`` (l, 9) [N/m]: an eighth of what bounds it."""
+        """Add the diagonal blocks of the projected Hessian at q to ``blocks`` (l, 9) [N/m].
+
+        Eight times these blocks bound the projected Hessian.
+        """
         self.hessian_at(q, True).add_diagonal(blocks)

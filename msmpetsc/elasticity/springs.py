@@ -1,15 +1,15 @@
-"""Elastic energy of springs, its gradient and its Hessian (paper Eq. 13-15): the law of one spring, then two loops.
+"""Elastic energy of linear springs, its gradient and its Hessian (paper Eq. 13-15).
 
-A spring of length l and rest length r pulls with k (l - r). Its energy is 1/2 k (l - r)^2.
+A spring of length l, rest length r and stiffness k has the energy 1/2 k (l - r)^2.
 
-All positions are local, (l, 3) [m]: owned nodes then ghosts. Gradients and products are right at the owned nodes,
-for a rank has every spring of them; the ghosts' rows are not complete and not to be used.
+Positions are local, (l, 3) [m]: owned nodes first, then ghosts. A rank has every spring of its
+owned nodes, so gradients and products are complete in the owned rows. The rows of ghosts are
+incomplete.
 
-Energies are summed spring by spring. Of nodes' forces there are two sums: ``SpringScatter`` takes each spring once and
-adds to both its ends: the CPU's way. ``SpringGather`` lets each node sum over its neighbours, one thread a node: the
-GPU's way, for no two threads write to the same row, so sums come out the same, to the last bit, every time. It stores
-nothing of a Hessian: reading positions again is less than reading the blocks of 26 springs. On a CPU gathering took 1.5
-times as long for a gradient and 6 to 10 times for a product: so there are two loops.
+``SpringScatter`` visits each spring once and adds to both ends: the faster loop on a CPU.
+``SpringGather`` runs a thread per node, which sums over the node's springs: the loop of a GPU. No
+two threads write to the same row, so the sums are reproducible to the last bit. The gather loop
+stores no Hessian blocks, because positions take less memory traffic than the blocks of 26 springs.
 """
 
 import math
@@ -24,15 +24,14 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, lik
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.lattice.lattice import Lattice
 
-Product = Callable[[Array, Array], None]  # adds (a Hessian) v [N] to the second argument
+# product(v, result) adds (Hessian) v [N] to ``result``
+Product = Callable[[Array, Array], None]
 Vector = tuple[float, float, float]
 Four = tuple[float, float, float, float]
 
-SYMMETRIC = np.array(
-    [0, 1, 2, 1, 3, 4, 2, 4, 5]
-)  # where the 9 numbers of a symmetric block stand among 6
-
-# A spring of no length has no direction: it then pulls nothing and its energy stays 1/2 k r^2.
+# index of each entry of a symmetric 3 x 3 block in its upper triangle [-]
+SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+# smallest length to divide by [m]; a spring of zero length then has no force
 TINY = 1e-300
 
 
@@ -44,34 +43,35 @@ def dot(a: Vector, b: Vector) -> float:
 
 @njit()
 def spring_change(before: Vector, d: Vector, r: float, k: float) -> float:
-    """Return the change of 1/2 k (|e| - r)^2 (Eq. 13) [J] of a spring e = before + d."""
+    """Return the change [J] of a spring's energy 1/2 k (|e| - r)^2 (Eq. 13), e = before + d.
+
+    Its change of length d . (e + before) / (|e| + |before|) keeps the digits of a small d.
+    """
     e = before[0] + d[0], before[1] + d[1], before[2] + d[2]
-    length, length_before = math.sqrt(dot(e, e)), math.sqrt(dot(before, before))
-    total = length + length_before
-    longer = (
+    total = math.sqrt(dot(e, e)) + math.sqrt(dot(before, before))
+    elongation = (
         d[0] * (e[0] + before[0]) + d[1] * (e[1] + before[1]) + d[2] * (e[2] + before[2])
     ) / max(total, TINY)
-    return 0.5 * k * longer * (total - 2.0 * r)
+    return 0.5 * k * elongation * (total - 2.0 * r)
 
 
 @njit()
-def spring_pull(e: Vector, r: float, k: float) -> float:
-    """Return f [N/m]: the gradient at the end that a spring e points to is f e."""
+def force_density(e: Vector, r: float, k: float) -> float:
+    """Return the force density f = k (1 - r / |e|) [N/m]: grad E is f e at the end of e."""
     return k * (1.0 - r / max(math.sqrt(dot(e, e)), TINY))
 
 
 @njit()
 def spring_block(spring: Vector, r: float, k: float, projected: bool) -> Four:
-    """Return c, e of a spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
+    """Return c [N/m] and e [sqrt(N/m)] of a spring's Hessian c I + e e^T.
 
-    The Hessian is k along the spring and k (1 - r/l) across the spring, l its length.
-    ``projected`` leaves out the negative part that a compressed spring has across.
+    The eigenvalues are k along the spring and k (1 - r / l) across, with l the spring's length.
+    If ``projected``, the negative eigenvalue of a compressed spring is set to zero.
     """
     length = math.sqrt(max(dot(spring, spring), TINY))
     across = 1.0 - r / length
     if projected:
         across = max(across, 0.0)
-    # Across is at most 1.
     along = math.sqrt(k * (1.0 - across)) / length
     return k * across, along * spring[0], along * spring[1], along * spring[2]
 
@@ -84,7 +84,7 @@ def block_product(c: float, e: Vector, d: Vector) -> Vector:
 
 
 class Springs(NamedTuple):
-    """Local ends (s, 2), rest lengths (s,) [m] and stiffnesses (s,) [N/m] of springs."""
+    """Local end nodes (s, 2), rest lengths (s,) [m] and stiffnesses (s,) [N/m] of springs."""
 
     ends: Indices
     rest_length: Floats
@@ -92,7 +92,7 @@ class Springs(NamedTuple):
 
     @classmethod
     def of_lattice(cls, lattice: Lattice, first: int | None = None) -> "Springs":
-        """Return the first springs of a lattice, or all, in the memory that its nodes are in."""
+        """Return the first ``first`` springs of a lattice, or all, on the device of its nodes."""
         return cls(
             *(
                 like(lattice.nodes, a[:first])
@@ -101,36 +101,39 @@ class Springs(NamedTuple):
         )
 
 
-class Way(NamedTuple):
-    """A way of nodes (l, 3) [m]: from ``base`` to ``end``, and how they ``moved``, which has digits of its own."""
+class Displacement(NamedTuple):
+    """Positions ``base`` and ``end`` of nodes (l, 3) [m], and the displacement ``moved`` [m].
+
+    Energy changes are computed from ``moved``, because it keeps the digits of a small displacement.
+    """
 
     base: Positions
     end: Positions
     moved: Rows
 
     @classmethod
-    def to(cls, end: Positions, base: Positions) -> "Way":
-        """Return the way from ``base`` to ``end``."""
+    def to(cls, end: Positions, base: Positions) -> "Displacement":
+        """Return the displacement from ``base`` to ``end``."""
         return cls(base, end, end - base)
 
 
 @njit(inline="always")
-def between(q: Positions, a: int, b: int) -> Vector:
-    """Return the way from node a to node b."""
+def edge(q: Positions, a: int, b: int) -> Vector:
+    """Return the vector q_b - q_a from node a to node b."""
     return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
 
 
 @kernel
 def _elastic_change(
-    first: int, count: int, step: int, sums: Floats, springs: Springs, way: Way
+    first: int, count: int, step: int, sums: Floats, springs: Springs, displacement: Displacement
 ) -> None:
     ends, rest_length, stiffness = springs
-    base, _, moved = way
+    base, _, moved = displacement
     change = 0.0
     for s in range(first, count, step):
-        before = between(base, ends[s, 1], ends[s, 0])
-        # how the ends moved, from node to node: a difference of springs would keep only the digits of a spring
-        d = between(moved, ends[s, 1], ends[s, 0])
+        before = edge(base, ends[s, 1], ends[s, 0])
+        # The difference of two springs would lose the digits of a small displacement.
+        d = edge(moved, ends[s, 1], ends[s, 0])
         change += spring_change(before, d, rest_length[s], stiffness[s])
     if first < count:
         sums[first] = change
@@ -138,28 +141,34 @@ def _elastic_change(
 
 @dataclass(frozen=True)
 class OwnedSprings:
-    """The springs that a rank owns: their energy, by one sum on a CPU and by one of each thread on a GPU."""
+    """The springs that a rank owns, and their energy."""
 
     owned: Springs
 
     def change(self, q: Positions, base: Positions) -> float:
-        """Return E(q) - E(base) [J] of these springs, summed spring by spring so that a small change keeps its
-        digits."""
-        count, ends = len(self.owned.ends), self.owned.ends
+        """Return E(q) - E(base) [J] of the owned springs.
+
+        The change is summed spring by spring, so a small change keeps its digits.
+        """
+        ends = self.owned.ends
+        count = len(ends)
         sums = np.zeros(1 if on_host(ends) else count, like=ends, dtype=float)
-        _elastic_change(count, sums, self.owned, Way.to(q, base))
+        _elastic_change(count, sums, self.owned, Displacement.to(q, base))
         return float(sums.sum())
 
 
 @dataclass(frozen=True)
 class SpringScatter(OwnedSprings):
-    """The springs of a rank one after another, those that it owns first: how a CPU sums them."""
+    """Spring forces and Hessians on a CPU: a loop over springs that adds to both ends.
+
+    springs : the springs around the owned nodes; the springs that the rank owns come first
+    """
 
     springs: Springs
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringScatter":
-        """Return the springs of a lattice whose arrays are in the memory of the CPU."""
+        """Return the springs of a lattice whose arrays are in CPU memory."""
         return cls(Springs.of_lattice(lattice, lattice.springs_owned), Springs.of_lattice(lattice))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
@@ -167,17 +176,17 @@ class SpringScatter(OwnedSprings):
         add_elastic_gradient(q, self.springs, gradient)
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
-        """Add to ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
+        """Add the bound of ``add_spring_concavity`` to ``concavity`` (l,) [N/m]."""
         add_spring_concavity(q, self.springs, concavity)
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
-        """Return what adds (Hessian of E at q) v [N] to its second argument; its blocks are stored."""
+        """Return the product with the Hessian of E at q, from stored blocks of type ``dtype``."""
         blocks: Rows = np.empty((len(self.springs.ends), 4), dtype)
         elastic_hessian(q, self.springs, projected, blocks)
         return partial(add_elastic_product, self.springs.ends, blocks)
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add what Elasticity.add_bound says to ``blocks`` (l, 9) [N/m]."""
+        """Add the springs' part of Elasticity.add_bound to ``blocks`` (l, 9) [N/m]."""
         add_elastic_diagonal(q, self.springs, blocks)
 
 
@@ -188,8 +197,8 @@ def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None
     for s in range(len(ends)):
         a = ends[s, 0]
         b = ends[s, 1]
-        e = between(q, b, a)
-        f = spring_pull(e, rest_length[s], stiffness[s])
+        e = edge(q, b, a)
+        f = force_density(e, rest_length[s], stiffness[s])
         gradient[a, 0] += f * e[0]
         gradient[a, 1] += f * e[1]
         gradient[a, 2] += f * e[2]
@@ -200,28 +209,29 @@ def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None
 
 @njit()
 def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> None:
-    """Add to ``concavity`` (l,) [N/m], at both ends of each compressed spring, twice what it pushes across itself.
+    """Add 2 |c| of each compressed spring to ``concavity`` (l,) [N/m] at both ends.
 
-    With d = v_a - v_b a spring's Hessian c I + e e^T makes, for c < 0,
+    c I + e e^T is the spring's Hessian. For c < 0 and d = v_a - v_b it has the lower bound
     c |d|^2 + (e . d)^2 >= -2 |c| (|v_a|^2 + |v_b|^2).
     """
     ends, rest_length, stiffness = springs
     for s in range(len(ends)):
-        e = between(q, ends[s, 1], ends[s, 0])
-        push = -2.0 * min(spring_pull(e, rest_length[s], stiffness[s]), 0.0)
-        concavity[ends[s, 0]] += push  # also where there is none: to step over these takes longer
-        concavity[ends[s, 1]] += push
+        e = edge(q, ends[s, 1], ends[s, 0])
+        bound = -2.0 * min(force_density(e, rest_length[s], stiffness[s]), 0.0)
+        # A branch around a zero bound would take longer than the addition.
+        concavity[ends[s, 0]] += bound
+        concavity[ends[s, 1]] += bound
 
 
 @njit()
 def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Rows) -> None:
-    """Write the Hessian of E at q as the c and e of ``spring_block`` into ``blocks`` (s, 4).
+    """Write c and e of ``spring_block`` at q for each spring into ``blocks`` (s, 4).
 
-    projected : makes the whole positive semidefinite
+    projected : without negative eigenvalues, so that the Hessian is positive semidefinite
     """
     ends, rest_length, stiffness = springs
     for s in range(len(ends)):
-        e = between(q, ends[s, 1], ends[s, 0])
+        e = edge(q, ends[s, 1], ends[s, 0])
         block = spring_block(e, rest_length[s], stiffness[s], projected)
         for i in range(4):
             blocks[s, i] = block[i]
@@ -232,7 +242,7 @@ def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
     ends, rest_length, stiffness = springs
     for s in range(len(ends)):
-        e = between(q, ends[s, 1], ends[s, 0])
+        e = edge(q, ends[s, 1], ends[s, 0])
         c, ex, ey, ez = spring_block(e, rest_length[s], stiffness[s], True)
         for end in range(2):
             add_block(blocks[ends[s, end]], c, 1.0, (ex, ey, ez))
@@ -240,12 +250,13 @@ def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
 
 @njit()
 def add_elastic_product(ends: Indices, blocks: Rows, v: Rows, product: Rows) -> None:
-    """Add (Hessian of E) v [N] to ``product`` (l, 3), its ``blocks`` those of elastic_hessian.
+    """Add (Hessian of E) v [N] to ``product`` (l, 3), from the ``blocks`` of ``elastic_hessian``.
 
-    Springs of the same first end follow each other: what they have in common is read and written once.
+    Springs with the same first end are consecutive, so its row is read and written once.
     """
-    none = v.dtype.type(0)  # so that single precision stays single
-    first, x, y, z, sx, sy, sz = -1, none, none, none, none, none, none
+    # A zero of v's own type keeps single precision single.
+    zero = v.dtype.type(0)
+    first, x, y, z, sx, sy, sz = -1, zero, zero, zero, zero, zero, zero
     for s in range(len(ends)):
         a = ends[s, 0]
         b = ends[s, 1]
@@ -254,7 +265,7 @@ def add_elastic_product(ends: Indices, blocks: Rows, v: Rows, product: Rows) -> 
                 product[first, 0] += sx
                 product[first, 1] += sy
                 product[first, 2] += sz
-            first, x, y, z, sx, sy, sz = a, v[a, 0], v[a, 1], v[a, 2], none, none, none
+            first, x, y, z, sx, sy, sz = a, v[a, 0], v[a, 1], v[a, 2], zero, zero, zero
         d = x - v[b, 0], y - v[b, 1], z - v[b, 2]
         fx, fy, fz = block_product(blocks[s, 0], (blocks[s, 1], blocks[s, 2], blocks[s, 3]), d)
         sx += fx
@@ -278,12 +289,12 @@ def add_block(block: Floats, c: float, factor: float, g: Vector) -> None:
 
 
 class Around(NamedTuple):
-    """The springs around each owned node, a column of the arrays for each.
+    """The springs of each owned node, a column of the arrays per node.
 
-    neighbour : (w, owned) int32, local number of the node at the far end, -1 past the last
-    kind      : (w, owned) u1, which of the lengths
+    neighbour : (w, owned) int32, local number of the node at the other end, -1 past the last spring
+    kind      : (w, owned) u1, index of the rest length in ``lengths``
     stiffness : (w, owned) [N/m]
-    lengths   : (k,) rest lengths [m]
+    lengths   : (k,) distinct rest lengths [m]
     """
 
     neighbour: Indices
@@ -293,7 +304,10 @@ class Around(NamedTuple):
 
 
 class AroundAt(NamedTuple):
-    """These springs at positions q (l, 3) [m], linearised there, ``projected`` without the negative parts."""
+    """The springs of each owned node at positions q (l, 3) [m], as kernels take them.
+
+    projected : leave out the negative eigenvalues of the Hessian
+    """
 
     around: Around
     q: Positions
@@ -302,13 +316,13 @@ class AroundAt(NamedTuple):
 
 @dataclass(frozen=True)
 class SpringGather(OwnedSprings):
-    """The springs around each owned node: how a GPU sums them."""
+    """Spring forces and Hessians on a GPU: a thread per node sums over the node's springs."""
 
     around: Around
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringGather":
-        """Return the springs of a lattice, in the memory that its nodes are in."""
+        """Return the springs of a lattice, on the device of its nodes."""
         springs = to_host(lattice.springs)
         ends = np.concatenate([springs, springs[:, ::-1]])
         rows = rows_of(ends[:, 0], lattice.owned)
@@ -328,22 +342,25 @@ class SpringGather(OwnedSprings):
         self._sum_around(_gradient_around, gradient, q)
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
-        """Add to the owned rows of ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
+        """Add the bound of ``add_spring_concavity`` to the owned rows (l,) [N/m]."""
         self._sum_around(_concavity_around, concavity, q)
 
     def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
-        """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
+        """Return the product with the Hessian of E at q, for the owned rows. It stores q alone."""
         springs = AroundAt(self.around, q.copy(), projected)
         count = self.around.neighbour.shape[1]
         return lambda v, product: _product_around(count, product, springs, v)
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add what Elasticity.add_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
+        """Add the springs' part of Elasticity.add_bound to the owned rows (l, 9) [N/m]."""
         self._sum_around(_diagonal_around, blocks, q)
 
 
 def rows_of(nodes: Indices, owned: int) -> Indices:
-    """Return which rows of ``nodes`` (n,) are each owned node's, (8 or more, owned); n past the last."""
+    """Return the indices (w, owned) at which each owned node occurs in ``nodes`` (n,).
+
+    w is at least 8. A column is filled up with n after the node's last occurrence.
+    """
     by_node = np.argsort(nodes, kind="stable")
     by_node = by_node[: np.searchsorted(nodes[by_node], owned)]
     node = nodes[by_node]
@@ -362,8 +379,8 @@ def _gradient_around(first: int, count: int, step: int, gradient: Rows, springs:
             j = neighbour[s, i]
             if j < 0:
                 break
-            e = between(q, j, i)
-            f = spring_pull(e, lengths[kind[s, i]], stiffness[s, i])
+            e = edge(q, j, i)
+            f = force_density(e, lengths[kind[s, i]], stiffness[s, i])
             gx += f * e[0]
             gy += f * e[1]
             gz += f * e[2]
@@ -384,7 +401,7 @@ def _concavity_around(
             if j < 0:
                 break
             total -= 2.0 * min(
-                spring_pull(between(q, j, i), lengths[kind[s, i]], stiffness[s, i]), 0.0
+                force_density(edge(q, j, i), lengths[kind[s, i]], stiffness[s, i]), 0.0
             )
         concavity[i] += total
 
@@ -401,8 +418,8 @@ def _product_around(
             if j < 0:
                 break
             length, k = lengths[kind[s, i]], stiffness[s, i]
-            c, ex, ey, ez = spring_block(between(q, j, i), length, k, projected)
-            f = block_product(c, (ex, ey, ez), between(v, j, i))
+            c, ex, ey, ez = spring_block(edge(q, j, i), length, k, projected)
+            f = block_product(c, (ex, ey, ez), edge(v, j, i))
             px += f[0]
             py += f[1]
             pz += f[2]
@@ -420,5 +437,5 @@ def _diagonal_around(first: int, count: int, step: int, blocks: Rows, springs: A
             if j < 0:
                 break
             length, k = lengths[kind[s, i]], stiffness[s, i]
-            c, ex, ey, ez = spring_block(between(q, j, i), length, k, True)
+            c, ex, ey, ez = spring_block(edge(q, j, i), length, k, True)
             add_block(blocks[i], c, 1.0, (ex, ey, ez))

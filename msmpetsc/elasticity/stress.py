@@ -1,12 +1,14 @@
-"""Stress of a neo-Hookean solid: of each cell, and at each node the mean over the cells around it.
+"""Stress of a neo-Hookean solid, in each cell and at each node.
 
-With F the mean deformation gradient of a cell, J = det F and U of elasticity.neo_hookean, the first Piola-Kirchhoff and
-the Cauchy stress are (Bonet and Wood 2008, chapter 5)
+F is the mean deformation gradient of a cell, J = det F, and U is that of elasticity.neo_hookean.
+The first Piola-Kirchhoff and the Cauchy stress are (Bonet and Wood 2008, chapter 5)
 
-    P = mu F + U' cof F,        sigma = P F^T / J = mu / J F F^T + U' I,
+    P = mu F + U' cof F,        sigma = P F^T / J = mu / J F F^T + U' I.
 
-the pressure -tr(sigma) / 3, and von Mises' stress (3/2 |sigma + p I|^2)^(1/2). The mean at a node is by the cells'
-volume at rest. It is what to look at where a solid is nearly incompressible: pressures may alternate from cell to cell.
+The pressure is p = -tr(sigma) / 3, von Mises' stress is (3/2 |sigma + p I|^2)^(1/2). The stress at
+a node is the mean over the cells around it, weighted by their volume at rest. In nearly
+incompressible solids prefer the nodes' stress, because the cells' pressures may alternate from cell
+to cell.
 """
 
 from typing import Any
@@ -22,14 +24,15 @@ from msmpetsc.elasticity.neo_hookean import ONSET
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.lattice.lattice import Lattice
 
-UPPER = np.array([0, 4, 8, 1, 5, 2])  # xx, yy, zz, xy, yz, xz of a tensor's nine
+# indices of xx, yy, zz, xy, yz, xz among nine entries [-]; the result file's order
+UPPER = np.array([0, 4, 8, 1, 5, 2])
 
 
 class StressField:
-    """The fields of stress that a frame has (fields.Frame), of one rank's part of a lattice.
+    """The stress fields of a frame (fields.Frame), for this rank's part of a lattice.
 
-    lanes  : (d,) where each of the lattice's ``local_cells`` stands in the solid's blocks
-    around : (owned, d) of each node the weights of the cells around it, which sum to 1
+    lanes  : (d,) index of each of the lattice's ``local_cells`` in the solid's blocks
+    around : (owned, d) sparse, weights of the cells around each node; rows sum to 1
     """
 
     def __init__(self, lattice: Lattice, solid: NeoHookean):
@@ -37,9 +40,8 @@ class StressField:
         self.solid, self.cells, self.cells_owned = solid, lattice.solid, lattice.cells_owned
         self.rest = lattice.nodes
         corners, of_blocks = to_host(lattice.local_cells), to_host(solid.blocks.nodes)
-        first, lanes = np.unique(
-            of_blocks[:, :, 0], return_index=True
-        )  # before the lanes that fill up
+        # The first occurrence of a cell comes before the copies that fill up a block.
+        first, lanes = np.unique(of_blocks[:, :, 0], return_index=True)
         self.lanes = lanes[np.searchsorted(first, corners[:, 0])]
         weights, number = np.repeat(self.cells.volume, 8), np.repeat(np.arange(len(corners)), 8)
         around = csr_array(
@@ -49,17 +51,15 @@ class StressField:
         self.around.data /= np.repeat(self.around.sum(axis=1), np.diff(self.around.indptr))
 
     def __call__(self, q: Positions) -> dict[str, Any]:
-        """Return the fields at q (l, 3) [m]: of owned nodes, and by ``cell_...`` of the cells that this rank owns.
+        """Return the fields at q (l, 3) [m] of owned nodes, and as ``cell_...`` of owned cells.
 
-        A stress is a row (6,) of xx, yy, zz, xy, yz, xz [Pa]; strain energies are [J/m^3] of volume at rest. Below J_0,
-        where U is no solid's any more, J_0 stands for J, so that the stress stays finite.
+        A stress is a row (6,) of xx, yy, zz, xy, yz, xz [Pa]. Strain energies are [J/m^3] of volume
+        at rest. If J is below J_0, it is replaced by J_0, so that the stress stays finite.
         """
         rows = to_host(self.solid.hessian_at(q, False).state)
         state = rows.reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
-        f, slope = (
-            state[:, :9].reshape(-1, 3, 3),
-            state[:, 9] * self.solid.blocks.h4**2 / self.cells.volume,
-        )
+        f = state[:, :9].reshape(-1, 3, 3)
+        slope = state[:, 9] * self.solid.blocks.h4**2 / self.cells.volume
         share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
         stress: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
         stress[:, :3] += slope[:, None]
@@ -75,7 +75,7 @@ class StressField:
 
 
 def _fields(stress: Rows, energy: Floats) -> dict[str, Any]:
-    """Return what is known by stresses (k, 6) [Pa] and energies (k,) [J/m^3]."""
+    """Return stresses (k, 6) [Pa], their invariants (k,) [Pa] and energies (k,) [J/m^3] by name."""
     pressure = -stress[:, :3].mean(axis=1)
     deviator = np.concatenate(
         [stress[:, :3] + pressure[:, None], np.sqrt(2) * stress[:, 3:]], axis=1

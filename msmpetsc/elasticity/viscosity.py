@@ -1,12 +1,14 @@
-"""Viscosity of a neo-Hookean solid in an implicit step: that of Kelvin and Voigt, cell by cell.
+"""Kelvin-Voigt viscosity of a neo-Hookean solid in an implicit step of length tau.
 
-With K the Hessian of E at rest, of mean strains alone and turned as each cell has turned, the step's
+K is the Hessian of E at rest for mean strains alone, each cell's part rotated as the cell has
+rotated. With x^ the positions before the step, the step's dissipation potential is
 
-    D(x) = beta / (2 tau) (x - x^)^T K (x - x^)
+    D(x) = beta / (2 tau) (x - x^)^T K (x - x^).
 
-adds the forces beta K v, v = (x - x^) / tau: the viscosities are beta mu and beta lambda. A cell that turns alone costs
-nothing but for what its turn was not foreseen. D is convex, and its K constant in a step. Modes of a cell are left out:
-they turn with it, and would have to be turned, too. Of n cells across they are 1 / n^2 of a bend.
+It adds the forces beta K v, v = (x - x^) / tau, so the viscosities are beta mu and beta lambda. K
+is constant within a step, so D is convex. A rigid rotation dissipates only as far as it differs
+from the rotation given to ``Viscosity.begin``. The modes of a cell are left out, because K would
+have to rotate them, too. In a bend over n cells their share is 1 / n^2.
 """
 
 import numpy as np
@@ -24,33 +26,40 @@ from msmpetsc.elasticity.solid import CellHessians, NeoHookean
 def _turned_states(
     first: int, count: int, step: int, q: Positions, cells: CellRows, state: Floats
 ) -> None:
-    """Write what a Hessian keeps of cells at rest, turned as those at q (l, 3) [m].
+    """Write the state of cells at rest, rotated as the cells at q (l, 3) [m], for their Hessians.
 
-    Cells that are flat or inside out have no rotation: K is not turned then, nor does it forgive a turn.
+    A flat or inverted cell has no rotation. Its K is not rotated, and resists rotations, too.
     """
     for i in range(first, count, step):
-        k, (r, turns) = constants_at(cells, i), rotation_of(gradient_at(q, cells, i))
+        k = constants_at(cells, i)
+        r, has_rotation = rotation_of(gradient_at(q, cells, i))
         m = cells.constants[k + 104]
-        write_state(state, state_at(i), r, -m if turns else 0.0, m + cells.constants[k + 112])
+        slope = -m if has_rotation else 0.0
+        write_state(state, state_at(i), r, slope, m + cells.constants[k + 112])
 
 
 class Viscosity:
-    """D of a step: what Elasticity asks of a law.
+    """The dissipation potential D of a step, with the methods that Elasticity needs of a law.
 
-    factor : beta / tau
+    factor : beta / tau [-]
     owned  : number of nodes that this rank owns
-    before : x^ (l, 3) [m]; at first the nodes at rest
+    before : x^ (l, 3) [m], the positions before the step; the rest positions until ``begin``
     """
 
     def __init__(self, solid: NeoHookean, factor: float, owned: int, before: Positions):
         constants = solid.blocks.constants.copy().reshape(-1, ROWS, LANES)
-        constants[:, 6 : ROWS - 2] = 0.0  # modes
+        # K leaves out the modes.
+        constants[:, 6 : ROWS - 2] = 0.0
         constants[:, ROWS - 2 :] *= factor
         self.blocks = solid.blocks._replace(constants=constants.reshape(len(constants), -1))
         self.owned, self.before, self.hessian = owned, before, self._turned_as(before)
 
     def begin(self, before: Positions, turned: Positions) -> None:
-        """Take the data of a new step: x^ (l, 3) [m], and positions (l, 3) whose cells have turned as in the step."""
+        """Begin a step: set x^ to ``before``, and rotate K as the cells are at ``turned``.
+
+        before : (l, 3) [m]
+        turned : (l, 3) [m], predicted positions of the step
+        """
         self.before, self.hessian = before, self._turned_as(turned)
 
     def _turned_as(self, q: Positions) -> CellHessians:
@@ -63,13 +72,13 @@ class Viscosity:
         return self.change(q, self.before)
 
     def change(self, q: Positions, base: Positions) -> float:
-        """Return this rank's part of D(q) - D(base) [J], that of its nodes' forces."""
-        both, product, owned = (
-            (q - self.before) + (base - self.before),
-            np.zeros_like(q),
-            self.owned,
-        )
-        self.hessian(both, product)
+        """Return this rank's part of D(q) - D(base) [J], by the forces on its owned nodes.
+
+        D(q) - D(base) = 1/2 (q - base)^T H ((q - x^) + (base - x^)), with H the Hessian of D.
+        """
+        owned = self.owned
+        product = np.zeros_like(q)
+        self.hessian((q - self.before) + (base - self.before), product)
         return 0.5 * float(np.vdot(q[:owned] - base[:owned], product[:owned]))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
@@ -77,12 +86,12 @@ class Viscosity:
         self.hessian(q - self.before, gradient)
 
     def hessian_at(self, _: Positions, __: bool, dtype: type = np.float64) -> CellHessians:
-        """Return what adds (Hessian of D) v [N] to its second argument."""
+        """Return the Hessian of D, in numbers of type ``dtype``."""
         constants: Rows = self.blocks.constants.astype(dtype, copy=False)
         return CellHessians(
             self.blocks._replace(constants=constants), self.hessian.state.astype(dtype, copy=False)
         )
 
     def add_bound(self, _: Positions, blocks: Rows) -> None:
-        """Add the diagonal blocks of the Hessian to ``blocks`` (l, 9) [N/m]."""
+        """Add the diagonal blocks of the Hessian of D to ``blocks`` (l, 9) [N/m]."""
         self.hessian.add_diagonal(blocks)

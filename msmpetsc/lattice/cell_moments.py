@@ -1,24 +1,31 @@
-"""Strain within a cell that the surface cuts: its mean, and the four modes that the mean does not see.
+"""Strain within a cut cell: its mean over the part inside the surface, and four hourglass modes.
 
-Corner a of a cell stands at s / 2 from its middle, s_x, s_y, s_z = -1 or 1, in cells. Of the corners' values u_a there
-are the seven sums  X = sum s_x u,  Y,  Z,  XY = sum s_x s_y u,  XZ,  YZ,  XYZ, and of the trilinear u within the cell
+Lengths are in cells, and the origin is the cell's centre. Corner a is at s / 2, with s_x, s_y and
+s_z equal to -1 or 1. The corner values u_a have the seven sums
+
+    X = sum s_x u,  Y,  Z,  XY = sum s_x s_y u,  XZ,  YZ,  XYZ = sum s_x s_y s_z u,
+
+and the trilinear u within the cell has the slope
 
     du/dx = 1/4 (X + 2 y XY + 2 z XZ + 4 y z XYZ).
 
-With c the centroid of what is inside, C its covariance and <> a mean over it, the mean slope is, exactly,
+c is the centroid of the part inside the surface, C its covariance and <> the mean over it. The mean
+slope is exactly
 
-    4 <du/dx> = X + 2 c_y XY + 2 c_z XZ + 4 <y z> XYZ,
+    4 <du/dx> = X + 2 c_y XY + 2 c_z XZ + 4 <y z> XYZ.
 
-and what is left is, with h_xy = XY + 2 c_z XYZ, h_xz and h_yz alike,
+The modes are h_xy = XY + 2 c_z XYZ, h_xz, h_yz and XYZ. They give the rest of the slope:
 
     4 (du/dx - <du/dx>) = 2 (y - c_y) h_xy + 2 (z - c_z) h_xz + 4 ((y - c_y) (z - c_z) - C_yz) XYZ.
 
-The sum over x, y, z of its mean square is taken as a form of the modes, third moments left out and fourth ones as of
-independent coordinates: exact in a whole cell (Flanagan and Belytschko 1981; Belytschko and Bindeman 1993),
+Its mean square, summed over x, y and z, is approximated by a quadratic form of the modes. Third
+moments are neglected, and fourth moments are those of independent coordinates. The form is exact in
+a whole cell (Flanagan and Belytschko 1981; Belytschko and Bindeman 1993). 16 times the form is
 
-    16 (...) = 4 (C_xx + C_yy) h_xy^2 + 8 C_yz h_xy h_xz + ... + 16 (C_xx C_yy + C_xx C_zz + C_yy C_zz) XYZ^2.
+    4 (C_xx + C_yy) h_xy^2 + 8 C_yz h_xy h_xz + ... + 16 (C_xx C_yy + C_xx C_zz + C_yy C_zz) XYZ^2.
 
-It is three sums like (h_xy, h_xz) [C_yy C_yz; C_yz C_zz] (h_xy, h_xz)^T, and so not negative, as a covariance is not.
+It is positive semidefinite because C is: it consists of three forms like
+(h_xy, h_xz) [C_yy C_yz; C_yz C_zz] (h_xy, h_xz)^T, and a multiple of XYZ^2.
 """
 
 import numpy as np
@@ -26,21 +33,31 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Rows
 from msmpetsc.lattice.cut_cells import CORNERS
 
-FORM = 13  # numbers of a cell's form: 2 c (3), 4 <xy>, <xz>, <yz>, then the modes' form of ``forms_of``
+# columns of ``forms_of`` [-]
+FORM = 13
+# s (8, 3) of the corners [-]
 SIGNS = 2.0 * CORNERS - 1
+# axes of XY, XZ and YZ [-]
 PAIRS = ((0, 1), (0, 2), (1, 2))
-SUMS = np.stack(
-    [*SIGNS.T, *(SIGNS[:, i] * SIGNS[:, j] for i, j in PAIRS), SIGNS.prod(axis=1)]
-)  # (7, 8) of the corners
-WHOLE = np.array([*[0.0] * 6, *[2 / 3] * 3, *[0.0] * 3, 1 / 3])  # form of a whole cell
+# coefficients (7, 8) of the seven sums [-]
+SUMS = np.stack([*SIGNS.T, *(SIGNS[:, i] * SIGNS[:, j] for i, j in PAIRS), SIGNS.prod(axis=1)])
+# row of ``forms_of`` for a whole cell [-]; its variances are 1/12
+WHOLE = np.array([*[0.0] * 6, *[2 / 3] * 3, *[0.0] * 3, 1 / 3])
 
 
 def forms_of(share: Rows, squares: Rows) -> Rows:
-    """Return the forms (c, FORM) of cells by their corners' shares (c, 8) and their squares (c, 3) (fill_fractions).
+    """Return the strain form (c, FORM) of cells: mean slopes, then the quadratic form of the modes.
 
-    Columns: 2 c_x, 2 c_y, 2 c_z; 4 <xy>, 4 <xz>, 4 <yz>; 4 (C_xx + C_yy), 4 (C_xx + C_zz), 4 (C_yy + C_zz);
-    4 C_yz, 4 C_xz, 4 C_xy, which couple the first mode with the second, the first with the third, and these two;
-    16 (C_xx C_yy + C_xx C_zz + C_yy C_zz).
+    The columns are
+
+        2 c_x, 2 c_y, 2 c_z,
+        4 <x y>, 4 <x z>, 4 <y z>,
+        4 (C_xx + C_yy), 4 (C_xx + C_zz), 4 (C_yy + C_zz),    the modes' diagonal
+        4 C_yz, 4 C_xz, 4 C_xy,                               modes 1 and 2, 1 and 3, 2 and 3
+        16 (C_xx C_yy + C_xx C_zz + C_yy C_zz)                the mode XYZ
+
+    share   : (c, 8) shares of the corners (geometry.fill_fractions)
+    squares : (c, 3) integrals of x^2, y^2 and z^2 over the part inside (geometry.fill_fractions)
     """
     volume = share.mean(axis=1, keepdims=True)
     middle, products = (
@@ -51,9 +68,8 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
         covariance[:, k, k] = squares[:, k] / volume[:, 0] - middle[:, k] ** 2
     for k, (i, j) in enumerate(PAIRS):
         covariance[:, i, j] = covariance[:, j, i] = products[:, k] - middle[:, i] * middle[:, j]
-    values, vectors = np.linalg.eigh(
-        covariance
-    )  # of bodies that overlap the shares are cut at 1: then it may be none
+    # Shares are cut at 1 if bodies overlap: a covariance may then be indefinite.
+    values, vectors = np.linalg.eigh(covariance)
     covariance = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     x, y, z = covariance[:, range(3), range(3)].T
     coupled = 4 * np.stack([covariance[:, 1, 2], covariance[:, 0, 2], covariance[:, 0, 1]], axis=1)
@@ -64,8 +80,12 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
 
 
 def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:
-    """Return, of corner values, 4 times the mean slopes (c, 3, 8) of cells in cell units, and their modes (c, 4, 8)."""
-    (cx, cy, cz), (xy, xz, yz) = forms[:, :3].T[:, :, None], forms[:, 3:6].T[:, :, None]
+    """Return the operators from corner values to strain, in units of cells.
+
+    They are 4 times the mean slopes (c, 3, 8), and the modes (c, 4, 8).
+    """
+    cx, cy, cz = forms[:, :3].T[:, :, None]
+    xy, xz, yz = forms[:, 3:6].T[:, :, None]
     x, y, z, of_xy, of_xz, of_yz, of_xyz = SUMS
     slopes = (
         x + (cy * of_xy + cz * of_xz + yz * of_xyz),
@@ -77,9 +97,11 @@ def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:
 
 
 def laplacians(forms: Rows, volume: Floats) -> Rows:
-    """Return the integrals (c, 8, 8) of grad N_a . grad N_b over what is inside of cells, in cell units.
+    """Return the stiffness matrices (c, 8, 8) of the Laplacian on cut cells, in units of cells.
 
-    volume : (c,) of what is inside, of a whole cell's
+    The entries are the integrals of grad N_a . grad N_b over the part inside the surface.
+
+    volume : (c,) fraction of each cell that lies inside [-]
     """
     slopes, modes = slopes_and_modes(forms)
     form = np.zeros((len(forms), 4, 4))

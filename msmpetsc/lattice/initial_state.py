@@ -1,4 +1,4 @@
-"""State of bodies at time 0: positions and velocities of their nodes."""
+"""Initial state of bodies: positions and velocities of their nodes at time 0."""
 
 from collections.abc import Sequence
 
@@ -10,19 +10,18 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.motion import Start, Twist
 
-InitialState = tuple[
-    Positions, Rows
-]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
+# positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
+InitialState = tuple[Positions, Rows]
 
 
 def initial_state(
     comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
 ) -> InitialState:
-    """Return positions and velocities of nodes by the starts of their bodies (collective).
+    """Return initial positions and velocities of nodes from their bodies' starts (collective).
 
-    starts : of each body; None: at rest
-    held   : (l,) bool, nodes that stay at rest where they are
-    bounds : (b, 2, 3) each body's bounding box at rest [m]
+    starts : the start of each body; None for a body at rest
+    held   : (l,) bool, nodes that stay at rest in their rest positions
+    bounds : (b, 2, 3) bounding box of each body at rest [m]
     """
     velocity = np.zeros_like(lattice.nodes)
     if not any(starts):
@@ -36,14 +35,19 @@ def initial_state(
             q[own[held[own]]] = lattice.nodes[own[held[own]]]
             mass = lattice.mass[own[:owned]]
             total: Floats = comm.allreduce(np.append(mass @ q[own[:owned]], mass.sum()))
-            middle = total[:3] / total[3]  # the centre of mass
-            velocity[own] = np.array(start.velocity) + np.cross(start.spin, q[own] - middle)
+            centre_of_mass = total[:3] / total[3]
+            velocity[own] = np.array(start.velocity) + np.cross(start.spin, q[own] - centre_of_mass)
     velocity[held] = 0
     return q, velocity
 
 
 def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Positions:
-    """Return the initial positions (n, 3) [m] of a body's nodes, by their global numbers (n,)."""
+    """Return the initial positions (n, 3) [m] of a body's nodes, scaled, twisted and scattered.
+
+    nodes   : (n, 3) rest positions [m]
+    numbers : (n,) global numbers, which seed the scatter
+    bounds  : (2, 3) bounding box of the body at rest [m]
+    """
     middle = bounds.mean(axis=0)
     q: Positions = middle + np.array(start.scale) * (nodes - middle)
     if start.twist is not None:
@@ -55,12 +59,13 @@ def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Pos
 
 
 def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Positions:
-    """Return q (n, 3) [m] turned about the axis through the middle of the bounds.
+    """Return q (n, 3) [m] twisted about the axis through the centre of the bounds.
 
-    The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin,
-    all degrees where they end.
+    The angle grows linearly along the axis with the rest positions ``nodes`` (n, 3). It is 0 at the
+    beginning of the bounds and ``twist.degrees`` at their end.
     """
-    a, middle = np.array(twist.axis) / np.linalg.norm(twist.axis), bounds.mean(axis=0)
+    a = np.array(twist.axis) / np.linalg.norm(twist.axis)
+    middle = bounds.mean(axis=0)
     extent = np.abs(a) @ (bounds[1] - bounds[0])
     angle = np.radians(twist.degrees) * ((nodes - middle) @ a / extent + 0.5)[:, None]
     turned: Positions = middle + Rotation.from_rotvec(angle * a).apply(q - middle)
@@ -68,9 +73,9 @@ def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Posit
 
 
 def uniform(numbers: Indices) -> Rows:
-    """Return three random numbers in [0, 1) for each global node number (n,), (n, 3), whatever ranks there are.
+    """Return random numbers (n, 3) in [0, 1) that depend on the global node numbers (n,) alone.
 
-    SplitMix64 (Steele, Lea and Flood 2014), its number 3 n + c.
+    Component c of node n is number 3 n + c of SplitMix64 (Steele, Lea and Flood 2014).
     """
     z = (3 * numbers[:, None] + np.arange(1, 4)).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

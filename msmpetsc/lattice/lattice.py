@@ -1,7 +1,7 @@
 """The lattice of a body: cell corners become masses, pairs of corners within a cell become springs.
 
-Each rank holds the nodes it owns, the ghost nodes that its springs reach, and every spring with an
-end that it owns. Global node numbers follow Morton order, so they do not depend on the number of ranks.
+Each rank holds its owned nodes, every spring of an owned node, and the ghost nodes at their other
+ends. Global node numbers follow Morton order, so they do not depend on the number of ranks.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,17 +27,18 @@ from msmpetsc.lattice.material import (
 )
 from msmpetsc.scene.body import Material
 
-# the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a
+# direction (8, 8) from corner a to b [-]; an index into the 3 x 3 x 3 nodes around a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
+# kind (27,) of the spring in each direction [-]: its squared length in cells
 KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
 NO_CELLS = np.empty((0, 8), np.int64)
 
 
 class SolidCells(NamedTuple):
-    """What a law of solids takes of each of a lattice's ``local_cells`` (elasticity.neo_hookean).
+    """Constants of a solid for each of a lattice's ``local_cells`` (elasticity.neo_hookean).
 
-    forms  : (d, 13) of strain within a cell (lattice.cell_moments)
-    volume : (d,) of what is inside the surface [m^3]
+    forms  : (d, 13) strain forms of the cells (lattice.cell_moments)
+    volume : (d,) volume inside the surface [m^3]
     shear, lame : (d,) mu and lambda [Pa]
     """
 
@@ -49,26 +50,26 @@ class SolidCells(NamedTuple):
 
 @dataclass(frozen=True)
 class Lattice:
-    """This rank's part of a lattice. Local node numbers: the ``owned`` nodes first, then the ghosts.
+    """This rank's part of a lattice. Local numbers begin with the ``owned`` nodes; ghosts follow.
 
-    table       : global node numbers by grid key; ``table.first`` is the first owned one
+    table       : global node numbers by grid key; ``table.first`` is that of the first owned node
     nodes       : (l, 3) rest positions [m]
     ghosts      : (l - owned,) global numbers of the ghost nodes
     mass        : (owned,) [kg]
-    cells       : (c, 8) global corner nodes of the cells this rank owns
-    cell_kind   : (c,) geometry.cages' BOUNDARY or INTERIOR
-    springs     : (s, 2) local ends; the first ``springs_owned`` belong to this rank, with the
-                  lower-numbered end first, the others to the rank of their lower-numbered end
-    rest_length : (s,) distance of their ends at rest [m]
-    stiffness   : (s,) [N/m]; with ``solid`` of springs of no rest length, whose L is no less than the Hessian at rest
+    cells       : (c, 8) global corner nodes of the cells that this rank owns
+    cell_kind   : (c,) BOUNDARY or INTERIOR of geometry.cages
+    springs     : (s, 2) local ends. This rank owns the first ``springs_owned``, whose first end has
+                  the lower number. The rank of the lower-numbered end owns each further spring.
+    rest_length : (s,) distance of the ends at rest [m]
+    stiffness   : (s,) [N/m]; a solid has zero-length springs whose L bounds its Hessian at rest
     pinned      : (l,) bool, nodes that do not move
-    local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
-                  first ``cells_owned``; then, only of a solid, of all others around the owned nodes
-    cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
-    cell_share  : (c,) of each of ``cells`` that lies inside the surface, and so counts [-]
-    first_of_body : (b,) global number of the first node of each body; a body's nodes follow each other
-    solid       : where the law is neo-Hookean; None where it is of springs
-    viscous     : viscosity of a solid in its steps over its stiffness, beta / tau (elasticity.viscosity) [-]
+    local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
+                  first corner this rank owns. For a solid all cells around owned nodes follow.
+    cell_stiffness : (d,) stiffness of an edge inside a body of the cell's material [N/m]
+    cell_share  : (c,) fraction of each of ``cells`` that lies inside the surface [-]
+    first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
+    solid       : constants of a neo-Hookean solid; None if the law is springs
+    viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
     """
 
     table: SortedKeys
@@ -102,7 +103,7 @@ class Lattice:
         return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
 
     def body_of(self, numbers: int | Indices) -> Indices:
-        """Return the number of the body that each of some nodes, by their global numbers, belongs to."""
+        """Return the number of the body that each node belongs to, from global node numbers."""
         return np.searchsorted(self.first_of_body, numbers, side="right") - 1
 
     @property
@@ -111,12 +112,12 @@ class Lattice:
         return self.body_of(self.global_numbers)
 
     def stiffest(self, comm: MPI.Comm) -> float:
-        """Return the greatest stiffness of any spring, or of such as a solid would have, [N/m] (collective)."""
+        """Return the greatest stiffness [N/m] of a spring, or of a solid's cell (collective)."""
         stiffness = self.stiffness if self.solid is None else self.cell_stiffness
         return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
 
     def pin(self, where: Mask) -> "Lattice":
-        """Return this lattice with the nodes ``where`` (l,) bool held fast."""
+        """Return this lattice with the nodes ``where`` (l,) bool pinned, too."""
         return replace(self, pinned=self.pinned | where)
 
 
@@ -126,16 +127,17 @@ def build_lattice(
     of_cells: MaterialOfCells | None = None,
     topology: "Topology | None" = None,
 ) -> Lattice:
-    """Build masses and springs of valid cells, of boundary cells what is inside (cut_cells; collective).
+    """Return the lattice of the valid cells; a cut cell counts with its part inside (collective).
 
-    of_cells : what each cell is made of, where that is not ``material`` for all (lattice.region)
-    topology : that of the cages, where it is known already
+    of_cells : material of each cell (lattice.region); None if ``material`` holds for all cells
+    topology : topology of the cages; None to compute it
     """
-    h, net = cages.grids.cell_size, topology or topology_of(cages)
+    h = cages.grids.cell_size
+    net = topology or topology_of(cages)
     is_solid = material.poisson is not None
     first_owned = net.cells[:, 0] < len(net.octants)
-    others = ~first_owned & is_solid
-    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(others)])
+    further = ~first_owned & is_solid
+    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
     law = (_of_solid if is_solid else _of_springs)(net, h, material, of_cells)
     grids = cages.grids
     nodes_of_bodies = np.bincount(
@@ -166,15 +168,15 @@ def build_lattice(
 
 
 class Topology(NamedTuple):
-    """Nodes, cells and springs of a rank before they are of a material. Fields as in Lattice, or as said here.
+    """Nodes, cells and springs of a rank, without material. Further fields are those of Lattice.
 
-    corners : (c, 8) global corner nodes of the cells this rank owns
-    ijk     : (l, 3) grid index of the nodes, owned and ghosts
+    corners : (c, 8) global corner nodes of the cells that this rank owns
+    ijk     : (l, 3) grid index of the nodes, ghosts included
     octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
-    cells   : (c, 8) local corner nodes of all cells around the owned nodes
-    share   : (c, 8) of the corners of these cells; None where all are whole
-    squares : (c, 3) of what is inside of them (geometry.fill_fractions); None where all are whole
-    direction : (s,) of the springs from their first ends, as DIRECTION has it
+    cells   : (d, 8) local corner nodes of all cells around the owned nodes
+    share   : (d, 8) shares of their corners (geometry.fill_fractions); None if all cells are whole
+    squares : (d, 3) their second moments (geometry.fill_fractions); None if all cells are whole
+    direction : (s,) direction of each spring from its first end, as in DIRECTION
     sharing : (s,) number of cells that share each spring
     """
 
@@ -193,7 +195,7 @@ class Topology(NamedTuple):
 
 
 def topology_of(cages: Cages) -> Topology:
-    """Return this rank's nodes, cells and springs (collective)."""
+    """Return the nodes, cells and springs of this rank's part of the cages (collective)."""
     corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
     table = SortedKeys(cages.table.comm, corner_keys.ravel())
     corners = table.find(corner_keys)
@@ -204,26 +206,17 @@ def topology_of(cages: Cages) -> Topology:
     share = None if share is None else share[:, *CORNERS.T]
     squares = cages.of_cells(ijk[cells[:, 0]], cages.squares)
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    return Topology(
-        table,
-        corners,
-        ijk,
-        octants,
-        ghosts,
-        cells,
-        share,
-        squares,
-        *_springs(cells, numbers, owned),
-    )
+    springs = _springs(cells, numbers, owned)
+    return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *springs)
 
 
 class LawConstants(NamedTuple):
-    """What a lattice has of its material, of all cells around a rank's nodes.
+    """The material data of a rank's nodes, springs and cells. A scalar holds for all items.
 
     mass    : (owned,) [kg]
-    springs : (s,) stiffness [N/m], or one for all; of a solid that of the constant L
-    cells   : (c,) stiffness [N/m] of an edge among cells like each, or one for all
-    solid   : None of springs
+    springs : (s,) stiffness [N/m]; for a solid, of the constant L
+    cells   : (d,) stiffness of an edge inside a body of the cell's material [N/m]
+    solid   : (d,) constants of a solid's cells; None if the law is springs
     """
 
     mass: Floats
@@ -235,13 +228,14 @@ class LawConstants(NamedTuple):
 def _of_springs(
     net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
 ) -> LawConstants:
-    """Return the constants of springs: of each the mean over the cells that share it."""
+    """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
     if of_cells is None and net.share is None:
         mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
         law = LawConstants(mass, material.spring, material.spring)
     else:
-        owned, cells, made_of = len(net.octants), len(net.cells), _made_of(net, material, of_cells)
-        share = np.ones((cells, 8)) if net.share is None else net.share
+        owned = len(net.octants)
+        made_of = _made_of(net, material, of_cells)
+        share = np.ones((len(net.cells), 8)) if net.share is None else net.share
         of_pairs = shares_of_pairs(share)
         of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
         mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
@@ -254,7 +248,7 @@ def _of_springs(
 
 
 def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None) -> CellMaterial:
-    """Return what the cells around a rank's nodes are made of, all alike where no function tells."""
+    """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given."""
     if of_cells:
         return of_cells(net.ijk[net.cells[:, 0]])
     of_all = material.density, material.spring, material.poisson_ratio
@@ -264,10 +258,15 @@ def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None
 def _of_solid(
     net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
 ) -> LawConstants:
-    """Return the constants of a solid: as with springs each corner's mass goes as the diagonal of L."""
-    owned, count, made_of = len(net.octants), len(net.cells), _made_of(net, material, of_cells)
+    """Return masses, spring stiffnesses of L and cell constants of a solid.
+
+    A corner's lumped mass is proportional to the diagonal of L, as with springs.
+    """
+    owned, count = len(net.octants), len(net.cells)
+    made_of = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
+    forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
+    volume = np.ones(count)
     pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
     if net.share is not None and net.squares is not None:
         forms, pairs = forms.copy(), pairs.copy()
@@ -278,17 +277,21 @@ def _of_solid(
     diagonal = np.diagonal(pairs, axis1=1, axis2=2)
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-    most = 2 * shear + 3 * lame  # of |grad u|^2 in the second variation at rest
-    of_spring = _sums_of_springs(net, -h * most, pairs)
+    # 2 mu + 3 lambda times |grad u|^2 bounds the second variation at rest.
+    modulus = 2 * shear + 3 * lame
+    of_spring = _sums_of_springs(net, -h * modulus, pairs)
     cells = SolidCells(forms, h**3 * volume, shear, lame)
     return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
 
 
 def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mask]:
-    """Return the cells around the owned nodes.
+    """Return this rank's nodes and the cells around its owned nodes.
 
-    They are: grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells,
-    and which of the 8 cells around each owned node are valid, (owned, 8) bool.
+    The result is
+
+    - the grid index (l, 3) of owned and ghost nodes,
+    - the local corner nodes (d, 8) of the cells,
+    - the mask (owned, 8) of the valid cells around each owned node.
     """
     ijk = decode_morton(table.keys)
     around = encode_morton(ijk[:, None, :] - CORNERS)
@@ -303,9 +306,11 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mas
 
 
 def _sums_of_springs(net: Topology, values: Floats, share: Rows) -> Floats:
-    """Return the sum (s,) of ``values`` (c,) of cells that share each spring, in one order on all ranks.
+    """Return the weighted sum (s,) of cell ``values`` (d,) over the cells that share each spring.
 
-    share : (c, 8, 8) of its value that a cell gives to the spring between two of its corners
+    The order of summation does not depend on the rank.
+
+    share : (d, 8, 8) weight of a cell's value for the spring between two of its corners
     """
     of_nodes = _sums_by_direction(net.cells, values, share, len(net.octants))
     sums: Floats = of_nodes[net.springs[:, 0], net.direction]
@@ -325,10 +330,13 @@ def _sums_by_direction(cells: Indices, values: Floats, share: Rows, owned: int) 
 
 @njit()
 def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int, Indices, Indices]:
-    """Return the springs between the corners of cells, each once.
+    """Return the springs between the corners of cells.
 
-    cells   : (c, 8) local nodes; numbers (l,) global; nodes below ``owned`` are owned
-    returns : (s, 2) local ends, how many this rank owns, direction (s,), cells sharing each (s,)
+    cells   : (d, 8) local corner nodes; nodes below ``owned`` are owned
+    numbers : (l,) global node numbers
+
+    Returns the local ends (s, 2), the number of owned springs, the directions (s,), and the number
+    (s,) of cells that share each spring. Owned springs come first.
     """
     neighbour = np.full((owned, 27), -1, np.int32)
     sharing = np.zeros((owned, 27), np.uint8)
@@ -339,28 +347,30 @@ def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int
                     neighbour[cell[a], DIRECTION[a, b]] = cell[b]
                     sharing[cell[a], DIRECTION[a, b]] += 1
     count = 0
+    # Direction 13 is the node itself.
     for node in range(owned):
         for direction in range(27):
-            far = neighbour[node, direction]
-            count += far >= 0 and direction != 13 and (numbers[far] > numbers[node] or far >= owned)
+            end = neighbour[node, direction]
+            count += end >= 0 and direction != 13 and (numbers[end] > numbers[node] or end >= owned)
     springs = np.empty((count, 2), np.int32)
     directions = np.empty(count, np.int64)
     shared = np.empty(count, np.int64)
-    low, high = 0, count  # springs of this rank fill the front, the others the back
+    # Owned springs fill the arrays from the front, all further springs from the back.
+    low, high = 0, count
     for node in range(owned):
         row = neighbour[node]
         for direction in np.argsort(numbers[row]):
-            far = row[direction]
-            if far < 0 or direction == 13:
+            end = row[direction]
+            if end < 0 or direction == 13:
                 continue
-            if numbers[far] > numbers[node]:
+            if numbers[end] > numbers[node]:
                 s = low
                 low += 1
-            elif far >= owned:
+            elif end >= owned:
                 high -= 1
                 s = high
             else:
                 continue
-            springs[s, 0], springs[s, 1] = node, far
+            springs[s, 0], springs[s, 1] = node, end
             directions[s], shared[s] = direction, sharing[node, direction]
     return springs, low, directions, shared

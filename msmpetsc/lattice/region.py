@@ -1,7 +1,10 @@
 """Nodes and cells in the regions of a scene, the materials of its parts, and its probes.
 
-A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is. Of
-nodes that lie in the region themselves those count, too, that have it half a cell away (README: regions and clamps).
+A region selects material (README: regions and clamps):
+
+- a node, if the region contains the body's point nearest to the node;
+- also a node in the region, if the body is in the region half a cell away;
+- a cell, if the region contains the centroid of its part inside the surface.
 """
 
 from collections.abc import Sequence
@@ -27,20 +30,28 @@ from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import OfBody, Probe
 
-SAME = 1e-9  # of a cell: a point of a face lies in both cells
-MOST_LISTED = 20  # names of groups in a message [-]; more fill the screen
+# tolerance of a point's place in a cell [cell]; a point of a face lies in both cells
+SAME = 1e-9
+# names of groups in a message [-]; more fill the screen
+MOST_LISTED = 20
 
 
 def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: Indices) -> Positions:
-    """Return the nearest points (n, 3) [m] of bodies (n,) to points (n, 3) (collective)."""
-    import igl  # for scenes with regions or obstacles
+    """Return the points (n, 3) [m] of bodies that are nearest to ``points`` (n, 3) (collective).
+
+    body : (n,) number of the body to search
+    """
+    # A scene without regions and obstacles starts without igl.
+    import igl
 
     to_root = Route(bodies[0].comm, np.zeros(len(points), np.int64))
-    nearest, of_point = to_root.send(points), to_root.send(body)
+    nearest = to_root.send(points)
+    of_point = to_root.send(body)
     for number in np.unique(of_point):
         own = of_point == number
         surface = bodies[number].surface
-        assert surface is not None  # here
+        # Rank 0 alone receives points, and it has the surfaces.
+        assert surface is not None
         given = nearest[own]
         closest = igl.point_mesh_squared_distance(given, surface.points, surface.triangles)[2]
         nearest[own] = np.where(is_inside(surface, given)[:, None], given, closest)
@@ -50,9 +61,9 @@ def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: In
 
 @dataclass(frozen=True)
 class Finder:
-    """Finds a region's nodes in the lattice of bodies, or its cells.
+    """Finder of the nodes and cells in a region.
 
-    folder : where files of painted points lie
+    folder : directory of the files with painted points
     """
 
     bodies: tuple[BodySurface, ...]
@@ -69,11 +80,11 @@ class Finder:
         return np.array([body.bounds for body in self.bodies])
 
     def find(self, table: OfBody, lattice: Lattice, points: Positions) -> Mask:
-        """Return the local nodes that the region of a scene's table means, (l,) bool (collective).
+        """Return the mask (l,) of local nodes in the region of a scene's table (collective).
 
-        points : (l, 3) of the bodies that nodes are nearest to [m]: a node that sticks out is where its body is
+        points : (l, 3) body points nearest to the nodes [m]
 
-        Raises InputError on all ranks if there are none.
+        Raises InputError on all ranks if the region has no node.
         """
         region = table.table.region
         if region.is_of_mesh:
@@ -85,57 +96,67 @@ class Finder:
             where = self.inside(table, points, lattice.body)
             around = self.inside(table, lattice.nodes, lattice.body)
             where = where | self._at_edge(table, lattice, around & ~where)
-        found, near = self.comm.allreduce(
+        selected, outside = self.comm.allreduce(
             np.array([mask[: lattice.owned].sum() for mask in (where, around & ~where)])
         )
-        if found == 0:
+        if selected == 0:
             raise InputError(
-                f"{table.key}.region holds no node of the lattice{self._beside(table)}"
+                f"{table.key}.region holds no node of the lattice{self._extents(table)}"
             )
-        if found < near:
+        if selected < outside:
             log.warning(
-                "%s.region only grazes the body: it means %d nodes, not %d that stick out into it from beside it%s",
-                table.key, found, near, self._beside(table),
+                "%s.region only grazes the body: it holds %d nodes, and leaves out %d nodes "
+                "that lie in the region but outside the body%s",
+                table.key, selected, outside, self._extents(table),
             )  # fmt: skip
         return where
 
-    def _at_edge(self, table: OfBody, lattice: Lattice, beside: Mask) -> Mask:
-        """Return which nodes beside a region's, (l,) bool, have it half a cell away along the grid (collective)."""
-        rows, sides = np.flatnonzero(beside), np.concatenate([np.eye(3), -np.eye(3)])
+    def _at_edge(self, table: OfBody, lattice: Lattice, outside: Mask) -> Mask:
+        """Return the nodes among ``outside`` (l,) whose body is in the region half a cell away.
+
+        The result is a mask (l,). The six places half a cell away lie along the grid's axes
+        (collective).
+        """
+        rows = np.flatnonzero(outside)
+        sides = np.concatenate([np.eye(3), -np.eye(3)])
         half_way = lattice.nodes[rows, None] + self.cages.grids.cell_size / 2 * sides
         body = np.repeat(lattice.body[rows], len(sides))
         nearest = nearest_in_bodies(self.bodies, half_way.reshape(-1, 3), body)
-        where = np.zeros_like(beside)
+        where = np.zeros_like(outside)
         where[rows] = self.inside(table, nearest, body).reshape(-1, len(sides)).any(axis=1)
         return where
 
     def inside(self, table: OfBody, points: Positions, body: Indices) -> Mask:
-        """Return which points (n, 3) [m] of bodies (n,) lie in a table's region of space, (n,) bool."""
+        """Return the mask (n,) of points (n, 3) [m] of bodies (n,) in a table's region of space."""
         return inside_bodies(table.table.region, points, self.bounds, body, table.body)
 
     def find_cells(self, table: OfBody, ijk: Indices) -> Mask:
-        """Return which cells (c,) bool are in a region with their middles (collective).
+        """Return the mask (c,) of cells in a region (collective).
 
-        If it has points or a group, these say which. A middle is that of what is inside.
+        A cell is in a region of space if the centroid of its part inside the surface is. A region
+        of painted points or of a group has the cells of ``_of_mesh``.
 
         ijk : (c, 3) grid index of the cells
 
-        Raises InputError on all ranks if the region means none.
+        Raises InputError on all ranks if the region has no cell.
         """
-        grids, share = self.cages.grids, self.cages.of_cells(ijk, self.cages.share)
+        grids = self.cages.grids
+        share = self.cages.of_cells(ijk, self.cages.share)
         middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
         if table.table.region.is_of_mesh:
             where = self._of_mesh(table, ijk, middles, grids.body_of(ijk), are_nodes=False)
         else:
             where = self.inside(table, middles, grids.body_of(ijk))
         if not self.comm.allreduce(bool(where.any()), MPI.LOR):
-            raise InputError(f"{table.key}.region holds the centre of no cell{self._beside(table)}")
+            raise InputError(
+                f"{table.key}.region holds the centre of no cell{self._extents(table)}"
+            )
         return where
 
-    def _beside(self, table: OfBody) -> str:
-        """Return where a table's bodies and its region are, for a message."""
+    def _extents(self, table: OfBody) -> str:
+        """Return the extents of a table's bodies and of its region, for a message."""
         bounds = self.bounds if table.body is None else self.bounds[[table.body]]
-        body = _in_words(bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))
+        body = _box_text(bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))
         region = table.table.region
         return f": the body is {body}" + (
             "" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}"
@@ -144,14 +165,14 @@ class Finder:
     def _of_mesh(
         self, table: OfBody, ijk: Indices, points: Positions, body: Indices, are_nodes: bool
     ) -> Mask:
-        """Return which nodes or cells (n,) bool a region's points or group mean (collective).
+        """Return the mask (n,) of nodes or cells in a region of painted points or a group.
 
-        Of a group they are the nodes nearest to a point of its triangles, or the cells that these
-        cut. What a closed group encloses is meant, too.
+        A group has the nodes that are nearest to a point of its triangles, or the cells that its
+        triangles cut. A closed group has the nodes and cells that it encloses, too (collective).
 
-        ijk    : (n, 3) their grid index
-        points : (n, 3) of nodes, or the middles of cells [m]
-        body   : (n,) whose they are
+        ijk    : (n, 3) grid index of the nodes or cells
+        points : (n, 3) positions of the nodes, or centroids of the cells [m]
+        body   : (n,) number of the body of each
         """
         grids, region = self.cages.grids, table.table.region
         if region.group is None:
@@ -163,7 +184,7 @@ class Finder:
             self.bodies, table.key + ".region", region.group, table.body
         ).items():
             grid = grids.grids[number]
-            # a node is nearest to all points of the cell about it
+            # A node is nearest to the points of the cell centred at the node.
             corners = grid.to_cells(group.points)[group.triangles] + are_nodes / 2
             marked = marked_cells(corners, grid.shape + 1, Slab(0, grid.shape[0] + 1))
             where |= np.isin(encode_morton(ijk), encode_morton(marked + grids.first(number)))
@@ -173,19 +194,21 @@ class Finder:
         return where
 
     def _painted_cells(self, table: OfBody) -> Indices:
-        """Return the cells (k, 3) that painted points of a body's surface lie in (collective)."""
-        key, number = table.key, table.body or 0  # without a body there is but one: the scene's own
-        surface, grid = self.bodies[number].surface, self.cages.grids.grids[number]
+        """Return the cells (k, 3) that contain painted points of a body's surface (collective)."""
+        # A table without a body is of a scene with a single body.
+        key, number = table.key, table.body or 0
+        surface = self.bodies[number].surface
+        grid = self.cages.grids.grids[number]
 
         def cells() -> Indices:
-            assert surface is not None  # it is on rank 0, which alone is asked
-            points, numbers = (
-                surface.points,
-                np.array(self._numbers(key, table.table.region.painted)),
-            )
+            # Rank 0 alone calls this function, and it has the surface.
+            assert surface is not None
+            points = surface.points
+            numbers = np.array(self._numbers(key, table.table.region.painted))
             if numbers.max() >= len(points):
                 raise InputError(
-                    f"{key}.region.painted: there is no point {numbers.max()}: the surface has {len(points)}"
+                    f"{key}.region.painted: there is no point {numbers.max()}: "
+                    f"the surface has {len(points)}"
                 )
             return np.unique(grid.to_cells(points[numbers]).astype(np.int64), axis=0)
 
@@ -210,14 +233,15 @@ class Finder:
 def groups_named(
     bodies: Sequence[BodySurface], key: str, name: str, number: int | None = None
 ) -> dict[int, Surface]:
-    """Return the triangles that meshes name, by the numbers of their bodies (collective).
+    """Return the triangles of the group ``name`` by body number (collective).
 
-    number : of the only body that is asked; None: all
+    key    : key of the scene's table, for messages
+    number : number of the body to search; None for all bodies
 
-    Raises InputError on all ranks if none has them.
+    Raises InputError on all ranks if no mesh has the group.
     """
 
-    def found() -> dict[int, Surface]:
+    def groups_by_body() -> dict[int, Surface]:
         asked = {
             n: body.surface.groups
             for n, body in enumerate(bodies)
@@ -232,12 +256,12 @@ def groups_named(
             )
         return named
 
-    groups: dict[int, Surface] = bodies[0].comm.bcast(on_root(bodies[0].comm, found))
+    groups: dict[int, Surface] = bodies[0].comm.bcast(on_root(bodies[0].comm, groups_by_body))
     return groups
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in printable characters, the first of many."""
+    """Return a list of at most MOST_LISTED names in printable characters, and how many follow."""
     more = len(names) - MOST_LISTED
     return ", ".join(printable(name, 60) for name in names[:MOST_LISTED]) + (
         f" and {more} more" if more > 0 else ""
@@ -245,17 +269,20 @@ def listed(names: Sequence[str]) -> str:
 
 
 def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list[Sequence[float]]:
-    """Return where probes are at rest [m]: of a group the point nearest to its middle (collective).
+    """Return the rest positions [m] of probes (collective).
 
-    Raises InputError on all ranks for a group that no body has.
+    The probe of a group is the group's point nearest to its centroid.
+
+    Raises InputError on all ranks if no body has a probe's group.
     """
     points: list[Sequence[float]] = []
     for number, probe in enumerate(probes):
         if probe.group is None:
-            assert probe.point is not None  # the schema has one of the two
+            assert probe.point is not None
             points.append(probe.point)
             continue
-        import igl  # for scenes with regions or obstacles
+        # A scene without regions and obstacles starts without igl.
+        import igl
 
         group = next(iter(groups_named(bodies, f"output.probe.{number}", probe.group).values()))
         corners = group.points[group.triangles]
@@ -270,45 +297,43 @@ def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list
 
 
 def _middles(share: Rows) -> Rows:
-    """Return the centre of mass (c, 3), in cells from the low corner, of what is inside cells by corners' shares."""
+    """Return the centroid (c, 3) of the part of cells inside the surface, from corner shares.
+
+    It is in cells from the low corner. ``share`` is (c, 2, 2, 2).
+    """
     whole = share.sum(axis=(1, 2, 3))
     return np.stack([share.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
 
 
-def _in_words(low: Floats, high: Floats) -> str:
+def _box_text(low: Floats, high: Floats) -> str:
     ends = (", ".join(f"{x:.4g}" for x in end) for end in (low, high))
     return "from ({}) to ({}) m".format(*ends)
 
 
 def _extent(region: Region, bounds: Rows) -> str:
-    """Return where a region of space is [m], in words; bounds (2, 3) of its body."""
+    """Return a description of a region of space [m], given the bounds (2, 3) of its body."""
     origin, scale, length = frame_of(region, bounds)
     if region.box is not None:
-        return _in_words(*(origin + np.array(region.box) * scale))
+        return _box_text(*(origin + np.array(region.box) * scale))
     if region.sphere is not None:
-        center, reach = (
-            origin + np.array(region.sphere.center) * scale,
-            region.sphere.radius * length,
-        )
-        return _in_words(center - reach, center + reach)
-    assert (
-        region.half_space is not None
-    )  # the schema has one, and those of the mesh are not asked for
-    point, normal = origin + np.array(region.half_space.point) * scale, region.half_space.normal
+        center = origin + np.array(region.sphere.center) * scale
+        radius = region.sphere.radius * length
+        return _box_text(center - radius, center + radius)
+    assert region.half_space is not None
+    point = origin + np.array(region.half_space.point) * scale
+    normal = region.half_space.normal
     at, along = (", ".join(f"{x:.4g}" for x in vector) for vector in (point, normal))
     return f"beyond ({at}) m towards ({along})"
 
 
 def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
-    """Return what makes of cells' grid index (c, 3) their materials (collective).
+    """Return the function from grid indices (c, 3) of cells to their materials (collective).
 
-    It is None where all cells are of the same material.
+    It is None if all cells have the scene's material.
     """
-    material, parts, bodies = (
-        scene.material,
-        list(scene.tables("part")),
-        [body.material for body in scene.body],
-    )
+    material = scene.material
+    parts = list(scene.tables("part"))
+    bodies = [body.material for body in scene.body]
     if not parts and not any(bodies):
         return None
     (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)
@@ -335,16 +360,19 @@ def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
 
 
 def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
-    """Return a number of a body's own material; the scene's where it gives none."""
+    """Return a constant of a body's own material, or the scene's if the body gives none."""
     value: float | None = getattr(own, name, None)
     return float(getattr(material, name)) if value is None else value
 
 
 class ProbePoints:
-    """Points of a body that move with the corners of their cells, by trilinear functions."""
+    """Points of bodies, interpolated trilinearly from the corners of their cells."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, points: Sequence[Sequence[float]]):
-        """Find points by where they rest (w, 3) [m]. Raises InputError on all ranks for one in no cell."""
+        """Locate points by their rest positions (w, 3) [m] (collective).
+
+        Raises InputError on all ranks if a point is in no cell.
+        """
         self.comm = comm
         cells = to_host(lattice.local_cells)[: lattice.cells_owned]
         low, numbers = to_host(lattice.nodes)[cells[:, 0]], lattice.global_numbers[cells[:, 0]]
@@ -354,13 +382,13 @@ class ProbePoints:
             place = (np.array(point) - low) / lattice.cell_size
             around = np.flatnonzero(((place >= -SAME) & (place <= 1 + SAME)).all(axis=1))
             own = int(numbers[around].min(initial=lattice.table.total))
-            first = comm.allreduce(
-                own, MPI.MIN
-            )  # of several cells on a face, or of bodies in one place
+            # A point on a face or in overlapping bodies has several cells.
+            first = comm.allreduce(own, MPI.MIN)
             if first == lattice.table.total:
                 place_text = ", ".join(f"{x:g}" for x in point)
                 raise InputError(
-                    f"output.probe.{row}.point: ({place_text}) m lies in no cell of the body at rest"
+                    f"output.probe.{row}.point: ({place_text}) m "
+                    "lies in no cell of the body at rest"
                 )
             if own == first:
                 cell = around[np.argmin(numbers[around])]
@@ -370,7 +398,7 @@ class ProbePoints:
                 )
 
     def __call__(self, q: Positions) -> Rows:
-        """Return where the points are (w, 3) [m] with nodes at q (l, 3) [m] (collective)."""
+        """Return the positions (w, 3) [m] of the points for nodes at q (l, 3) [m] (collective)."""
         own = (self.weights[:, :, None] * to_host(q)[self.corners]).sum(axis=1)
         places: Rows = self.comm.allreduce(own)
         return places

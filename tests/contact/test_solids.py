@@ -90,13 +90,18 @@ def test_normals_are_the_slope_of_depths_and_a_small_change_keeps_its_digits(sol
         size=x.shape
     )  # of which a difference of depths would keep seven digits
     np.testing.assert_allclose(
-        solid.deeper(x + moved, moved, face), -(moved * normals).sum(axis=1), rtol=1e-5, atol=1e-15
+        solid.depth_change(x + moved, moved, face),
+        -(moved * normals).sum(axis=1),
+        rtol=1e-5,
+        atol=1e-15,
     )
     far = x + 0.3 * depths[:, None] * rng.normal(size=x.shape)
     still = solid.depths(far)
     same = (still[0] > 0) & (still[1] == face)
     np.testing.assert_allclose(
-        solid.deeper(far[same], (far - x)[same], face[same]), (still[0] - depths)[same], atol=1e-12
+        solid.depth_change(far[same], (far - x)[same], face[same]),
+        (still[0] - depths)[same],
+        atol=1e-12,
     )
 
 

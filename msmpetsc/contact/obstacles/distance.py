@@ -1,4 +1,4 @@
-"""Solids given by a signed distance: closed meshes and functions of the user."""
+"""Solids given by the distance to their surface: closed meshes, and users' distance functions."""
 
 from abc import abstractmethod
 from weakref import finalize
@@ -13,25 +13,21 @@ from msmpetsc.errors import InputError
 from msmpetsc.extensions import DistanceFunction
 from msmpetsc.geometry.surface import Surface
 
-# Grid points along each axis that show the surface of a function
+# grid points per axis for a function's surface [-]; for pictures only
 POINTS = 65
-# Margin around the bodies within which the surface is shown, in their longest side
-BEYOND = 1.0
-# Displacement over depth below which the slope gives the change of depth with more
-# digits
-NEAR = 1e-4
-# Barycentric coordinate below which a point is on an edge
+# margin of that grid around the bodies [fraction of their longest side]
+MARGIN = 1.0
+# longest displacement for the trapezoidal rule [fraction of the depth]; the difference
+# of two depths has more digits over a longer displacement
+SHORT = 1e-4
+# barycentric coordinate that counts as zero [-]; the point is then on an edge
 ON_AN_EDGE = 1e-9
-# Distance to the nearest point, over the largest coordinate, below which it has no
-# direction
+# distance without a direction [fraction of the largest coordinate]; close to rounding
 ROUNDED = 1e-14
 
 
 class DistanceSolid(Solid):
-    """Solid given by distances, on the CPU.
-
-    the last depths are kept, as a step asks for them again.
-    """
+    """A solid given by distances, computed on the CPU and cached for the last positions."""
 
     def __init__(self) -> None:
         self._last: tuple[Positions, Floats, Indices] | None = None
@@ -46,25 +42,24 @@ class DistanceSolid(Solid):
     def normals(self, q: Positions, face: Indices) -> Rows:
         return like(q, self._behind(to_host(q), to_host(face))[1])
 
-    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return the change of depth (n,) [m] of inner positions over displacements ``moved`` (n,
-        3).
+    def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        """Return the change of depth (n,) [m] from q - moved to q, in the solid.
 
-        A small change is found by the trapezoidal rule, with an error of |moved|^3 / (12 r^2) at a
-        surface of curvature 1 / r.
+        A short displacement uses the trapezoidal rule. Its error is |moved|^3 / (12 r^2) if r is
+        the surface's radius of curvature.
         """
-        face, way = to_host(face), to_host(moved)
-        (depth, normal), (depth_before, normal_before) = (
-            self._behind(to_host(x), face) for x in (q, q - moved)
-        )
-        near = np.linalg.norm(way, axis=1) < NEAR * np.maximum(depth, depth_before)
-        near &= (normal * normal_before).sum(axis=1) > 0
-        slope = -0.5 * (way * (normal + normal_before)).sum(axis=1)
-        return like(q, np.where(near, slope, depth - depth_before))
+        face = to_host(face)
+        displacement = to_host(moved)
+        depth, normal = self._behind(to_host(q), face)
+        depth_before, normal_before = self._behind(to_host(q - moved), face)
+        is_short = np.linalg.norm(displacement, axis=1) < SHORT * np.maximum(depth, depth_before)
+        is_short &= (normal * normal_before).sum(axis=1) > 0
+        trapezoid = -0.5 * (displacement * (normal + normal_before)).sum(axis=1)
+        return like(q, np.where(is_short, trapezoid, depth - depth_before))
 
     @abstractmethod
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return the surface, for pictures, around bodies between two corners (3,) [m]."""
+        """Return the solid's surface, for pictures, around bodies between two corners (3,) [m]."""
 
     @abstractmethod
     def _find(self, q: Positions) -> tuple[Floats, Indices]:
@@ -72,13 +67,13 @@ class DistanceSolid(Solid):
 
     @abstractmethod
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        """Return depths (n,) [m] of positions (n, 3) behind faces (n,), and normals (n, 3)."""
+        """Return depths (n,) [m] and unit normals (n, 3) of positions (n, 3) behind faces (n,)."""
 
 
 class FunctionSolid(DistanceSolid):
-    """Solid in which a signed distance function of the user is negative.
+    """The solid in which a user's signed distance function is negative.
 
-    key : of its table in the scene, for messages
+    key : key of its table in the scene, for messages
     """
 
     def __init__(self, function: DistanceFunction, key: str):
@@ -88,42 +83,37 @@ class FunctionSolid(DistanceSolid):
     def distances(self, q: Positions) -> tuple[Floats, Rows]:
         """Return the signed distances (n,) [m] of positions (n, 3) [m], and their gradients (n, 3).
 
-        Raises InputError if the function returns other shapes or numbers that are not finite.
+        Raises InputError if the function's result has a wrong shape or is not finite.
         """
         if not len(q):
             return np.zeros(0), np.zeros((0, 3))
-        # Warnings of the user's function are the user's
+        # A user's function may divide by zero: its result is checked below.
         with np.errstate(all="warn"):
             answer = self.function(q.copy())
         try:
             distance, gradient = (np.asarray(part, float) for part in answer)
-            distance, gradient = (
-                np.broadcast_to(distance, len(q)),
-                np.broadcast_to(gradient, q.shape),
-            )
+            distance = np.broadcast_to(distance, len(q))
+            gradient = np.broadcast_to(gradient, q.shape)
         except (TypeError, ValueError):
             raise InputError(
-                f"{self.key}.function: returned no distances of shape {(len(q),)} and "
-                f"gradients of shape {q.shape}"
+                f"{self.key}.function: returned no distances of shape {(len(q),)} "
+                f"and gradients of shape {q.shape}"
             ) from None
         if not (np.isfinite(distance).all() and np.isfinite(gradient).all()):
             raise InputError(f"{self.key}.function: returned numbers that are not finite")
         return distance, gradient
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return the surface by marching cubes, open at the end of the part that is shown."""
+        """Return the surface by marching cubes; it is open at the end of the grid."""
         import igl
 
-        margin = BEYOND * (high - low).max()
+        margin = MARGIN * (high - low).max()
         axes = [
             np.linspace(*ends, POINTS) for ends in zip(low - margin, high + margin, strict=True)
         ]
-        # x runs first
-        grid = (
-            np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-            .transpose(2, 1, 0, 3)
-            .reshape(-1, 3)
-        )
+        # igl expects x fastest.
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        grid = grid.transpose(2, 1, 0, 3).reshape(-1, 3)
         distance = np.ascontiguousarray(self.distances(grid)[0])
         points, triangles, _ = igl.marching_cubes(distance, grid, POINTS, POINTS, POINTS)
         return Surface(points.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
@@ -137,14 +127,14 @@ class FunctionSolid(DistanceSolid):
 
 
 class MeshSolid(DistanceSolid):
-    """Inside of a closed surface; the face of a point is the nearest triangle.
+    """The inside of a closed surface. A position's face is the nearest triangle.
 
-    A point is inside by the pseudonormal of the nearest triangle, edge or corner
-    (Baerentzen and Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal).
+    The pseudonormal at the nearest triangle, edge or corner gives the sign of the distance. Source:
+    Baerentzen and Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal.
     """
 
     def __init__(self, surface: Surface):
-        # Other scenes do not need igl
+        # A scene without mesh obstacles starts without igl.
         import igl
 
         super().__init__()
@@ -157,17 +147,17 @@ class MeshSolid(DistanceSolid):
             self.triangles,
             igl.PerEdgeNormalsWeightingType.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM,
         )
-        # Normals of the edges opposite to the corners of each triangle
+        # For each triangle the normals of the edges opposite to its corners.
         self._of_edges = normals[of_edge].reshape(3, -1, 3).swapaxes(0, 1)
         self._bounds = np.array(mesh.bounds)
         tree = igl.AABB()
         tree.init(self.points, self.triangles)
         self._trees = [tree]
-        # igl's binding complains of trees that are left at the end of Python
+        # igl's binding reports a leak if the tree outlives Python.
         finalize(self, self._trees.clear)
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return the mesh, all triangles wound outwards."""
+        """Return the whole mesh, with outward triangles."""
         return Surface(self.points, self.triangles)
 
     def _find(self, q: Positions) -> tuple[Floats, Indices]:
@@ -184,18 +174,19 @@ class MeshSolid(DistanceSolid):
         return depths, face
 
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        out = closest_point(self.points[self.triangles[face]], q) - q  # type: ignore[no-untyped-call]  # trimesh's
+        out = closest_point(self.points[self.triangles[face]], q) - q  # type: ignore[no-untyped-call]
         depth = np.linalg.norm(out, axis=1)
         on_surface = depth <= ROUNDED * np.abs(self._bounds).max()
         normals = out / np.maximum(depth, TINY)[:, None]
         return depth, np.where(on_surface[:, None], self._normals[face], normals)
 
     def _pseudonormals(self, on_surface: Positions, face: Indices) -> Rows:
-        """Return outward directions (n, 3) at points (n, 3) of triangles (n,)."""
+        """Return outward pseudonormals (n, 3) at points (n, 3) [m] of triangles (n,)."""
         corners = self.points[self.triangles[face]]
-        weights = points_to_barycentric(corners, on_surface)  # type: ignore[no-untyped-call]  # trimesh's
+        weights = points_to_barycentric(corners, on_surface)  # type: ignore[no-untyped-call]
         zero = weights < ON_AN_EDGE
-        count, normals = zero.sum(axis=1), self._normals[face]
+        count = zero.sum(axis=1)
+        normals = self._normals[face]
         edge, corner = count == 1, count > 1
         normals[edge] = self._of_edges[face[edge], zero[edge].argmax(axis=1)]
         normals[corner] = self._of_corners[

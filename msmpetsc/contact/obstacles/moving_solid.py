@@ -1,4 +1,4 @@
-"""Moving obstacles, their creation from a scene's tables, and the depths of nodes in them."""
+"""Moving obstacles: their construction from a scene's tables, and the depths of nodes in them."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,22 +22,21 @@ from msmpetsc.scene.body import MeshTable
 from msmpetsc.scene.obstacles import ObstacleTable
 from msmpetsc.scene.reading import Scene
 
-# Depth below which a node counts as outside [cells]; rounding
+# depth that counts as touching [cell]; above rounding
 TOUCHING = 1e-6
-# Greatest difference of the gradient of a signed distance from length 1
-MOST_OFF = 0.01
+# deviation of a distance's gradient from unit length [-]; a rough test of functions
+GRADIENT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Obstacle(Timed):
-    """Solid that may move, and may exist for a limited time.
+    """A solid that may move, and may act for a limited time.
 
-    solid   : at its place at time 0
+    solid   : the solid in its pose at time 0
     path    : motion of the solid
-    key     : of its table in the scene, for messages
-    outside : (l,) distance by which nodes stick out of the surface at rest [m]
-              (build.nearest_of_body). Nodes reach that depth before the surface touches the
-              obstacle. None if the nodes are the surface
+    key     : key of its table in the scene, for messages
+    outside : (l,) distance of nodes outside of the surface at rest [m] (build.nearest_of_body),
+              which is subtracted from their depth; None if the nodes are the surface
     """
 
     solid: Solid
@@ -46,21 +45,21 @@ class Obstacle(Timed):
     outside: Floats | None = None
 
     def seen_from(self, q: Positions, time: float) -> Positions:
-        """Return positions (n, 3) [m] at a time [s] relative to the solid at its first place."""
-        return q - like(q, self.path.displacement_at(time)) if self.path.leads_away else q
+        """Return positions (n, 3) [m] at a time [s] in the frame of the solid."""
+        return q - like(q, self.path.displacement_at(time)) if self.path.is_moving else q
 
     def depths(
         self, q: Positions, time: float, sides: Indices | None = None
     ) -> tuple[Floats, Indices]:
-        """Return the depths (n,) [m] of the surface at nodes (n, 3) at a time [s], and faces (n,).
+        """Return the depths (n,) [m] of the surface at nodes q (n, 3) [m], and the faces (n,).
 
-        sides : (n or more,) face through which each node entered; None: the nearest face counts
+        sides : (n or more,) sides of the nodes (solids.side_of); None for the nearest face
         """
         depths, face = self.solid.depths(self.seen_from(q, time), sides)
         return depths if self.outside is None else depths - self.outside[: len(q)], face
 
     def normals_at(self, q: Positions, time: float, face: Indices) -> Rows:
-        """Return unit normals (n, 3) of faces (n,) at inner positions (n, 3) [m] at a time [s]."""
+        """Return unit normals (n, 3) of faces (n,) at positions (n, 3) [m] in the solid."""
         return self.solid.normals(self.seen_from(q, time), face)
 
     def sides(
@@ -71,12 +70,12 @@ class Obstacle(Timed):
         time_step: float,
         before: Indices | None = None,
     ) -> Indices:
-        """Return the sides (n,) of nodes that move straight from q to ``end`` (n, 3) [m] in a step.
+        """Return the sides (n,) of nodes on straight paths from q to ``end`` (n, 3) [m] in a step.
 
-        A node around which the obstacle appears gets the nearest face (solids.side_of).
+        If the obstacle begins to act in the step, a node inside gets the nearest face.
 
-        time, time_step : end and length of the step [s]
-        before          : (n,) sides at the start of the step
+        time   : end of the step [s]
+        before : (n,) sides at the beginning of the step
         """
         if not (self.acts_at(time) and isinstance(self.solid, Faces)):
             return no_sides(q)
@@ -87,7 +86,7 @@ class Obstacle(Timed):
         return self.solid.sides_of(self.seen_from(q, begin), self.seen_from(end, time), before)
 
     def sent(self, send: Send) -> "Obstacle":
-        """Return the obstacle with the arrays of a step moved by ``send``, to a device."""
+        """Return the obstacle with the arrays of a step's work on the device of ``send``."""
         outside = None if self.outside is None else send(self.outside)
         return replace(self, solid=self.solid.sent(send), outside=outside)
 
@@ -97,9 +96,9 @@ def build_obstacles(
 ) -> list[Obstacle]:
     """Return the obstacles of a scene (collective).
 
-    outside : (l,) distances by which nodes stick out of the surface [m]
+    outside : (l,) distance of nodes outside of the surface at rest [m]
 
-    Raises InputError on all ranks for an open mesh and for a function that is no signed distance.
+    Raises InputError on all ranks if a mesh is not closed or a function is no signed distance.
     """
     obstacles = []
     for number, table in enumerate(scene.obstacle):
@@ -111,7 +110,7 @@ def build_obstacles(
 
 
 def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
-    """Return the surface of a mesh obstacle. Raises InputError if the mesh is not closed."""
+    """Return the surface of an obstacle's mesh. Raises InputError if the mesh is not closed."""
     try:
         surface = prepare(load(mesh.source, folder), mesh.prepare, mesh.size, mesh.base)
         report = examine(surface)
@@ -126,7 +125,7 @@ def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
 
 
 def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: Positions) -> Solid:
-    """Return the solid of a table, for bodies with nodes (owned, 3) [m] at rest."""
+    """Return the solid of a table. A function is checked at the nodes (owned, 3) [m] at rest."""
     if table.mesh is not None:
         mesh = table.mesh
         surface = comm.bcast(on_root(comm, lambda: obstacle_surface(mesh, key, folder)))
@@ -135,7 +134,7 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: 
         with together(comm):
             solid = FunctionSolid(OBSTACLES.find(table.function), key)
             lengths = np.linalg.norm(solid.distances(nodes)[1], axis=1)
-            if len(nodes) and abs(np.median(lengths) - 1) > MOST_OFF:
+            if len(nodes) and abs(np.median(lengths) - 1) > GRADIENT_TOLERANCE:
                 wrong = f"its gradient is {np.median(lengths):.3g} long at most nodes, not 1"
                 raise InputError(f"{key}.function: no signed distance: {wrong}")
             return solid
@@ -149,13 +148,12 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: 
 def describe_overlap(
     comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, held: Mask, time: float
 ) -> str | None:
-    """Describe the free nodes inside an obstacle at a time [s]; None if there are none
-    (collective).
+    """Return a description of the free nodes inside an obstacle; None without nodes (collective).
 
-    A scene seldom intends this, and the response "exchange" leaves the nodes inside.
+    Such an overlap is seldom intended, and an obstacle that reflects does not remove it.
 
-    q    : (l, 3) [m]
-    held : (l,) whether a node is fixed
+    q    : (l, 3) positions [m]
+    held : (l,) bool, the nodes that are not free
     """
     owned = slice(lattice.owned)
     inside, _ = obstacle.depths(q[owned], time)

@@ -1,4 +1,4 @@
-"""Obstacles that press on nodes or that nodes bounce off, at a time and over a step."""
+"""Obstacles that act on nodes, at a time and over a step: penalties and reflections."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,16 +13,16 @@ from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
 from msmpetsc.lattice.lattice import Lattice
 
-# q (owned, 3) [m] and sides (o, owned or more); None without sides
+# positions (owned, 3) [m] and sides (o, owned or more); None without contact
 Placed = tuple[Positions, Indices | None]
 
 
 class NodeObstacles:
-    """Obstacles that act on nodes: penalties, which press, and exchanges, which reverse velocities.
+    """Obstacles that act on nodes: penalties, which press, and exchanges, which reflect.
 
-    Positions are local, (l, 3) [m], with ghosts. ``time`` [s] is the end of a step and
-    ``time_step`` [s] its length. ``sides`` (o, l) are the faces by which nodes are in contact with
-    each obstacle (solids.side_of), first of the penalties, then of the exchanges.
+    Positions are local, (l, 3) [m], ghosts included. ``time`` [s] is the end of a step, and
+    ``time_step`` [s] its length. ``sides`` (o, l) has a row per obstacle, penalties first, with the
+    face by which each node is in contact (solids.side_of).
     """
 
     def __init__(
@@ -31,8 +31,9 @@ class NodeObstacles:
         self.lattice, self.penalties, self.exchanges = lattice, penalties, exchanges
         self.all = [p.obstacle for p in penalties] + [e.obstacle for e in exchanges]
         self.has_sides = any(obstacle.solid.has_sides for obstacle in self.all)
-        # Rows of sides
-        self.pressing, self.exchanging = slice(len(penalties)), slice(len(penalties), None)
+        # Rows of ``sides``.
+        self.pressing = slice(len(penalties))
+        self.exchanging = slice(len(penalties), None)
         self.strikes = bool(exchanges) or any(p.restitution is not None for p in penalties)
         self.has_friction = any(p.friction > 0 for p in penalties)
         nodes = lattice.nodes
@@ -47,12 +48,12 @@ class NodeObstacles:
         before: Indices | None,
         held: Mask,
     ) -> Indices:
-        """Return the sides (o, n) of nodes that move straight from q to ``end`` (n, 3) in a step.
+        """Return the sides (o, n) of nodes on straight paths from q to ``end`` (n, 3) in a step.
 
-        Obstacles of a single face have no sides.
+        A plane has a single face, so its row is zero.
 
-        before : (o, n) sides at the start of the step
-        held   : (n,) whether a node is fixed; fixed nodes have no side
+        before : (o, n) the sides at the beginning of the step
+        held   : (n,) bool, the nodes that are not free; their side is 0
         """
         sides = np.zeros((len(self.all), len(q)), np.int8, like=q)
         for row, obstacle in enumerate(self.all):
@@ -62,17 +63,14 @@ class NodeObstacles:
         return sides
 
     def same_push(self, q: Positions, time: float, a: Indices, b: Indices) -> bool:
-        """Return whether penalties press alike on nodes with sides a and b (o, l) (collective)."""
+        """Return whether sides a and b (o, l) give the same penalty forces at q (collective)."""
         rows = q[: self.lattice.owned]
         pressing = [row for row, p in enumerate(self.penalties) if p.obstacle.acts_at(time)]
-        pushed = ([self._pushed(row, (rows, side), time) for row in pressing] for side in (a, b))
+        pushed = ([self._depths(row, (rows, side), time) for row in pressing] for side in (a, b))
         return bool(self.lattice.table.comm.allreduce(all(map(np.array_equal, *pushed)), MPI.LAND))
 
     def push(self, time: float, sides: Indices | None) -> Contact | None:
-        """Return the contact with penalties at a time, without friction.
-
-        None if no penalty acts.
-        """
+        """Return the penalty contact at a time, without friction; None if no penalty acts."""
         states = [
             p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)
         ]
@@ -87,19 +85,21 @@ class NodeObstacles:
         sides: Indices | None,
         before: Contact | None,
     ) -> list[ContactState]:
-        """Return the states of the penalties that act in a step from q.
+        """Return the penalty contacts in a step from q, with friction.
 
         last, end : see Environment.contact
-        step      : end and length of the step [s]
-        before    : contact of the last step, whose friction goes on
+        step      : time of the step's end, and its length [s]
+        before    : contact of the step before, whose elastic slips continue; None without it
         """
-        (time, time_step), owned, states = step, self.lattice.owned, []
-        held = before.states if before else []
+        time, time_step = step
+        owned = self.lattice.owned
+        states = []
+        states_before = before.states if before else []
         ended = None if end is None else end[:owned]
         for p, side in self._pressing(time, sides):
             states.append(
                 p.during(q[:owned], time, time_step, side[:owned], last, ended).after(
-                    held, q[:owned]
+                    states_before, q[:owned]
                 )
             )
         return states
@@ -112,9 +112,9 @@ class NodeObstacles:
         substep: tuple[float, float],
         sides: Indices,
     ) -> None:
-        """Apply friction of obstacles at a time, for a ``duration`` [s], to this rank's nodes.
+        """Apply the obstacles' friction at a time, for a ``duration`` [s], to this rank's nodes.
 
-        substep : begin and end [s], between which an obstacle carries nodes along
+        substep : begin and end of the substep [s], which give an obstacle's velocity
         """
         begin, end = substep
         for p, side in self._pressing(time, sides):
@@ -128,39 +128,40 @@ class NodeObstacles:
     def contact_stiffness_bound(
         self, q: Positions, speed: float, start: float, time: float, sides: Indices
     ) -> Floats:
-        """Return a bound (owned,) [N/m] of the stiffness that obstacles add from start to ``time``.
+        """Return a bound (owned,) [N/m] of the obstacles' stiffness at nodes until ``time``.
 
-        A node counts as inside from twice its possible way on.
+        A node counts as inside within twice the distance that it and the obstacle can move.
 
-        q     : (owned, 3) [m] at the start
-        speed : bound of all nodes' speeds [m/s]
+        q     : (owned, 3) positions at ``start`` [m]
+        speed : upper bound of the nodes' speed [m/s]
         """
         stiffness = np.zeros(len(q), like=q)
         for p, side in zip(self.penalties, sides[self.pressing], strict=True):
             if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
-                way = p.obstacle.path.displacement_between(start, time)
-                reach = 2 * (speed * (time - start) + np.linalg.norm(way))
-                inside, _ = p.obstacle.depths(q, start)
-                stiffness += p.stiffness * ((inside > -reach) | (side > 0))
+                displacement = p.obstacle.path.displacement_between(start, time)
+                margin = 2 * (speed * (time - start) + np.linalg.norm(displacement))
+                depths, _ = p.obstacle.depths(q, start)
+                stiffness += p.stiffness * ((depths > -margin) | (side > 0))
         return stiffness
 
     def power(self, q: Positions, time: float, begin: float, end: float, sides: Indices) -> float:
-        """Return the power [W] of penalties on this rank's nodes q (owned, 3) [m] at ``time``.
+        """Return the power [W] of the penalty forces at ``time`` on this rank's nodes (owned, 3).
 
-        begin, end : substep [s] that gives the velocities of obstacles
+        begin, end : the substep [s] that gives an obstacle's velocity
         """
         power = 0.0
         for p, side in self._pressing(time, sides):
-            way = p.obstacle.path.displacement_between(begin, end)
-            if way.any():
+            displacement = p.obstacle.path.displacement_between(begin, end)
+            if displacement.any():
                 _, depth, normal = p.state_at(time, side).pressed(q)
-                power += p.stiffness / (end - begin) * float(depth @ (normal @ like(q, way)))
+                work = float(depth @ (normal @ like(q, displacement)))
+                power += p.stiffness / (end - begin) * work
         return power
 
     def energy_of_new_obstacles(
         self, q: Positions, begin: float, end: float, sides: Indices
     ) -> float:
-        """Return the energy [J] at a substep's end of penalties that began to act within it."""
+        """Return the energy [J] at a substep's end of penalties that began to act in it."""
         new = [
             p.state_at(end, side)
             for p, side in self._pressing(end, sides)
@@ -171,60 +172,54 @@ class NodeObstacles:
     def friction_work_bound(
         self, before: Placed, after: Placed, time: float, time_step: float, frame: Floats
     ) -> float:
-        """Return a bound of the work [J] of friction of moving obstacles on this rank's nodes in a
-        step.
+        """Return a bound of the work [J] of moving obstacles' friction on owned nodes in a step.
 
-        The bound is mu N times the displacement of each obstacle relative to a frame.
-
-        frame : (3,) displacement of the frame [m]
+        The bound is mu N times the obstacles' distance in a frame displaced by ``frame`` (3,) [m].
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
-            way = float(
-                np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time) - frame)
-            )
-            if p.obstacle.acts_at(time) and p.friction > 0 and way > 0:
+            displacement = p.obstacle.path.displacement_between(time - time_step, time)
+            distance = float(np.linalg.norm(displacement - frame))
+            if p.obstacle.acts_at(time) and p.friction > 0 and distance > 0:
                 for state, when in ((before, time - time_step), (after, time)):
-                    work += (
-                        p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
-                    )
+                    depth = float(self._depths(row, state, when).sum())
+                    work += p.friction * p.stiffness * depth * distance
         return work
 
     def way_of_pressing(self, state: Placed, time: float, time_step: float) -> tuple[float, Floats]:
-        """Return the force of penalties on this rank's nodes [N], and its products with
-        displacements.
+        """Return the sum of penalty forces [N], and the sum (3,) [N m] of force times displacement.
 
-        The second is the sum (3,) [N m] over obstacles of force times displacement in the step.
+        The sums are over this rank's nodes, with the obstacles' displacements in the step.
         """
-        push, led = 0.0, np.zeros(3)
+        total, weighted = 0.0, np.zeros(3)
         for row, p in enumerate(self.penalties):
             if p.obstacle.acts_at(time):
-                share = p.stiffness * float(self._pushed(row, state, time).sum())
-                way = p.obstacle.path.displacement_between(time - time_step, time)
-                push, led = push + share, led + share * way
-        return push, led
+                force = p.stiffness * float(self._depths(row, state, time).sum())
+                displacement = p.obstacle.path.displacement_between(time - time_step, time)
+                total += force
+                weighted = weighted + force * displacement
+        return total, weighted
 
     def change_of_push(
         self, before: Placed, after: Placed, time: float, time_step: float
     ) -> Floats:
-        """Return the change (owned,) [N] of penalty forces on this rank's nodes in a step."""
+        """Return the change (owned,) [N] in a step of the penalty force on each owned node."""
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
-            deeper = np.zeros_like(change)
+            depth_change = np.zeros_like(change)
             for sign, state, when in ((-1, before, time - time_step), (1, after, time)):
                 if p.obstacle.acts_at(when):
-                    deeper += sign * self._pushed(row, state, when)
-            change += p.stiffness * np.abs(deeper)
+                    depth_change += sign * self._depths(row, state, when)
+            change += p.stiffness * np.abs(depth_change)
         return change
 
-    def _pushed(self, row: int, state: Placed, time: float) -> Floats:
-        """Return the depths (owned,) [m] of nodes in a penalty's obstacle, 0 outside."""
+    def _depths(self, row: int, state: Placed, time: float) -> Floats:
+        """Return the depths (owned,) [m] of nodes in a penalty's obstacle; 0 outside."""
         q, sides = state
         side = (self.no_sides if sides is None else sides)[row, : len(q)]
         return np.maximum(self.penalties[row].state_at(time, side).depths(q)[0], 0)
 
     def _pressing(self, time: float, sides: Indices | None) -> list[tuple[Penalty, Indices]]:
-        """Return the penalties that act at a time [s], each with the sides of its nodes."""
         sides = (self.no_sides if sides is None else sides)[self.pressing]
         return [
             (p, side)
@@ -235,14 +230,15 @@ class NodeObstacles:
     def strike(
         self, q: Positions, q_previous: Positions, step: StepTaken, held: Mask
     ) -> tuple[Positions, Positions, float]:
-        """Return q_n and q_(n-1) after strikes, and the obstacles' work [J] on this rank's nodes.
+        """Return q_n and q_(n-1) after impacts on obstacles, and the work [J] on this rank's nodes.
 
         The arrays are the same objects if no node strikes.
 
-        step : with the sides (o, l) of all obstacles
-        held : (l,) whether a node is fixed
+        step : the completed step, with the sides (o, l) for all obstacles
+        held : (l,) bool, the nodes that are not free
         """
-        free, work = ~held[:, None], 0.0
+        free = ~held[:, None]
+        work = 0.0
         sides = self.no_sides if step.sides is None else step.sides
         for exchange, side in zip(self.exchanges, sides[self.exchanging], strict=True):
             after, before = exchange.exchanged(q, q_previous, replace(step, sides=side))
@@ -262,12 +258,12 @@ class NodeObstacles:
         return q, q_previous, work
 
     def _impulse_work(self, obstacle: Obstacle, change: Rows, step: StepTaken) -> float:
-        """Return the work [J] of an obstacle that changes velocities.
+        """Return an obstacle's work [J] in an impact: the impulse times the obstacle's velocity.
 
-        impulse times its velocity.
+        change : (l, 3) change of v_n = q_n - q_(n-1) [m]
         """
-        if not obstacle.path.leads_away:
+        if not obstacle.path.is_moving:
             return 0.0
-        way = obstacle.path.displacement_between(step.time - step.length, step.time)
+        displacement = obstacle.path.displacement_between(step.time - step.length, step.time)
         mass = self.lattice.mass
-        return float(to_host(mass @ change[: len(mass)]) @ way) / step.length**2
+        return float(to_host(mass @ change[: len(mass)]) @ displacement) / step.length**2

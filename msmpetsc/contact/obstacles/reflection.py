@@ -1,13 +1,11 @@
-"""Change of velocity of nodes that strike an obstacle.
+"""Impact of nodes on obstacles, with a coefficient of restitution e.
 
-A state has no velocity, only q_n and q_(n-1).
+The state has q_n and q_(n-1) in place of a velocity. There are two laws:
 
-- ``slowed`` changes q_(n-1), so that the normal velocity becomes e times itself. The node stays in
-  place, and no energy comes in. The penalty of the face then turns the node round, so that it
-  leaves with e times its speed.
-- ``Exchange`` reverses a velocity, v_(n+1) = -v_n, by q_(n+1) = q_(n-1) (paper section 5). The
-  obstacle thereby moves nodes against their springs, which adds energy: the contact is not
-  conservative.
+- ``slowed`` scales the normal velocity of a striking node by e through a new q_(n-1). The node's
+  position stays, so no energy is added. The push of the penalty then reverses the velocity.
+- ``Exchange`` is the paper's reflection (section 5): v_(n+1) = -v_n by q_(n+1) = q_(n-1). It moves
+  nodes against their springs, which adds energy. So this contact is not conservative.
 """
 
 from dataclasses import dataclass
@@ -20,12 +18,10 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 @dataclass(frozen=True)
 class StepTaken:
-    """Step that has been taken.
+    """A completed step: the time [s] of its end, its length [s], and the sides of nodes.
 
-    time   : of its end [s]
-    length : [s]
-    sides  : (n,) faces by which nodes are in contact (Obstacle.sides), (o, n) of several
-             obstacles; None without contact
+    sides : (n,) faces by which nodes are in contact (Obstacle.sides), or (o, n) for several
+            obstacles; None without contact
     """
 
     time: float
@@ -35,7 +31,7 @@ class StepTaken:
 
 @dataclass(frozen=True)
 class Exchange:
-    """Obstacle with a restitution in [0, 1], 1 in the paper."""
+    """The paper's reflection, with a coefficient of restitution in [0, 1]; the paper has 1."""
 
     obstacle: Obstacle
     restitution: float
@@ -43,12 +39,12 @@ class Exchange:
     def exchanged(
         self, q: Positions, q_previous: Positions, step: StepTaken
     ) -> tuple[Positions, Positions]:
-        """Return q_n and q_(n-1) after contact, (n, 3) [m] each.
+        """Return q_n and q_(n-1) (n, 3) [m] after the impact.
 
-        A node strikes if it lies on or behind a face and its v_n = q_n - q_(n-1), relative to the
-        obstacle, leads further in. The normal part of q_n then goes back by that of v_n, which
-        becomes -e times itself. With e = 1 and an obstacle at rest this exchanges the normal parts
-        of q_n and q_(n-1).
+        A node strikes if it is on or behind a face and v_n = q_n - q_(n-1), relative to the
+        obstacle, points into the solid. The normal part of v_n is then subtracted from q_n, and the
+        new v_n has -e times this part. If e = 1 and the obstacle rests, this exchanges the normal
+        parts of q_n and q_(n-1).
         """
         rows, into = striking(self.obstacle, q, q_previous, step)
         if len(rows) == 0:
@@ -62,7 +58,10 @@ class Exchange:
 def slowed(
     obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken
 ) -> Positions:
-    """Return q_(n-1) (n, 3) [m] such that striking nodes have e times their normal velocity."""
+    """Return q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes by restitution e.
+
+    A node strikes in the step in which it reaches a face.
+    """
     rows, into = striking(obstacle, q, q_previous, step)
     before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]
     rows, into = rows[before < 0], into[before < 0]
@@ -76,10 +75,10 @@ def slowed(
 def striking(
     obstacle: Obstacle, q: Positions, q_previous: Positions, step: StepTaken
 ) -> tuple[Indices, Rows]:
-    """Return the nodes (k,) on or behind faces, and their inward displacements (k, 3) [m].
+    """Return the nodes (k,) on or behind a face, and their displacements (k, 3) [m] into the solid.
 
-    Displacements are those of the step, relative to the obstacle and normal to the face. There are
-    no nodes if the obstacle does not act.
+    The displacement is the normal part, inwards, of the step's displacement relative to the
+    obstacle. If the obstacle does not act, the result is empty.
     """
     time, path = step.time, obstacle.path
     if not obstacle.acts_at(time):
@@ -91,6 +90,6 @@ def striking(
     rows = np.flatnonzero(behind)
     normal = obstacle.normals_at(q[rows], time, face[rows])
     v = q[rows] - q_previous[rows]
-    if path.leads_away:
+    if path.is_moving:
         v = v - like(v, path.displacement_between(time - step.length, time))
     return rows, np.minimum((v * normal).sum(axis=1), 0)[:, None] * normal

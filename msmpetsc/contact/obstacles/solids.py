@@ -1,6 +1,6 @@
-"""Solids that nodes stay out of: planes, boxes and balls.
+"""Solids that obstacles consist of: planes, boxes and balls.
 
-A solid is at its place at time 0. Positions are relative to a moved obstacle.
+A solid is fixed in its pose at time 0. For a moving obstacle, positions are given in its frame.
 """
 
 from abc import ABC, abstractmethod
@@ -13,67 +13,68 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 
-# Least length [m], against division by 0
+# smallest length to divide by [m]
 TINY = 1e-300
-# Cosine below which two faces look away from each other
+# largest cosine between the normals of opposite faces [-]; -1 up to rounding
 OPPOSITE = -1 + 1e-9
-# Share of a node's way; a thinner plate is not passed either
+# rounding of a crossing [fraction of a path]; a plate of zero thickness stops nodes
 ROUNDED = 1e-12
 
 Send = Callable[[Array], Array]
 
 
 class Solid(ABC):
-    """Solid with one or more faces, numbered from 0. Positions are (n, 3) [m]."""
+    """A solid, whose faces have numbers from 0. Positions are (n, 3) [m]."""
 
     @property
     def has_sides(self) -> bool:
-        """Whether the face through which a node entered matters."""
+        """Whether the depth depends on the face by which a node entered."""
         return False
 
     @abstractmethod
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """Return depths (n,) [m] behind the face of each side, or else the nearest, and faces (n,).
+        """Return the depths (n,) [m] of positions behind a face, and the numbers (n,) of the faces.
 
-        A depth outside is negative, and no less than minus the distance.
+        The depth outside is negative, and at least minus the distance.
 
-        sides : (n or more,) of the positions
+        sides : (n or more,) 1 + the face by which each node entered; 0 for the nearest face
         """
 
     @abstractmethod
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """Return the unit normals (n, 3) of faces (n,) at inner positions."""
+        """Return the outward unit normals (n, 3) of the faces (n,) at positions in the solid."""
 
     @abstractmethod
-    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return the change of depth (n,) [m] behind faces (n,) over displacements ``moved`` (n,
-        3).
+    def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        """Return the change of depth (n,) [m] behind faces (n,) from q - moved to q, in the solid.
 
-        A difference of depths would have only the digits of a position.
+        A difference of two depths would lose the digits of a small displacement.
+
+        moved : (n, 3) displacement [m]
         """
 
     def sent(self, send: Send) -> "Solid":
-        """Return the solid with the arrays of a step moved by ``send``, to a device."""
+        """Return the solid with the arrays of a step's work on the device of ``send``."""
         return self
 
 
 class Planes(NamedTuple):
-    """Planes of faces: points (f, 3) [m] and unit normals (f, 3) towards the free side."""
+    """Planes of faces: points (f, 3) [m], and outward unit normals (f, 3)."""
 
     points: Positions
     normals: Rows
 
 
 class Depths(NamedTuple):
-    """Sides (n or more,) of nodes, and depths (n,) [m] and faces (n,) as output."""
+    """Sides (n or more,) of nodes, and a kernel's output: depths (n,) [m] and faces (n,)."""
 
     sides: Indices
     depths: Floats
     faces: Indices
 
 
-class Ways(NamedTuple):
-    """Ends (n, 3) [m] of nodes' ways, sides (n,) before, and sides (n,) after as output."""
+class Paths(NamedTuple):
+    """Ends (n, 3) [m] of nodes' paths, sides (n,) before, and a kernel's output: sides (n,)."""
 
     ends: Positions
     before: Indices
@@ -82,7 +83,7 @@ class Ways(NamedTuple):
 
 @njit(inline="always")
 def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
-    """Return the depth [m] of the position q[i] (3,) behind a face, negative in front."""
+    """Return the distance [m] of q[i] behind the plane of a face; negative in front of it."""
     points, normals = planes
     distance: float = -normals[face, 0] * (q[i, 0] - points[face, 0])
     distance -= normals[face, 1] * (q[i, 1] - points[face, 1])
@@ -92,9 +93,9 @@ def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
 
 @njit(inline="always")
 def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
-    """Return the depth [m] of q[i] (3,) behind the face of its ``side``, and that face.
+    """Return the depth [m] of q[i] behind the face of its ``side``, and the number of the face.
 
-    Without a side return the depth in the solid, not positive outside, and the nearest face.
+    If ``side`` is 0, return the depth in the solid, not positive outside, and the nearest face.
     """
     if side > 0:
         return behind(q, i, planes, side - 1), side - 1
@@ -108,9 +109,9 @@ def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
 
 @njit()
 def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
-    """Return whether q[i] is behind a face and has not slid off past another face.
+    """Return whether q[i] is behind a face and has not slid off the face sideways.
 
-    The opposite face is ignored, since a node may pass that of a thin plate.
+    The opposite face does not count, because a node may be beyond the far face of a thin plate.
     """
     if behind(q, i, planes, face) <= 0.0:
         return False
@@ -125,19 +126,19 @@ def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
 
 @njit()
 def side_of(q: Positions, end: Positions, i: int, planes: Planes, side: int) -> int:
-    """Return the side of a node on its straight way from q[i] to end[i]: 1 + its face, or 0.
+    """Return 1 + the face by which a node is in contact on its straight path from q[i] to end[i].
 
-    The node counts here, however far it sticks out of the surface. A node with a side but without
-    depth is on its way in or out.
+    The result is 0 if the node does not meet the solid. The test is for the node itself, which may
+    lie outside of the body's surface. So a node with a side may still have no depth.
 
-    side : before the way; the node keeps it until it is out of the solid
+    side : the node's side before, which it keeps until it leaves the solid
     """
     if side > 0 and _stays(q, i, planes, side - 1):
         return side
     inside, face = depth(q, i, planes, 0)
     if inside > 0.0:
         return face + 1
-    # Shares of the way
+    # Fractions of the path at which the node enters the solid and leaves it.
     enter, leave, side = -1.0, 1.0, 0
     for f in range(len(planes.points)):
         first, last = behind(q, i, planes, f), behind(end, i, planes, f)
@@ -159,22 +160,24 @@ def _depths_of(first: int, count: int, step: int, q: Positions, planes: Planes, 
 
 
 @kernel
-def _sides_of(first: int, count: int, step: int, q: Positions, planes: Planes, ways: Ways) -> None:
-    ends, before, sides = ways
+def _sides_of(
+    first: int, count: int, step: int, q: Positions, planes: Planes, paths: Paths
+) -> None:
+    ends, before, sides = paths
     for i in range(first, count, step):
         sides[i] = side_of(q, ends, i, planes, before[i])
 
 
 @dataclass(frozen=True)
 class Faces(Solid):
-    """Points behind all faces: one face is a plane, six faces are a box."""
+    """The points behind all faces: a half space with a single face, or a box with six."""
 
     planes: Planes
 
     @classmethod
     def of_box(cls, low: Positions, high: Positions) -> "Faces":
         """Return the box between two corners (3,) [m]."""
-        # Three faces meet at each of the two corners
+        # Three faces meet at each of the two corners.
         points = np.repeat(np.array([low, high], float), 3, axis=0)
         return cls(Planes(points, np.concatenate([-np.eye(3), np.eye(3)])))
 
@@ -191,18 +194,18 @@ class Faces(Solid):
     def normals(self, q: Positions, face: Indices) -> Rows:
         return self.planes.normals[face]
 
-    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        deeper: Floats = -(moved * self.planes.normals[face]).sum(axis=1)
-        return deeper
+    def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        change: Floats = -(moved * self.planes.normals[face]).sum(axis=1)
+        return change
 
     def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
-        """Return the sides (n,) of nodes that move straight from q to ``end`` (n, 3) [m].
+        """Return ``side_of`` (n,) for nodes on straight paths from q to ``end`` (n, 3) [m].
 
-        before : (n,) sides at q
+        before : (n,) the nodes' sides before
         """
-        ways = Ways(end, before, no_sides(q))
-        _sides_of(len(q), q, self.planes, ways)
-        return ways.sides
+        paths = Paths(end, before, no_sides(q))
+        _sides_of(len(q), q, self.planes, paths)
+        return paths.sides
 
     def sent(self, send: Send) -> "Faces":
         return Faces(Planes(*map(send, self.planes)))
@@ -210,7 +213,7 @@ class Faces(Solid):
 
 @dataclass(frozen=True)
 class BallSolid(Solid):
-    """Ball of center (3,) [m] and radius [m]; at the center there is no normal."""
+    """A ball: center (3,) [m] and radius [m]. The normal at its center is zero."""
 
     center: Positions
     radius: float
@@ -225,18 +228,18 @@ class BallSolid(Solid):
         normals: Rows = out / np.maximum(np.linalg.norm(out, axis=1), TINY)[:, None]
         return normals
 
-    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return the change of depth (n,) [m]: |u| - |v| = (u - v) (u + v) / (|u| + |v|)."""
+    def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        # |u| - |v| = (u - v) . (u + v) / (|u| + |v|)
         u = q - self.center
         v = u - moved
         both = np.linalg.norm(u, axis=1) + np.linalg.norm(v, axis=1)
-        deeper: Floats = -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
-        return deeper
+        change: Floats = -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
+        return change
 
     def sent(self, send: Send) -> "BallSolid":
         return replace(self, center=send(self.center))
 
 
 def no_sides(q: Positions) -> Indices:
-    """Return the sides (n,) of nodes (n, 3) without contact."""
+    """Return the sides (n,) of nodes (n, 3) without contact: zeros."""
     return np.zeros(len(q), np.int8, like=q)

@@ -18,7 +18,6 @@ import small_result
 import trimesh
 from conftest import ROOT, python, run
 
-from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
@@ -68,15 +67,21 @@ ALL_COMMANDS = [
 WITH_PYTHON = [path for path in READMES if blocks(path, "python")]
 
 
+def code_of(text: str) -> list[str]:
+    """Return the lines of a program without indentation, empty lines and comments of their own."""
+    lines = [line.strip() for line in text.splitlines()]
+    return [line for line in lines if line and not line.startswith("#")]
+
+
 def test_the_loops_of_a_step_are_printed_as_they_stand_in_the_files():
     folder = ROOT / "msmpetsc" / "solve"
     files = "\n".join(path.read_text() for path in (folder / "nonlinear").glob("*.py"))
-    files = "\n".join(line.strip() for line in files.splitlines())
+    files = "\n".join(code_of(files))
     printed = re.findall(r"^```\n(.*?)^```", (folder / "README.md").read_text(), re.M | re.S)
     loops = [block for block in printed if "while not" in block]
     assert len(loops) == 2
     for loop in loops:
-        assert "\n".join(line.strip() for line in loop.splitlines()) in files
+        assert "\n".join(code_of(loop)) in files
 
 
 def test_the_front_door_is_short():
@@ -209,21 +214,6 @@ def test_the_study_files_are_some(tmp_path: Path):
         path.write_text(text)
         study = load_study(path)
         assert study.sweep or study.map
-
-
-def options_of_run() -> str:
-    """The table of what a run can be asked for, as the request has it."""
-    rows = ["| option | in Python | meaning |", "|---|---|---|"]
-    for name, option in OPTIONS.items():
-        value = option.value or "|".join(option.choices or ())
-        words = f"{option.short} {flag_of(name)} {value}" if name != "scene" else value
-        shown = "" if option.python else f"`{words.strip()}`".replace("|", "\\|")
-        rows.append(f"| {shown} | `{name}` | {option.help} |")
-    return "\n".join(rows)
-
-
-def test_the_table_of_options_is_that_of_the_request():
-    assert options_of_run() in (ROOT / "msmpetsc" / "README.md").read_text(), options_of_run()
 
 
 def test_the_tests_of_cases_are_there():

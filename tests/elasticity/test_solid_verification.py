@@ -1,4 +1,4 @@
-"""The neo-Hookean solid as the product runs it, against theory (msmpetsc/elasticity/README.md has the tables)."""
+"""The neo-Hookean solid as the product runs it, against theory (scripts/results/solid.md has the tables)."""
 
 from collections.abc import Iterator
 

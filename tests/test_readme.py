@@ -42,7 +42,14 @@ SMALLER = {  # a command's words -> those of the test
     "scene.toml --resume out/x.h5": "scene.toml --resume out/x.h5 --set time.duration=0.03 --set cages.count=200",
     "--set time.duration=4": "--set time.duration=0.05",
 }
-RUN = ("msmpetsc/results/README.md", "scripts/README.md", "scenes/studies/README.md")
+RUN = (
+    *(
+        f"scripts/docs/pages/{name}.md"
+        for name in ("forces-and-stress", "pictures", "comparing", "resuming")
+    ),
+    "scripts/README.md",
+    "scenes/studies/README.md",
+)
 DIFFER = {"compare": (0, 1), "plan": (0, 3)}  # exit statuses of commands that were carried out
 PROGRAM = ("-m", "msmpetsc.cli.main")
 LONG = ("study", "--device cuda")  # of RUN's commands, parsed only

@@ -1,5 +1,6 @@
 """The tutorials of the documentation run as scripts; their own assertions check the numbers."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -27,3 +28,5 @@ def test_a_tutorial_runs(script: Path, tmp_path: Path):
             pytest.skip(str(error))
     done = python(script, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
+    for printed in re.findall(r"# It prints:\n#\n((?:#     .*\n)+)", script.read_text()):
+        assert re.sub(r"^#     ", "", printed, flags=re.M) in done.stdout, done.stdout

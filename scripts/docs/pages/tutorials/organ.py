@@ -66,9 +66,16 @@ with msm.open(path) as result:
     triangles = result.surface.triangles[:]
 
 for displacement, pull in zip(0.015 * time / 3.0, force, strict=True):
-    print(f"{1e3 * displacement:4.1f} mm: {1e3 * pull:8.1f} mN")
+    print(f"{1e3 * displacement:.0f} mm: {pull:.1f} N")
 
 # %% [markdown]
+# It prints:
+#
+#     0 mm: 0.0 N
+#     5 mm: -1.9 N
+#     10 mm: -3.8 N
+#     15 mm: -5.5 N
+#
 # ## Stress and volume
 #
 # A material of Poisson's ratio 0.47 changes its volume little. That checks cells and
@@ -77,8 +84,9 @@ for displacement, pull in zip(0.015 * time / 3.0, force, strict=True):
 # %%
 volumes = [trimesh.Trimesh(points, triangles, process=False).volume for points in surface]
 change = volumes[-1] / volumes[0] - 1
-print(f"von Mises' stress: median {np.median(von_mises):.0f} Pa, largest {von_mises.max():.0f} Pa")
-print(f"volume: {1e6 * volumes[0]:.1f} ml, {100 * change:+.2f}% at the end")
+median, largest = np.median(von_mises), von_mises.max()
+print(f"von Mises' stress: median {median:.0f} Pa, largest {largest:.0f} Pa")
+print(f"volume: {1e6 * volumes[0]:.0f} ml, {100 * change:+.1f}% at the end")
 
 # %%
 assert force[1] < 0 and force[-1] < 2 * force[1], "the anchor should pull down, ever harder"
@@ -92,6 +100,8 @@ words = ["render", path, "-o", out / "heart.png", "--colour", "stress", "--count
 subprocess.run([sys.executable, "-m", "msmpetsc", *map(str, words)], check=True)
 
 # %% [markdown]
+# ![Von Mises' stress of a heart whose tip is led down](heart.png)
+#
 # `out/tutorial/heart.png` shows the rest shape and two states.
 # `out/tutorial/heart.xdmf` opens in ParaView with the stresses.
 #

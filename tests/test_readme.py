@@ -58,8 +58,7 @@ SMALLER = {  # a command's words -> those of the test
     "--count 12": "--count 3",
     "render scene.toml": "render scene.toml --set cages.count=200",
     "scene.toml --surface-error 1e-2": "scene.toml --surface-error 0.3 --cells 300 --frames 4",
-    "scene.toml --resume out/x.h5": "scene.toml --resume out/x.h5 --set time.duration=0.03 "
-    "--set cages.count=200",
+    "scene.toml --resume": "scene.toml --set time.duration=0.03 --set cages.count=200 --resume",
     "--set time.duration=4": "--set time.duration=0.05",
 }
 RUN = (
@@ -73,6 +72,8 @@ RUN = (
 DIFFER = {"compare": (0, 1), "plan": (0, 3)}  # exit statuses of commands that were carried out
 PROGRAM = ("-m", "msmpetsc.cli.main")
 LONG = ("study", "--device cuda")  # of RUN's commands, parsed only
+# commands that fork runs or start mpiexec, which no fork of a test's may do
+STARTING = ("plan ", "check ", "doctor")
 
 
 def name_of(path: Path) -> str:
@@ -167,7 +168,7 @@ def carried_out(command: str, folder: Path) -> subprocess.CompletedProcess:
         command = command.replace(words, small)
     launcher, _, arguments = command.rpartition("msmpetsc ")
     words = [*PROGRAM, *shlex.split(arguments)]
-    if arguments.startswith("plan "):  # whose runs are forked: no fork of a test's may do that
+    if arguments.startswith(STARTING):
         return python(*words, cwd=folder)
     with chdir(folder):
         return run(2 if launcher.startswith("mpirun -n 2 ") else 1, *words)

@@ -1,11 +1,10 @@
-"""The table of fields: what is written has its types, shapes and units, and the documentation's table has each once."""
+"""The table of fields: each written dataset has its type, shape and unit."""
 
 from dataclasses import fields
 from pathlib import Path
 
 import h5py
 import small_result
-from conftest import ROOT
 
 from msmpetsc.fields import DIMENSIONS, FIELDS, FRAME_FIELDS, STRESS, Frame
 
@@ -37,13 +36,3 @@ def test_what_is_written_is_what_the_table_says(tmp_path: Path):
                 assert size == (
                     sizes.setdefault(symbol, size) if isinstance(symbol, str) else symbol
                 ), name
-
-
-def test_the_documentation_has_this_very_table():
-    rows = [
-        f"| /{name} | {field.dtype} | ({', '.join(map(str, field.shape))}{',' * (len(field.shape) == 1)}) "
-        f"| {field.unit} | {field.long_name} |"
-        for name, field in FIELDS.items()
-    ]
-    head = ["| dataset | type | shape | unit | meaning |", "|---|---|---|---|---|"]
-    assert "\n".join([*head, *rows]) in (ROOT / "msmpetsc" / "results" / "README.md").read_text()

@@ -1,7 +1,8 @@
-"""The README files are right: their links, files, commands, scenes, studies and Python.
+"""README files and pages of the documentation are right: links, commands, scenes, studies, Python.
 
-Every command is parsed by the program itself. Those of README.md and of RUN are also run, at the small size that
-SMALLER makes of them; what only another machine could run (pip, modules, apt) is listed in ELSEWHERE.
+The program itself parses every command. Commands of README.md and of RUN are also run, at the
+small size that SMALLER makes of them. ELSEWHERE lists programs that only other machines have.
+Tables of a scene on a page are run as a scene with the tables that they lack.
 """
 
 import os
@@ -15,42 +16,74 @@ from pathlib import Path
 
 import pytest
 import small_result
+import tomli_w
 import trimesh
 from conftest import ROOT, python, run
+from hooks import page_of_script
+from reference_tables import MARKER, TABLES, with_tables
 
 from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
+from msmpetsc.fields import FIELDS
 from msmpetsc.geometry.registry import locate
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import BodyTable, SceneFile
+from msmpetsc.solve.presets import PRESETS
 from msmpetsc.study.study_file import load_study
+from msmpetsc.study.table import COLUMNS
 
 OUTSIDE = {".venv", "out", "build", ".petsc-cuda", ".pytest_cache", ".hypothesis"}
 READMES = sorted(
     path for path in ROOT.rglob("README.md") if not OUTSIDE & set(path.relative_to(ROOT).parts)
 )
-ELSEWHERE = {"asv", "pip", "python", "module", "export", "./configure", "eval"}
+PAGES = sorted((ROOT / "scripts" / "docs" / "pages").rglob("*.md"))
+TEXTS = [*READMES, *PAGES]
+START, HOW_TO, REFERENCE = (
+    ROOT / "scripts" / "docs" / "pages" / name for name in ("get-started", "how-to", "reference")
+)
+ELSEWHERE = {
+    "asv", "pip", "python", "module", "export", "./configure", "eval",
+    "sbatch", "docker", "apptainer", "conda", "spack",
+}  # fmt: skip
 SMALLER = {  # a command's words -> those of the test
-    "cages.count=3000": "cages.count=400 --frames 4",
-    "run scenes/bunny_fall.toml --overwrite": "run scenes/bunny_fall.toml --overwrite --set cages.count=400 --frames 2",
-    "my.toml --picture": "my.toml --picture --frames 2 --set cages.count=200",
+    "cages.count=3000": "cages.count=400 --frames 4 --overwrite",
+    "bunny_fall.toml --overwrite": "bunny_fall.toml --overwrite --set cages.count=400 --frames 2",
+    "new my.toml --mesh body.obj": "new my.toml --mesh body.obj --overwrite",
+    "my.toml --picture": "my.toml --picture --overwrite --frames 2 --set cages.count=200",
+    "run scene.toml --overwrite": "run scene.toml --overwrite --frames 2 --set cages.count=200",
+    "render my.toml": "render my.toml --set cages.count=200",
     "scene.toml --ranks 512": "scene.toml --ranks 8 --set cages.count=500",
     "--frames 0,100,200": "--frames 0,2,4",
     "--count 12": "--count 3",
     "render scene.toml": "render scene.toml --set cages.count=200",
     "scene.toml --surface-error 1e-2": "scene.toml --surface-error 0.3 --cells 300 --frames 4",
-    "scene.toml --resume out/x.h5": "scene.toml --resume out/x.h5 --set time.duration=0.03 --set cages.count=200",
+    "scene.toml --resume": "scene.toml --set time.duration=0.03 --set cages.count=200 --resume",
     "--set time.duration=4": "--set time.duration=0.05",
 }
-RUN = ("msmpetsc/results/README.md", "scripts/README.md", "scenes/studies/README.md")
+RUN = (
+    ROOT / "scripts" / "README.md",
+    *(
+        START.parent / f"{name}.md"
+        for name in ("forces-and-stress", "pictures", "comparing", "resuming")
+    ),
+    *sorted((*START.glob("*.md"), *HOW_TO.glob("*.md"))),
+)
 DIFFER = {"compare": (0, 1), "plan": (0, 3)}  # exit statuses of commands that were carried out
 PROGRAM = ("-m", "msmpetsc.cli.main")
 LONG = ("study", "--device cuda")  # of RUN's commands, parsed only
+# commands that fork runs or start mpiexec, which no fork of a test's may do
+STARTING = ("plan ", "check ", "doctor")
+
+
+def name_of(path: Path) -> str:
+    """Return the name of a README file or page in the names of tests."""
+    short = path.relative_to(ROOT)
+    return str(short.parent if short.name == "README.md" else Path(*short.parts[-2:]))
 
 
 def blocks(path: Path, kind: str) -> list[str]:
-    """Return the contents of the blocks of a README that are marked as of this kind."""
+    """Return the contents of the blocks of a README or page that are marked as of this kind."""
     return re.findall(rf"^```{kind}\n(.*?)^```", path.read_text(), re.M | re.S)
 
 
@@ -61,29 +94,35 @@ def commands(path: Path) -> list[str]:
 
 
 ALL_COMMANDS = [
-    pytest.param(command, id=f"{path.relative_to(ROOT).parent}: {command}")
-    for path in READMES
+    pytest.param(command, id=f"{name_of(path)}: {command}")
+    for path in TEXTS
     for command in commands(path)
 ]
-WITH_PYTHON = [path for path in READMES if blocks(path, "python")]
+WITH_PYTHON = [path for path in TEXTS if blocks(path, "python")]
+
+
+def code_of(text: str) -> list[str]:
+    """Return the lines of a program without indentation, empty lines and comments of their own."""
+    lines = [line.strip() for line in text.splitlines()]
+    return [line for line in lines if line and not line.startswith("#")]
 
 
 def test_the_loops_of_a_step_are_printed_as_they_stand_in_the_files():
     folder = ROOT / "msmpetsc" / "solve"
     files = "\n".join(path.read_text() for path in (folder / "nonlinear").glob("*.py"))
-    files = "\n".join(line.strip() for line in files.splitlines())
+    files = "\n".join(code_of(files))
     printed = re.findall(r"^```\n(.*?)^```", (folder / "README.md").read_text(), re.M | re.S)
     loops = [block for block in printed if "while not" in block]
     assert len(loops) == 2
     for loop in loops:
-        assert "\n".join(line.strip() for line in loop.splitlines()) in files
+        assert "\n".join(code_of(loop)) in files
 
 
 def test_the_front_door_is_short():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 200
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 100
 
 
-@pytest.mark.parametrize("path", READMES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", TEXTS, ids=name_of)
 def test_links_and_files_exist(path: Path):
     text = path.read_text()
     for target in re.findall(r"\]\(([^)]+)\)", text):
@@ -92,7 +131,8 @@ def test_links_and_files_exist(path: Path):
         assert linked.exists(), target
         titles = re.findall(r"^#+ (.*)", linked.read_text(), re.M) if anchor else []
         anchors = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
-        assert not anchor or anchor in anchors, target
+        made_by_mkdocstrings = anchor.startswith("msmpetsc.")
+        assert not anchor or made_by_mkdocstrings or anchor in anchors, target
     for name in set(re.findall(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|png|sbatch))", text)):
         folders = (ROOT, ROOT / "msmpetsc", path.parent)
         assert name.startswith("out/") or any((folder / name).exists() for folder in folders), name
@@ -128,7 +168,7 @@ def carried_out(command: str, folder: Path) -> subprocess.CompletedProcess:
         command = command.replace(words, small)
     launcher, _, arguments = command.rpartition("msmpetsc ")
     words = [*PROGRAM, *shlex.split(arguments)]
-    if arguments.startswith("plan "):  # whose runs are forked: no fork of a test's may do that
+    if arguments.startswith(STARTING):
         return python(*words, cwd=folder)
     with chdir(folder):
         return run(2 if launcher.startswith("mpirun -n 2 ") else 1, *words)
@@ -145,14 +185,22 @@ def carry_out(path: Path, folder: Path) -> None:
 
 
 def write_own_scene(folder: Path) -> None:
-    """Write the front door's scene of one's own, and its body."""
-    (folder / "scene.toml").write_text(blocks(ROOT / "README.md", "toml")[0])
-    trimesh.creation.box(extents=[1, 0.5, 0.5]).export(folder / "body.obj")
+    """Write the scene of the page on own meshes, and its body, whose one end is the group "tip"."""
+    (folder / "scene.toml").write_text(blocks(START / "own-mesh.md", "toml")[0])
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [1, 0.5, 0.5]])
+    at_end = (box.vertices[box.faces, 0] == 1).all(axis=1)
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices]
+    for group, faces in (("side", box.faces[~at_end]), ("tip", box.faces[at_end])):
+        lines += [f"g {group}", *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
+    (folder / "body.obj").write_text("\n".join([*lines, ""]))
 
 
 @pytest.fixture(scope="module")
 def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the clone's scenes, a scene of one's own and its body, and what the front door's commands leave."""
+    """A folder with the clone's scenes, an own scene and body, and the results of the front door.
+
+    Other README files draw and compare the results of the first page, so it is carried out, too.
+    """
     try:
         locate("bunny_scan", str(ROOT))
     except InputError as error:
@@ -161,6 +209,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "scenes").symlink_to(ROOT / "scenes")
     write_own_scene(folder)
     carry_out(ROOT / "README.md", folder)
+    carry_out(START / "first-body.md", folder)
     return folder
 
 
@@ -174,17 +223,17 @@ def test_commands_of_the_front_door_run(clone: Path):
         "loose.h5",
         "my.h5",
         "my.png",
-        "bunny_fall.h5",
+        "my.mp4",
     } <= names
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RUN)
-def test_commands_run(name: str, clone: Path):
-    carry_out(ROOT / name, clone)
+@pytest.mark.parametrize("path", RUN, ids=name_of)
+def test_commands_run(path: Path, clone: Path):
+    carry_out(path, clone)
 
 
-@pytest.mark.parametrize("path", WITH_PYTHON, ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", WITH_PYTHON, ids=name_of)
 def test_python_runs(path: Path, tmp_path: Path):
     (tmp_path / "out").mkdir()
     small_result.write(tmp_path / "out" / "bunny_fall.h5")
@@ -195,7 +244,8 @@ def test_python_runs(path: Path, tmp_path: Path):
 
 
 def test_the_scene_with_every_table_is_one(tmp_path: Path):
-    one, several = blocks(ROOT / "scenes" / "README.md", "toml")
+    (one,) = blocks(REFERENCE / "every-table.md", "toml")
+    (several,) = blocks(HOW_TO / "several-bodies.md", "toml")
     assert set(tomllib.loads(one)) == set(SceneFile.model_fields) - {"body"}
     assert set(tomllib.loads(several)["body"][1]) == set(BodyTable.model_fields)
     for text in (one, several):
@@ -203,27 +253,69 @@ def test_the_scene_with_every_table_is_one(tmp_path: Path):
         assert load_scene(tmp_path / "scene.toml").text == text
 
 
+STUDIES = HOW_TO / "study.md"
+WITH_TABLES = [path for path in PAGES if blocks(path, "toml") and path != STUDIES]
+WITH_TABLES.remove(REFERENCE / "every-table.md")  # which names meshes that are downloaded
+LACKED = {  # tables of the scene that a page's tables change
+    "mesh": {"source": "body.obj"},
+    "cages": {"count": 200},
+    "material": {"young_modulus": 1e6, "density": 1000},
+    "time": {"step": 0.01, "duration": 0.02},
+}
+
+
+@pytest.mark.parametrize("path", WITH_TABLES, ids=name_of)
+def test_tables_on_pages_run(path: Path, tmp_path: Path):
+    write_own_scene(tmp_path)
+    for number, text in enumerate(blocks(path, "toml")):
+        tables = tomllib.loads(text)
+        scene = LACKED | tables
+        scene["material"] = LACKED["material"] | tables.get("material", {})
+        scene["cages"] = LACKED["cages"]
+        if "body" in tables:
+            del scene["mesh"]
+        steps = [] if scene["time"].get("integrator") == "static" else ["--frames", "2"]
+        file = tmp_path / f"{number}.toml"
+        file.write_text(tomli_w.dumps(scene))
+        run(1, *PROGRAM, "run", file, "-o", file.with_suffix(".h5"), *steps, status=0)
+
+
 def test_the_study_files_are_some(tmp_path: Path):
     path = tmp_path / "study.toml"
-    for text in blocks(ROOT / "scenes" / "studies" / "README.md", "toml"):
+    for text in blocks(STUDIES, "toml"):
         path.write_text(text)
         study = load_study(path)
         assert study.sweep or study.map
 
 
-def options_of_run() -> str:
-    """The table of what a run can be asked for, as the request has it."""
-    rows = ["| option | in Python | meaning |", "|---|---|---|"]
-    for name, option in OPTIONS.items():
-        value = option.value or "|".join(option.choices or ())
-        words = f"{option.short} {flag_of(name)} {value}" if name != "scene" else value
-        shown = "" if option.python else f"`{words.strip()}`".replace("|", "\\|")
-        rows.append(f"| {shown} | `{name}` | {option.help} |")
-    return "\n".join(rows)
+def test_the_page_of_the_study_table_has_each_column():
+    named = set(re.findall(r"`(\w+)`", (REFERENCE / "study-table.md").read_text()))
+    assert set(COLUMNS) <= named
 
 
-def test_the_table_of_options_is_that_of_the_request():
-    assert options_of_run() in (ROOT / "msmpetsc" / "README.md").read_text(), options_of_run()
+def test_pages_have_the_tables_that_are_generated():
+    marked = [name for path in PAGES for name in MARKER.findall(path.read_text())]
+    assert sorted(marked) == sorted(TABLES)
+    text = with_tables("".join(f"<!-- table: {name} -->\n" for name in TABLES))
+    assert "<!--" not in text
+    expected = [*FIELDS, *PRESETS, *map(flag_of, OPTIONS), "cages.cell_size", "region.half_space"]
+    expected = [
+        name for name in expected if name not in ("--scene", "--petsc-options", "--on-frame")
+    ]
+    assert [name for name in expected if name not in text] == []
+
+
+def test_each_page_is_in_the_navigation():
+    navigation = (ROOT / "scripts" / "docs" / "mkdocs.yml").read_text()
+    folder = START.parent
+    tutorials = [path.with_suffix(".md") for path in folder.glob("tutorials/*.py")]
+    for path in (*PAGES, *tutorials):
+        assert f": {path.relative_to(folder)}\n" in navigation
+
+
+def test_a_script_of_cells_becomes_a_page():
+    script = "# %% [markdown]\n# # Title\n#\n# Text\n\n# %%\nx = 1  # one\n"
+    assert page_of_script(script) == "# Title\n\nText\n\n```python\nx = 1  # one\n```\n"
 
 
 def test_the_tests_of_cases_are_there():

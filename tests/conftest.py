@@ -22,7 +22,8 @@ WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
 os.environ.update(AS_ROOT)  # for what the program itself starts by mpiexec, called within a test
 SHARED_CORES = {"OMPI_MCA_mpi_yield_when_idle": "1"}  # more ranks than cores: who waits makes room
-# Open MPI 5 writes a line for each rank about networks that do not pair, IPv4 with IPv6; ranks of one machine need none
+# Open MPI 5 writes a line for each rank about networks that do not pair, IPv4 with
+# IPv6; ranks of one machine need none
 ONE_MACHINE = {"OMPI_MCA_btl_tcp_if_include": "lo"}
 # As this process was started: its own MPI, once awake, leaves marks that would confuse a child's.
 PATHS = os.pathsep.join(
@@ -43,7 +44,9 @@ DURATIONS = Path(__file__).parent / "durations.json"
 # Seconds of a file up to which its tests are in the smoke run, which takes three minutes in all
 SMOKE = 3.0
 
-HANGS = 500.0  # [s]: what takes longer will not end; a loaded machine was seen to take ten times as long as another
+# [s]: what takes longer will not end; a loaded machine was seen to take ten times as
+# long as another
+HANGS = 500.0
 
 Run = Callable[..., subprocess.CompletedProcess]
 

@@ -1,4 +1,5 @@
-"""Results are read with the core dependencies alone; a package that is missing is named in one line with its extra."""
+"""Results are read with the core dependencies alone; a package that is missing is named in one line
+with its extra."""
 
 import os
 import re

@@ -1,4 +1,5 @@
-"""Scenes of all kinds on two ranks as on one: the same lattice, and the same frames to the error of their steps."""
+"""Scenes of all kinds on two ranks as on one: the same lattice, and the same frames to the error of
+their steps."""
 
 from typing import Any, NamedTuple
 
@@ -39,7 +40,8 @@ SWITCHED = [
 
 
 class Case(NamedTuple):
-    """Tables of a scene, words of the command, how near positions are [sides], and numbers of frames that are equal."""
+    """Tables of a scene, words of the command, how near positions are [sides], and numbers of
+    frames that are equal."""
 
     tables: dict[str, Any]
     words: tuple[str, ...] = ()
@@ -71,18 +73,22 @@ CASES = {
                   "velocity": [0, 0, 1], "spin": [2, 0, 1]},
         "time": steps(2, 1 / 128), "output": {"surface": True},
     }),
-    "clamp": Case({"cages": {"cell_size": 0.11}, "pin": [{"region": TILTED}], "time": steps(1, 0.01)}),
+    "clamp": Case({"cages": {"cell_size": 0.11}, "pin": [{"region": TILTED}],
+    "time": steps(1, 0.01)}),
     "pressed": pressed("neo-hookean"),
     "explicit": Case({
         "obstacle": [FLOOR, WALL], "anchor": LED, "material": SOLID,
         "gravity": {"acceleration": [3, 0, -9.81]}, "time": steps(12, 1 / 60, "verlet"),
     }, equal=("iterations",)),
     "multigrid": Case({
-        "sides": np.array([8, 3, 3]) * CELL, "start": {"velocity": [0.5, 0, -1.5]}, "obstacle": [FLOOR],
-        "gravity": GRAVITY, "solver": {"preset": "newton-multigrid", "error": 1e-6}, "time": steps(6, 0.01),
+        "sides": np.array([8, 3, 3]) * CELL, "start": {"velocity": [0.5, 0, -1.5]},
+        "obstacle": [FLOOR],
+        "gravity": GRAVITY, "solver": {"preset": "newton-multigrid", "error": 1e-6},
+        "time": steps(6, 0.01),
     }, ("-pc_mg_levels", "3"), 1e-5),
     "rescued": Case({
-        "sides": BEAM, "pin": [{"region": LEFT}], "gravity": GRAVITY, "safety": {"on_failure": "fallback"},
+        "sides": BEAM, "pin": [{"region": LEFT}], "gravity": GRAVITY,
+        "safety": {"on_failure": "fallback"},
         "time": steps(3, 0.1),
     }, ("-snes_max_it", "1", "-fallback_ksp_rtol", "1e-3"), 1e-6, ("fallbacks",)),
     "by error": Case({
@@ -90,14 +96,18 @@ CASES = {
         "time": steps(40, 0.01, "bdf2", error=3e-2),
     }, accuracy=1e-4, equal=("steps",)),
     "a saddle": Case({
-        "sides": [1, 0.2, 0.2], "cages": {"count": 80, "boundary": "whole"}, "start": {"scale": [2, 0.05, 2]},
-        "material": SOFT | {"young_modulus": 283262.4}, "gravity": GRAVITY, "time": steps(1, 0.00208),
+        "sides": [1, 0.2, 0.2], "cages": {"count": 80, "boundary": "whole"},
+        "start": {"scale": [2, 0.05, 2]},
+        "material": SOFT | {"young_modulus": 283262.4}, "gravity": GRAVITY,
+        "time": steps(1, 0.00208),
     }, accuracy=1e-6),
     "static": Case({
-        "sides": BEAM, "pin": [{"region": LEFT}], "force": SWITCHED, "time": steps(4, 1.0, "static"),
+        "sides": BEAM, "pin": [{"region": LEFT}], "force": SWITCHED,
+        "time": steps(4, 1.0, "static"),
     }),
     "twisted": Case({
-        "sides": BEAM, "pin": [{"region": LEFT}], "anchor": TURNED, "material": SOLID, "solver": {"error": 1e-12},
+        "sides": BEAM, "pin": [{"region": LEFT}], "anchor": TURNED, "material": SOLID,
+        "solver": {"error": 1e-12},
         "time": steps(1, 1.0, "static"),
     }),
 }  # fmt: skip

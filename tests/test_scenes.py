@@ -1,5 +1,5 @@
-"""Every scene of the paper, and those that touch, at about 1,000 cells: what the figure shows, in numbers from the
-result file alone.
+"""Every scene of the paper, and those that touch, at about 1,000 cells: what the figure shows, in
+numbers from the result file alone.
 
 Bounds, not values: a coarse lattice is stiffer than the full one, its thin limbs thicker.
 """
@@ -74,7 +74,8 @@ class Result:
         return ((u >= low) & (u <= high)).all(axis=1)
 
     def region(self, table) -> np.ndarray:
-        """Nodes of a pin's, anchor's or force's region: those that are inside, or where the body is nearest to them."""
+        """Nodes of a pin's, anchor's or force's region: those that are inside, or where the body is
+        nearest to them."""
         distance, _, nearest, _ = igl.signed_distance(self.nodes, *self.body)
         places = np.where(distance[:, None] > 0, nearest, self.nodes)
         return inside(table.region, places, self.bounds)
@@ -204,7 +205,8 @@ def test_the_dragon_is_raised_to_rest_and_pushed_to_rest_and_bends_its_knees(res
 
 
 def error_of_lobes(run: Result) -> float:
-    """The greater of the two lobes' shape errors at the end [m]: thin bronchi join them, and they lean over."""
+    """The greater of the two lobes' shape errors at the end [m]: thin bronchi join them, and they
+    lean over."""
     lobes = (run.zone([x, 0, 0], [x + 0.45, 1, 0.5]) for x in (0, 0.55))
     parts = ((run.q[-1][lobe], run.nodes[lobe], run.mass[lobe]) for lobe in lobes)
     return max(

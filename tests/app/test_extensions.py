@@ -1,4 +1,5 @@
-"""Forces and presets of the user's own: by their discrete formulas, in the energy balance, by name, installed."""
+"""Forces and presets of the user's own: by their discrete formulas, in the energy balance, by name,
+installed."""
 
 import subprocess
 from pathlib import Path

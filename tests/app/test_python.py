@@ -1,4 +1,5 @@
-"""Runs from Python: msmpetsc.run says and writes what the command does, and raises where that returns a status."""
+"""Runs from Python: msmpetsc.run says and writes what the command does, and raises where that
+returns a status."""
 
 import inspect
 import shlex
@@ -64,7 +65,8 @@ def test_petsc_options_are_those_of_one_run(scene: Path, tmp_path: Path):
         )
         with msmpetsc.open(path) as result:
             assert options_of(result.attributes["petsc_options"].split()) | before == {
-                "ksp_rtol": "0.001" if isinstance(options, dict) else "1e-3", "ksp_max_it": "77", **before,
+                "ksp_rtol": "0.001" if isinstance(options, dict) else "1e-3", "ksp_max_it": "77",
+                **before,
             }  # fmt: skip
         assert PETSc.Options().getAll() == before
     with pytest.raises(InputError, match="-ksp_tpye: no part of this run"):
@@ -111,7 +113,8 @@ def test_a_request_is_recorded_as_its_command():
     asked = RunRequest("s.toml", true_error=3, picture=True, set=changes, petsc_options=options)
     words = shlex.split(asked.command)
     assert words == [
-        "msmpetsc", "run", "s.toml", "--set=pin=[{region = {box = [[0, 0, 0], [1, 1, 1]], relative = true}}]",
+        "msmpetsc", "run", "s.toml",
+        "--set=pin=[{region = {box = [[0, 0, 0], [1, 1, 1]], relative = true}}]",
         '--set=title="a b"', "--picture", "--true-error=3", "-ksp_view", "-options_left", "false",
     ]  # fmt: skip
     given = {name: value for name, value in vars(parsed(words[1:])).items() if name in OPTIONS}

@@ -1,4 +1,5 @@
-"""Frames without a file: those of msmpetsc.run, from files, tables and scenes, again and again on one lattice."""
+"""Frames without a file: those of msmpetsc.run, from files, tables and scenes, again and again on
+one lattice."""
 
 import gc
 import tomllib

@@ -49,7 +49,8 @@ def test_a_package_that_is_not_there_is_named():
 
 @pytest.mark.cuda
 def test_a_solver_that_computes_elsewhere_than_the_run_is_refused(tmp_path: Path, petsc_options):
-    """A prefix has a matrix type of its own, for the spare solver of a rescue or of the true error."""
+    """A prefix has a matrix type of its own, for the spare solver of a rescue or of the true
+    error."""
     if device.what_is_missing():
         pytest.skip(device.what_is_missing())
     petsc_options(mat_type="seqaijcusparse")

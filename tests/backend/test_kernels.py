@@ -1,4 +1,5 @@
-"""Compiled kernels are found again by the same sources, wherever they can be kept, and never by changed ones."""
+"""Compiled kernels are found again by the same sources, wherever they can be kept, and never by
+changed ones."""
 
 import os
 import resource
@@ -54,7 +55,8 @@ def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def environment(package: Path, **variables: object) -> dict[str, str]:
-    """Variables with which kernels of this package can be kept in those folders alone that are named here, or /tmp."""
+    """Variables with which kernels of this package can be kept in those folders alone that are
+    named here, or /tmp."""
     given = {"HOME": NOWHERE, "PYTHONPATH": str(package.parent), **variables}
     others = {
         name: x
@@ -103,7 +105,8 @@ def test_kernels_work_where_nothing_can_be_written(copied: Path):
 def test_changed_sources_never_find_old_kernels(
     copied: Path, tmp_path: Path, name, old, new, value
 ):
-    """Neither a kernel that is called, nor a constant or a named tuple of a file without kernels."""
+    """Neither a kernel that is called, nor a constant or a named tuple of a file without
+    kernels."""
     assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (8.0, 0)
     path = copied / "backend" / f"{name}.py"
     path.write_text(path.read_text().replace(old, new))

@@ -1,5 +1,6 @@
-"""Runs on a GPU, a real one where there is one, and one that is pretended (pretend_gpu): the same frames as on the CPU,
-no array of one place among those of the other, and nothing carried but what frames and checkpoints need."""
+"""Runs on a GPU, a real one where there is one, and one that is pretended (pretend_gpu): the same
+frames as on the CPU, no array of one place among those of the other, and nothing carried but what
+frames and checkpoints need."""
 
 import importlib
 import json
@@ -64,20 +65,25 @@ VISCOUS = {"material": {**SOLID["material"], "retardation_time": 0.01}}
 CASES = {
     "newton": FALL,
     "solid": {**FALL, **SOLID, **HELD, **LED},
-    "solid, pressed, viscous": {**FALL, **VISCOUS, "obstacle": [{**FLOOR, "response": "penalty"}, PLATE]},
+    "solid, pressed, viscous": {**FALL, **VISCOUS,
+    "obstacle": [{**FLOOR, "response": "penalty"}, PLATE]},
     "solid, bdf2": {**FALL, **VISCOUS, **HELD, "time": {**FALL["time"], "integrator": "bdf2"}},
     "solid, static": {
-        "time": {**FALL["time"], "integrator": "static"}, "gravity": {"acceleration": [0, 0, -40.0]}, **HELD,
+        "time": {**FALL["time"], "integrator": "static"},
+        "gravity": {"acceleration": [0, 0, -40.0]}, **HELD,
         "material": {**SOLID["material"], "poisson_ratio": 0.499}, "output": {"stress": True},
     },
     "solid, verlet": {**FALL, **SOLID, **LED, "time": {**FALL["time"], "integrator": "verlet"}},
-    "solid, multigrid": {**FALL, **VISCOUS, **HELD, "solver": {"preset": "newton-multigrid", "error": 1e-9}},
+    "solid, multigrid": {**FALL, **VISCOUS, **HELD,
+    "solver": {"preset": "newton-multigrid", "error": 1e-9}},
     "held, led and let go": {**FALL, **HELD, **LED},
     "reflected": {**FALL, "obstacle": [{**FLOOR, "response": "reflect"}]},
     "pressed and rubbed": {**FALL, **SOFT, "obstacle": [{**FLOOR, "response": "penalty"}, PLATE]},
-    "thin plates": {**FALL, "obstacle": [{**THIN, "response": "penalty", "friction": 0.3}, {**THIN, "start": 5 * T}]},
+    "thin plates": {**FALL,
+    "obstacle": [{**THIN, "response": "penalty", "friction": 0.3}, {**THIN, "start": 5 * T}]},
     "thin plates, bdf2": {
-        **FALL, "time": {**FALL["time"], "integrator": "bdf2"}, "obstacle": [THIN, {**THIN, "response": "penalty"}],
+        **FALL, "time": {**FALL["time"], "integrator": "bdf2"},
+        "obstacle": [THIN, {**THIN, "response": "penalty"}],
     },
     "thin plates, verlet": {
         **FALL, "time": {**FALL["time"], "integrator": "verlet"},
@@ -165,7 +171,8 @@ def test_a_step_that_fails_is_rescued(tmp_path: Path, on_gpu):
 def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_carried(
     tmp_path: Path, case: str
 ):
-    """Nothing that grows with the body: a few numbers do go to and fro, as where an obstacle has come to."""
+    """Nothing that grows with the body: a few numbers do go to and fro, as where an obstacle has
+    come to."""
     scene = load_scene(block_scene(tmp_path, **CASES[case], output={"surface": False, "every": 4}))
     with (
         pretended() as counted,
@@ -196,8 +203,10 @@ SIMULATED = {
     },
     "multigrid": {
         **CASES["pressed and rubbed"], "time": {"step": T, "duration": 2 * T},
-        "solver": {"preset": "newton-multigrid", "error": 1e-9},  # its cycle has single precision on a CPU alone
-        "obstacle": [{**FLOOR, "point": [0, 0, 0.01], "response": "penalty", "friction": 0.3}],  # it begins in touch
+        # its cycle has single precision on a CPU alone
+        "solver": {"preset": "newton-multigrid", "error": 1e-9},
+        # it begins in touch
+        "obstacle": [{**FLOOR, "point": [0, 0, 0.01], "response": "penalty", "friction": 0.3}],
     },
     "verlet": {**CASES["verlet"], "time": {"step": T, "duration": T, "integrator": "verlet"}},
     "solid": {**CASES["solid, multigrid"], "time": {"step": T, "duration": 2 * T}},
@@ -234,8 +243,8 @@ def bodies() -> list[Callable]:
 
 
 def test_kernels_compile_for_a_gpu(tmp_path: Path):
-    """To PTX, for the arguments that runs give them, and where there is ptxas to machine code that keeps its variables
-    in registers; it needs no GPU."""
+    """To PTX, for the arguments that runs give them, and where there is ptxas to machine code that
+    keeps its variables in registers; it needs no GPU."""
     for package in ("numba_cuda", "cupy"):
         pytest.importorskip(package, reason=f"no {package} here: pip install 'msmpetsc[cuda]'")
     given = {}
@@ -305,7 +314,8 @@ with pretended():
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [3, pytest.param(2, marks=pytest.mark.cuda)])
 def test_ranks_agree_on_gpus_too(tmp_path: Path, ranks: int):
-    """And a run of the command line: ranks with ghosts, on pretended GPUs or a real one, against one on the CPU."""
+    """And a run of the command line: ranks with ghosts, on pretended GPUs or a real one, against
+    one on the CPU."""
     path = block_scene(tmp_path, **CASES["pressed and rubbed"])
     there = ["-c", ON_GPUS, "run"]
     if ranks == 2:

@@ -1,5 +1,5 @@
-"""Paths on the command line that lead nowhere, or to what is no file, or bear the name of another format: one line, and
-status 2. Commands for one process say so under mpiexec."""
+"""Paths on the command line that lead nowhere, or to what is no file, or bear the name of another
+format: one line, and status 2. Commands for one process say so under mpiexec."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""The command line: what it writes, what it refuses and how, and that no failure hangs or leaves anything behind."""
+"""The command line: what it writes, what it refuses and how, and that no failure hangs or leaves
+anything behind."""
 
 import subprocess
 import tomllib
@@ -266,7 +267,8 @@ def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path):
 def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
     scene: Path, tmp_path: Path, ranks: int, preset: str
 ):
-    """At rest until a force sets in at 0.025 s: frames 0 to 2 need no iteration, frame 3 more than one."""
+    """At rest until a force sets in at 0.025 s: frames 0 to 2 need no iteration, frame 3 more than
+    one."""
     out = tmp_path / "o.h5"
     force = "force.0={region={sphere={center=[0,0,-1],radius=1}},total=[1e4,0,0],start=0.025}"
     at_rest = sets("gravity.acceleration=[0,0,0]", force, "time.duration=0.05")

@@ -135,7 +135,8 @@ def test_a_body_thinner_than_a_cell_is_told_with_the_cells_that_would_do(
     of_a_cell: float,
     most: int,
 ):
-    """A strip of 100 x 20 x 1 mm, whose tip sinks by 0.08 to 0.66 of beam theory; whether counted or scaled."""
+    """A strip of 100 x 20 x 1 mm, whose tip sinks by 0.08 to 0.66 of beam theory; whether counted
+    or scaled."""
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", most)
     strip = block_scene(
         tmp_path, np.array([0.1, 0.02, 0.001]), cages=cages, time={"step": 0.01, "duration": 0.1}
@@ -178,7 +179,8 @@ def test_the_bytes_of_a_lattice_are_those_of_its_arrays(lattice: Lattice):
 
 
 def test_the_assembly_says_the_bytes_that_it_takes(lattice: Lattice):
-    """As Python's own count of memory has it, within a tenth; what PETSc takes for A is not in that."""
+    """As Python's own count of memory has it, within a tenth; what PETSc takes for A is not in
+    that."""
     unknowns = Unknowns(SELF, lattice)
     tracemalloc.start()
     matrix = assemble(SELF, unknowns, 0.01)

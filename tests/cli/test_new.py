@@ -24,7 +24,8 @@ from msmpetsc.scene.reading import load_scene
 
 
 def chair(upwards: int, back: int) -> trimesh.Trimesh:
-    """A chair of boxes that stands on y (1) or z (2), its back towards one end (1) or the other (-1)."""
+    """A chair of boxes that stands on y (1) or z (2), its back towards one end (1) or the other
+    (-1)."""
     boxes = [[[0, 0.4, 0], [0.45, 0.45, 0.45]], [[0, 0.45, 0], [0.45, 0.9, 0.05]]]  # seat and back
     boxes += [[[x, 0, z], [x + 0.05, 0.4, z + 0.05]] for x in (0, 0.4) for z in (0, 0.4)]
     mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in boxes])
@@ -175,10 +176,12 @@ def test_a_shipped_scene_is_copied_as_it_is(tmp_path: Path, capsys):
 
 
 def packed(folder: Path, kind: str) -> set[str]:
-    """The files of a wheel, an editable one or a source archive of this clone, built in a folder."""
+    """The files of a wheel, an editable one or a source archive of this clone, built in a
+    folder."""
     tree = folder / "tree"
     shutil.copytree(ROOT, tree, symlinks=True, ignore=lambda folder, names: [
-        name for name in names if name.startswith(".") or name in ("out", "tests", "build", "__pycache__")
+        name for name in names if name.startswith(".") or name in ("out", "tests", "build",
+        "__pycache__")
         or name.endswith((".egg-info", ".png"))
     ])  # fmt: skip
     build = f"from setuptools import build_meta; build_meta.build_{kind}('..')"

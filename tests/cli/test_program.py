@@ -63,7 +63,8 @@ def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_
 
 
 def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, capsys):
-    """Bending of a bar of the sides 0.5 and 0.25 m, E = 1e5 Pa: 6.19 L^2 / (d c), c = 10 m/s, is 0.62 s."""
+    """Bending of a bar of the sides 0.5 and 0.25 m, E = 1e5 Pa: 6.19 L^2 / (d c), c = 10 m/s, is
+    0.62 s."""
     for step, integrator, said in ((0.7, "bdf2", 1), (0.5, "bdf2", 0), (0.7, "verlet", 0)):
         time = {"step": step, "duration": step, "integrator": integrator}
         scene = block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -1]})

@@ -12,7 +12,8 @@ GRAVITY = np.array([0, 0, -9.81])
 
 @pytest.fixture(scope="module")
 def fall(tmp_path_factory: pytest.TempPathFactory) -> h5py.File:
-    """The shipped scene at its own time step until it has struck the ground, solved tightly by newton."""
+    """The shipped scene at its own time step until it has struck the ground, solved tightly by
+    newton."""
     path = tmp_path_factory.mktemp("runs") / "fall.h5"
     words = (
         "--set",

@@ -1,4 +1,5 @@
-"""How a command starts: help and refusals import little, and a command imports what it needs itself."""
+"""How a command starts: help and refusals import little, and a command imports what it needs
+itself."""
 
 import re
 from pathlib import Path

@@ -70,7 +70,8 @@ def test_of_two_anchors_on_a_node_the_first_leads_it_and_a_pin_is_stronger_than_
 
 
 def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
-    """Led nodes leave with the path's velocity; without loads nothing changes the momentum from then on."""
+    """Led nodes leave with the path's velocity; without loads nothing changes the momentum from
+    then on."""
     stop = 0.06 + 0.5 * T
     model, frames = play(led_scene(tmp_path, 15, [{"region": LEFT, "path": UP, "stop": stop}]))
     rest, mass = model.lattice.nodes, model.lattice.mass
@@ -106,7 +107,8 @@ def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
 def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(
     tmp_path: Path, petsc_options
 ):
-    """And one of the user's that the first solver used is not called unused, nor taken out with our defaults."""
+    """And one of the user's that the first solver used is not called unused, nor taken out with our
+    defaults."""
     scene = load_scene(led_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
     petsc_options(ksp_rtol="1e-8")
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
@@ -207,7 +209,8 @@ PRESETS = "newton", "anderson", "fast-msm"
 
 @pytest.fixture(scope="module")
 def runs(balls: Path) -> dict[int, tuple[Path, list]]:
-    """On so many ranks: the folder of results, and (status, what was told) of each rank for each of all commands."""
+    """On so many ranks: the folder of results, and (status, what was told) of each rank for each of
+    all commands."""
     half, most_of_it = (
         {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]},
         {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]},
@@ -244,7 +247,8 @@ def runs(balls: Path) -> dict[int, tuple[Path, list]]:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_two_ranks_lead_and_let_go_as_one(runs: dict, preset: str):
-    """The solver is built three times; at first six nodes of the last corner are free, which leaves one rank none."""
+    """The solver is built three times; at first six nodes of the last corner are free, which leaves
+    one rank none."""
     files = {}
     for ranks, (out, answers) in runs.items():
         assert [status for status, _ in answers[PRESETS.index(preset)]] == [0] * ranks, answers

@@ -1,4 +1,5 @@
-"""What a run says at its start: what takes which nodes, what has no effect, and a body of an odd size."""
+"""What a run says at its start: what takes which nodes, what has no effect, and a body of an odd
+size."""
 
 import logging
 import re
@@ -179,12 +180,14 @@ def test_the_first_lines_say_what_a_run_is_of_and_the_last_what_it_left(tmp_path
 
 
 def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
-    """Cells of 1/8 m around a block of 0.45 x 0.45 x 0.2 m: 4 x 4 x 2 of them, half of them of half the density."""
+    """Cells of 1/8 m around a block of 0.45 x 0.45 x 0.2 m: 4 x 4 x 2 of them, half of them of half
+    the density."""
     half = {"region": {"box": [[0, 0, 0], [0.25, 1, 1]]}, "density": 500.0}
     path = block_scene(tmp_path, [0.45, 0.45, 0.2], time=TIME, part=[half])
     for boundary, told in {
         "whole": "closed mesh of 0.0405 m^3, 30.37 kg; lattice of 0.0625 m^3, 46.88 kg",
-        "fill": "closed mesh of 0.0405 m^3, 29.25 kg; lattice of 0.0405 m^3, 29.25 kg",  # 0.25 m of 0.45 m are light
+        # 0.25 m of 0.45 m are light
+        "fill": "closed mesh of 0.0405 m^3, 29.25 kg; lattice of 0.0405 m^3, 29.25 kg",
     }.items():
         scene = load_scene(path, [f'cages.boundary="{boundary}"'])
         log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))

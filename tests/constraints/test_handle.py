@@ -57,17 +57,21 @@ def test_without_a_center_nodes_turn_about_their_centre_of_mass(tmp_path: Path):
 
 
 def bar(folder: Path, cells: int, turn: float, **tables) -> Path:
-    """A bar of 5 x 1 x 1 along x, clamped on the left, its right end a handle, which turns about x."""
+    """A bar of 5 x 1 x 1 along x, clamped on the left, its right end a handle, which turns about
+    x."""
     path = [{"time": 1.0, "turn": [turn, 0, 0]}]
     return block_scene(
-        folder, sides=np.array([5.0, 1.0, 1.0]), **{"solver": {"error": 1e-12}} | tables, material=SOLID,
+        folder, sides=np.array([5.0, 1.0, 1.0]), **{"solver": {"error": 1e-12}} | tables,
+        material=SOLID,
         cages={"cell_size": 1 / cells}, time={"integrator": "static", "step": 1.0, "duration": 1.0},
-        pin=[{"region": LEFT}], anchor=[{"region": {"box": [[4.99, -1, -1], [6, 2, 2]]}, "path": path}],
+        pin=[{"region": LEFT}],
+        anchor=[{"region": {"box": [[4.99, -1, -1], [6, 2, 2]]}, "path": path}],
     )  # fmt: skip
 
 
 def test_a_bar_twisted_by_a_handle_resists_as_saint_venants(tmp_path: Path):
-    """T = G K theta / L with K = 0.1406 b^4 of a square; ends that may not warp make it a little stiffer."""
+    """T = G K theta / L with K = 0.1406 b^4 of a square; ends that may not warp make it a little
+    stiffer."""
     shear = SOLID["young_modulus"] / (2 * (1 + SOLID["poisson_ratio"]))
     theory = shear * 0.1406 * np.radians(1) / 5
     of_sizes = []
@@ -83,7 +87,8 @@ def test_a_bar_twisted_by_a_handle_resists_as_saint_venants(tmp_path: Path):
 
 
 def test_forces_and_torques_of_a_body_in_balance_add_up(tmp_path: Path):
-    """A weight held by a pin and a handle that has bent and twisted it: moments about any point are none."""
+    """A weight held by a pin and a handle that has bent and twisted it: moments about any point are
+    none."""
     gravity = np.array([0.3, -0.5, -2.0])
     scene = bar(tmp_path, 4, 120.0, gravity={"acceleration": gravity.tolist()})
     text = scene.read_text().replace("time = 1.0", "time = 1.0\nby = [-0.3, 0.2, -0.4]")

@@ -1,4 +1,5 @@
-"""Forces on a body add up; probes go with it; `msmpetsc series` prints both, the same on any number of ranks."""
+"""Forces on a body add up; probes go with it; `msmpetsc series` prints both, the same on any number
+of ranks."""
 
 import csv
 from itertools import pairwise
@@ -41,7 +42,8 @@ def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
     """A pull and the weight, held by two pins that share an edge: the edge's nodes count once."""
     scene = block_scene(
         tmp_path, **TIGHT, material=material, time={"integrator": "static"},
-        pin=[{"region": BOTTOM}, {"region": EDGE}], force=[{"region": TOP, "total": [30.0, 0, 200.0]}],
+        pin=[{"region": BOTTOM}, {"region": EDGE}],
+        force=[{"region": TOP, "total": [30.0, 0, 200.0]}],
     )  # fmt: skip
     *_, frame = play(scene)[1]
     pull = np.array([30.0, 0, 200.0]) + 1000 * SIDES.prod() * np.array(G)
@@ -53,7 +55,8 @@ def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 @pytest.mark.parametrize(("damping", "retardation_time"), [(0.0, 0.0), (3.0, 0.0), (3.0, 0.02)])
 def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping, retardation_time):
-    """Lifted against a plate that rubs: of implicit Euler the change of momentum; damping takes its part."""
+    """Lifted against a plate that rubs: of implicit Euler the change of momentum; damping takes its
+    part."""
     scene = block_scene(
         tmp_path, **TIGHT, anchor=LIFT, obstacle=[PLATE],
         time={"step": 0.01, "duration": 0.03, "integrator": integrator},
@@ -89,7 +92,8 @@ def test_series_prints_what_the_file_has_and_replaces_nothing_unasked(tmp_path, 
     scene = block_scene(
         tmp_path, **TIGHT, material=SOLID, pin=[{"region": BOTTOM}], obstacle=[PLATE],
         time={"step": 0.01, "duration": 0.02},
-        output={"surface": False, "stress": True, "probe": [{"name": "top, middle", "point": [0.25, 0.3, 0.2]}]},
+        output={"surface": False, "stress": True,
+        "probe": [{"name": "top, middle", "point": [0.25, 0.3, 0.2]}]},
     )  # fmt: skip
     tables = []
     for ranks in (1, 2):

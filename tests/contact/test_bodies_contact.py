@@ -1,4 +1,5 @@
-"""Bodies that touch: they do not cross, keep their momentum, come to rest on each other; on three ranks, too."""
+"""Bodies that touch: they do not cross, keep their momentum, come to rest on each other; on three
+ranks, too."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -85,7 +86,8 @@ def test_a_block_that_touches_another_at_rest_lies_on_it(folder: Path, meshes: l
 
 
 def test_cubes_side_by_side_in_the_same_plane_of_the_grid_stay_where_they_are(folder: Path):
-    """Without a distance given: the gap made must be more than what a coordinate may be off a plane."""
+    """Without a distance given: the gap made must be more than what a coordinate may be off a
+    plane."""
     bodies = [body("block", [number * SIDE, 0, 0]) for number in range(2)]
     tables = {"time": {"step": 0.01, "duration": 0.03}, "gravity": {"acceleration": [0, 0, 0]}}
     model, frames = play(write(folder, "side_by_side", body=bodies, self_contact={}, **tables))
@@ -112,7 +114,8 @@ def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:
 
 
 def test_a_solid_ball_lands_on_its_lowest_cells_which_are_slivers(folder: Path):
-    """A direction that was bent at the ground led uphill: no line search could go on from the 11th frame."""
+    """A direction that was bent at the ground led uphill: no line search could go on from the 11th
+    frame."""
     tables = {"material": SOLID, "time": {"step": 0.01, "duration": 0.15}}
     model, frames = play(fall(folder, "solid", 0.02, **tables))
     assert max(frame.self_contacts for frame in frames) > 20 and frames[-1].substeps == 0
@@ -132,7 +135,8 @@ def crossings(model: Model, frames: list[Frame]) -> int:
 def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(
     turned: np.ndarray, bent: float
 ):
-    """Boxes around ways are those without what is linear in them, and yet hold what comes near by that alone."""
+    """Boxes around ways are those without what is linear in them, and yet hold what comes near by
+    that alone."""
     rng = np.random.default_rng(0)
     plates = [trimesh.creation.box([SIDE, SIDE, 0.01]).subdivide().subdivide() for _ in range(2)]
     plates[1].apply_translation([0.003, 0.005, 0.01 + 1.15 * 0.02])
@@ -157,7 +161,8 @@ def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(
 
 
 def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
-    """A line search looked behind the block, and the way there is asked for again: once a corner passed through so."""
+    """A line search looked behind the block, and the way there is asked for again: once a corner
+    passed through so."""
     scene = fall(folder, "way", 0.02, time={"step": 0.01, "duration": 0.01})
     model = build_model(MPI.COMM_SELF, load_scene(scene))
     assert model.collision is not None
@@ -208,7 +213,8 @@ def test_the_best_guess_is_taken_though_not_all_are_weighed(
 
 @pytest.fixture
 def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[str]]:
-    """Of each solve of each step of 10 ms, whether the surface was taken to touch nothing, or only what is known."""
+    """Of each solve of each step of 10 ms, whether the surface was taken to touch nothing, or only
+    what is known."""
     found: dict[int, list[str]] = {}
     problem = ContactFaces.problem
 
@@ -299,7 +305,8 @@ def test_a_step_that_fails_without_the_surface_is_solved_with_it(folder: Path, s
 
 
 def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path):
-    """A ball flies at a block, and its Newton correction through the block, of which the Hessian knows nothing."""
+    """A ball flies at a block, and its Newton correction through the block, of which the Hessian
+    knows nothing."""
     bodies = [
         body("block", [0, 0, 0]),
         body("ball", [0, 0, SIDE + 0.002], start={"velocity": [0, 0, -5.0]}),

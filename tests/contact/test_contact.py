@@ -1,4 +1,5 @@
-"""Penalty contact and friction: derivatives, a block at rest, sliding and pressed; obstacles that move and reflect."""
+"""Penalty contact and friction: derivatives, a block at rest, sliding and pressed; obstacles that
+move and reflect."""
 
 from pathlib import Path
 
@@ -54,7 +55,8 @@ flat_cases = pytest.mark.parametrize("penalties", CASES.values(), ids=CASES)
 
 
 def pressed(penalties: list[Penalty]) -> tuple[Contact, np.ndarray, np.ndarray]:
-    """Contact of a step from random q, positions a little away from q, and a direction to go in from there."""
+    """Contact of a step from random q, positions a little away from q, and a direction to go in
+    from there."""
     rng = np.random.default_rng(3)
     q = rng.uniform(-0.9, 0.9, (40, 3))
     contact = Contact([p.during(q, 0.5, T) for p in penalties], len(q))
@@ -91,7 +93,8 @@ def test_the_gradient_is_the_slope_of_the_change(penalties: list[Penalty]):
 
 @cases
 def test_a_small_change_keeps_its_digits(penalties: list[Penalty]):
-    """Against the first and second derivative: a plain difference of energies has no digit left here."""
+    """Against the first and second derivative: a plain difference of energies has no digit left
+    here."""
     contact, q, v = pressed(penalties)
     nodes, blocks = hessian(contact, q)
     moved = q + 1e-11 * v
@@ -115,7 +118,8 @@ def test_the_blocks_are_the_slope_of_the_gradient(penalties: list[Penalty]):
 
 
 def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
-    """The energy 1/2 k d^2 has the block k (n n^T - d / r (I - n n^T)), d = R - r, of which the first part is kept."""
+    """The energy 1/2 k d^2 has the block k (n n^T - d / r (I - n n^T)), d = R - r, of which the
+    first part is kept."""
     contact, q, v = pressed(BALLS["sphere"])
     step = 1e-7
     slope = (gradient(contact, q + step * v) - gradient(contact, q - step * v)) / (2 * step)
@@ -167,8 +171,8 @@ def test_the_parabola_of_frictions_secant_nowhere_lies_below_its_potential(name:
 
 @pytest.mark.parametrize("name", ["plane, sticking", "plane, slipping", "box, slipping"])
 def test_duals_of_friction_follow_its_forces(name: str):
-    """Those of a step from agreement are off by its square, those of no step are the forces, and agreement is the true
-    Hessian; whatever they are, no block is negative."""
+    """Those of a step from agreement are off by its square, those of no step are the forces, and
+    agreement is the true Hessian; whatever they are, no block is negative."""
     contact, q, v = pressed(CASES[name])
     friction = contact.states[0].friction
     forces, off = friction.force(q) / friction.limit[:, None], []
@@ -198,7 +202,8 @@ def test_a_node_in_a_box_is_pushed_out_through_the_nearest_face(axis: int, side:
 
 
 def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
-    """A node 0.2 deep in a plane that goes 0.05 along x in the step; mu N f'(u), f' = 2 s - s^2 at s = u/e < 1."""
+    """A node 0.2 deep in a plane that goes 0.05 along x in the step; mu N f'(u), f' = 2 s - s^2 at
+    s = u/e < 1."""
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)  # 0.5 and 0.2 m/s
     start = np.array([[0.0, 0, -0.2]])
     carried = start + np.array([0.05, 0.02, 0])
@@ -216,8 +221,8 @@ def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
 
 
 def test_friction_of_a_step_of_bdf2_goes_by_the_velocity_and_the_depth_that_it_ends_with():
-    """0.1 and 0.15 deep, a node will be 0.2 deep; one from outside no more than 0.3; one on its way out from 0.4 not at
-    all. The plane goes (0.05, 0.02) a step."""
+    """0.1 and 0.15 deep, a node will be 0.2 deep; one from outside no more than 0.3; one on its way
+    out from 0.4 not at all. The plane goes (0.05, 0.02) a step."""
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)
     before = np.array([[0.0, 0, -0.1], [0, 0, 0.9], [0, 0, -0.4]])
     start = np.array([[0.03, 0, -0.15], [0.03, 0, -0.15], [0.03, 0, -0.15]])
@@ -261,7 +266,8 @@ def test_a_block_at_rest_sinks_until_the_ground_carries_it(tmp_path: Path, stiff
 def test_a_stiff_die_comes_to_rest_though_contact_is_stiffer_than_the_corners_that_touch(
     tmp_path: Path,
 ):
-    """What F has of rounding is that of contact: the lightest corners weigh less than a millionth of a cell."""
+    """What F has of rounding is that of contact: the lightest corners weigh less than a millionth
+    of a cell."""
     die = trimesh.creation.box([0.2] * 3)
     die.apply_transform(
         trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3))
@@ -288,7 +294,8 @@ def slide(
     speed: dict | None = None,
     **tables,
 ):
-    """Velocities (steps + 1, 3) [m/s] of the mass centre, the weight tilted towards x by an angle of this tangent."""
+    """Velocities (steps + 1, 3) [m/s] of the mass centre, the weight tilted towards x by an angle
+    of this tangent."""
     down, ground = (
         np.array([slope, 0, -1]) / np.hypot(slope, 1),
         GROUND | {"friction": 0.5} | (speed or {}),
@@ -299,7 +306,8 @@ def slide(
 
 @pytest.mark.parametrize("given, error", [({}, 1e-9), ({"friction_speed": 1e-3}, 1e-6)])
 def test_friction_holds_a_block_on_a_gentle_slope(tmp_path: Path, given: dict, error: float):
-    """It gives way by f'(u / e) = 2 s - s^2 = tan / mu = 0.6: s = 0.37, once, and again after 20 steps: not in each."""
+    """It gives way by f'(u / e) = 2 s - s^2 = tan / mu = 0.6: s = 0.37, once, and again after 20
+    steps: not in each."""
     speed = slide(tmp_path, 0.3, 80, 0.02, given, solver={"error": error})[:, 0]
     stick = given.get("friction_speed", 0.01 * SIDES.max())
     creep = (1 - np.sqrt(0.4)) * stick
@@ -327,7 +335,8 @@ def test_friction_goes_on_from_the_slip_that_the_last_step_ended_with():
 def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_it_from_the_first_step_on(
     tmp_path: Path, beyond: float
 ):
-    """By a degree. Friction of no push in the first step let it go 4.7 mm; then it crept at 0.8 mm/s."""
+    """By a degree. Friction of no push in the first step let it go 4.7 mm; then it crept at 0.8
+    mm/s."""
     angle = np.arctan(0.5) + np.radians(beyond)
     scene = {"cages": {"cell_size": 0.05}, "material": {"young_modulus": 1e6, "density": 1000.0}}
     scene |= {"obstacle": [GROUND | {"friction": 0.5}], "time": {"step": 0.01, "duration": 1.0}}
@@ -360,11 +369,11 @@ PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0,
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:
-    """How far [m] X + mu Z is off, X and Z how far the mass centre went, of a block that slides at 2 m/s under a force.
+    """How far [m] X + mu Z is off, X and Z how far the mass centre went, of a block that slides at
+    2 m/s under a force.
 
-    M (x'' + mu z'') = mu (-N + N - F) = -mu F, whatever N is from moment to moment: X + mu Z = v T - mu / M iint F.
-    The ground is soft enough for steps to follow how the block sinks in.
-    """
+    M (x'' + mu z'') = mu (-N + N - F) = -mu F, whatever N is from moment to moment: X + mu Z = v T
+    - mu / M iint F. The ground is soft enough for steps to follow how the block sinks in."""
     mu, time = 0.2, {"step": t, "duration": 0.2, "integrator": "bdf2"}
     ground = GROUND | {"friction": mu, "stiffness": 2e3}
     force = [
@@ -388,7 +397,8 @@ def test_friction_under_a_push_that_changes_is_of_second_order_with_bdf2(tmp_pat
 
 
 PRESSING_PLANE = {
-    "shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.8,
+    "shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty",
+    "friction": 0.8,
     "path": [{"time": 1.0, "by": [0, 0, 0.3]}],
 }  # fmt: skip
 SLIDES = {  # it falls on the ground, slides a little and is pressed
@@ -451,8 +461,8 @@ def test_a_plate_presses_a_block_with_E_A_strain_and_lets_it_go(tmp_path: Path):
 def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, friction: float):
     """To the error it declares, |x - x*|_M / |x - y|_M; the exact x* by newton to 1e-11.
 
-    ``paper`` stops its CG at 1e-10 of |b|, which stiff contact makes large: with friction it comes to 1.4e-4.
-    """
+    ``paper`` stops its CG at 1e-10 of |b|, which stiff contact makes large: with friction it comes
+    to 1.4e-4."""
     model, frames = play(press(tmp_path), "time.duration=0.4")
     lattice, obstacle = model.lattice, model.penalties
     q, before = frames[5].position, frames[4].position
@@ -519,7 +529,8 @@ def test_an_obstacle_acts_from_start_to_before_stop():
 
 @pytest.mark.parametrize("hold", ["pin", "anchor"])
 def test_held_nodes_are_not_moved_by_what_strikes_them(tmp_path: Path, hold: str):
-    """A plane comes up through the bottom of a block that is held there: struck, it would take the plane's speed."""
+    """A plane comes up through the bottom of a block that is held there: struck, it would take the
+    plane's speed."""
     bottom = {"region": {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}}
     prescribed = bottom | {"path": [{"time": 9.0, "by": [0, 0, 0]}]}
     rising = {

@@ -1,4 +1,5 @@
-"""Scenes of bodies that touch, small: a block on a slope, a stack, a chain, a twisted bar, a ball pressed into a hole.
+"""Scenes of bodies that touch, small: a block on a slope, a stack, a chain, a twisted bar, a ball
+pressed into a hole.
 
 Nothing crosses, what should hold does, and what slides does so as Coulomb says.
 """
@@ -48,7 +49,8 @@ def box(folder: Path, name: str, sides: list[float], splits: int = 2) -> dict[st
 
 
 def crossings(model: Model, frames: list[Frame], *solids: trimesh.Trimesh) -> int:
-    """Return how many edges cross triangles, of bodies and solids that do not move, over all frames.
+    """Return how many edges cross triangles, of bodies and solids that do not move, over all
+    frames.
 
     But for the first: at rest flat faces have triangles in one plane, which cross by rounding.
     """
@@ -64,7 +66,8 @@ def crossings(model: Model, frames: list[Frame], *solids: trimesh.Trimesh) -> in
 
 
 def middles(model: Model, frames: list[Frame], bodies: np.ndarray) -> np.ndarray:
-    """Return the mass centres (frames, b, 3) [m] of bodies, by the number of that of each node (n,)."""
+    """Return the mass centres (frames, b, 3) [m] of bodies, by the number of that of each node
+    (n,)."""
     mass = model.lattice.mass
     each = [
         mass * (bodies == number) / mass[bodies == number].sum()
@@ -74,7 +77,8 @@ def middles(model: Model, frames: list[Frame], bodies: np.ndarray) -> np.ndarray
 
 
 def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_path):
-    """With 3e-4 of the diagonal for a distance, 0.1 mm in cells of 80 mm, the median was 60 iterations."""
+    """With 3e-4 of the diagonal for a distance, 0.1 mm in cells of 80 mm, the median was 60
+    iterations."""
     block = box(tmp_path, "block", [0.2] * 3)
     trimesh.creation.icosphere(subdivisions=2, radius=0.11).export(tmp_path / "ball.ply")
     meshes, places = [block, {"source": "ball.ply"}, block], [0.0, 0.05, -0.04]
@@ -178,7 +182,8 @@ def stack(folder: Path, duration: float) -> tuple[Model, list[Frame], np.ndarray
     ("duration", "farthest"), [(0.12, 2e-3), pytest.param(10.0, 1e-4, marks=pytest.mark.slow)]
 )
 def test_a_stack_of_five_cubes_stands(tmp_path, duration: float, farthest: float):
-    """It settles, and sways for two seconds. One of 0.2 MPa is as high as buckles under its own weight."""
+    """It settles, and sways for two seconds. One of 0.2 MPa is as high as buckles under its own
+    weight."""
     model, frames, places = stack(tmp_path, duration)
     assert crossings(model, frames) == 0
     drift = np.linalg.norm((places[-1] - places[round(0.3 * len(frames))])[:, :2], axis=1)
@@ -243,7 +248,8 @@ def test_a_bar_that_an_anchor_twists_does_not_cross_itself(tmp_path, turns: floa
 
 @pytest.mark.slow
 def test_a_ball_pressed_hard_into_a_hole_stays_out_of_its_rim(tmp_path):
-    """By 60 N: where nodes alone meet the rim it sinks into that by half a cell, and a step takes minutes."""
+    """By 60 N: where nodes alone meet the rim it sinks into that by half a cell, and a step takes
+    minutes."""
     ring = trimesh.creation.annulus(0.045, 0.15, 0.06, sections=48)
     ring.apply_translation([0, 0, -0.03]).export(tmp_path / "ring.ply")
     trimesh.creation.icosphere(3, 0.06).export(tmp_path / "ball.ply")

@@ -1,5 +1,5 @@
-"""A surface that meets itself in a crease, where its parts are nearer at rest than its distance: they do not push at
-rest, they do not cross, and what is told of them is true."""
+"""A surface that meets itself in a crease, where its parts are nearer at rest than its distance:
+they do not push at rest, they do not cross, and what is told of them is true."""
 
 from pathlib import Path
 
@@ -23,7 +23,8 @@ LAW = BarrierLaw(DISTANCE, 100.0, 0.5, 0.01)
 
 
 def grooved(half: float = HALF) -> trimesh.Trimesh:
-    """A block with a groove across its upper side; all its points are within three rings of each other."""
+    """A block with a groove across its upper side; all its points are within three rings of each
+    other."""
     low, high = LONG / 2 - half, LONG / 2 + half
     profile = [
         [LONG / 2, BOTTOM],
@@ -46,7 +47,8 @@ def grooved(half: float = HALF) -> trimesh.Trimesh:
 
 
 def barrier_of(half: float = HALF) -> tuple[Barrier, np.ndarray, tuple[int, int]]:
-    """The barrier of a grooved block, its points (14, 3), and how many pairs are in creases and how many push never."""
+    """The barrier of a grooved block, its points (14, 3), and how many pairs are in creases and how
+    many push never."""
     mesh = grooved(half)
     points = np.array(mesh.vertices)
     barrier = Barrier(Surface(points, np.array(mesh.faces)), LAW, len(points))

@@ -32,7 +32,8 @@ def test_box_absolute_and_relative():
 def test_sphere_absolute_and_relative():
     ball = {"sphere": {"center": [0.5, 0.5, 0.5], "radius": 0.25}}
     assert holds(ball, [0.5, 0.5, 0.75], [0.5, 0.25, 0.5], [0.7, 0.7, 0.5]) == [True, True, False]
-    # relative: centre at (1, 1, 2.5), the radius a quarter of the longest side, so 1; it stays round
+    # relative: centre at (1, 1, 2.5), the radius a quarter of the longest side, so 1;
+    # it stays round
     points = [[2, 1, 2.5], [1, 2, 2.5], [1, 1, 1.5], [2.01, 1, 2.5], [1, 1, 3.51]]
     assert holds(ball | {"relative": True}, *points) == [True, True, True, False, False]
 

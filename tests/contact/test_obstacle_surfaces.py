@@ -1,4 +1,5 @@
-"""Obstacles whose surface meets that of the bodies: nothing crosses at rest, pressed, turned, on one rank and two."""
+"""Obstacles whose surface meets that of the bodies: nothing crosses at rest, pressed, turned, on
+one rank and two."""
 
 from pathlib import Path
 
@@ -48,7 +49,8 @@ def surfaces(model: Model) -> ObstacleSurfaces:
 
 
 def crossed(model: Model, frame: Frame) -> int:
-    """How many edges of bodies cross triangles or are crossed by obstacles' edges, as the model has them at a frame.
+    """How many edges of bodies cross triangles or are crossed by obstacles' edges, as the model has
+    them at a frame.
 
     Triangles of a face of an obstacle that has turned may seem to cross each other by rounding.
     """
@@ -82,7 +84,8 @@ def test_a_block_comes_to_rest_on_a_floor_that_carries_its_weight(tmp_path: Path
 
 
 def test_a_plate_presses_a_block_that_is_held_at_its_foot(tmp_path: Path):
-    """Its step is many times the distance from which it pushes: what is near it is carried along."""
+    """Its step is many times the distance from which it pushes: what is near it is carried
+    along."""
     time = {"step": 0.05, "duration": 0.6}
     model, frames = play(fine_block(tmp_path, time=time, obstacle=[PLATE], pin=FOOT))
     assert not any(crossed(model, frame) for frame in frames)
@@ -169,7 +172,8 @@ PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0,
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:
-    """How far [m] X + mu Z is off, as in test_contact: it does not depend on how the push comes and goes."""
+    """How far [m] X + mu Z is off, as in test_contact: it does not depend on how the push comes and
+    goes."""
     mu, end, mass = 0.2, 0.2, DENSITY * SIDES.prod()
     floor = FLOOR | {"box": [[-0.503, -0.507, -0.2], [1.5, 1.1, -1e-4]]}
     force = [
@@ -204,7 +208,8 @@ def test_friction_of_the_surface_is_of_second_order_with_bdf2(tmp_path: Path):
 
 
 def test_ranks_agree(tmp_path: Path):
-    """For six steps: the seventh has two minima, of 5 and of 7 contacts, and one rank or two come to either."""
+    """For six steps: the seventh has two minima, of 5 and of 7 contacts, and one rank or two come
+    to either."""
     tables = {"self_contact": {"friction": 0.5}, "solver": ERROR | {"error": 1e-8}}
     ball = {
         "shape": "sphere",

@@ -1,4 +1,5 @@
-"""Obstacles that move by far more than the barrier's distance in a step, with a body between them."""
+"""Obstacles that move by far more than the barrier's distance in a step, with a body between
+them."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -55,7 +56,8 @@ def pressed(
     ["sheared", *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS if way != "sheared")],
 )
 def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
-    """Each of its steps is a hundred times the barrier's distance long; momentum is that of all forces."""
+    """Each of its steps is a hundred times the barrier's distance long; momentum is that of all
+    forces."""
     steps = 3
     plate = PLATE | {"center": CENTER, "path": [{"time": STEP * steps, **WAYS[way]}]}
     model, frames = pressed(tmp_path, plate, steps, self_contact={"friction": 0.4})
@@ -71,7 +73,8 @@ def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
 
 @pytest.mark.slow
 def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
-    """The cone widens it; the plate that pushes goes on by eighty times the barrier's distance in a step."""
+    """The cone widens it; the plate that pushes goes on by eighty times the barrier's distance in a
+    step."""
     ring = trimesh.creation.annulus(
         r_min=0.1, r_max=0.16, height=0.06, sections=24
     ).subdivide_to_size(0.06)
@@ -102,7 +105,8 @@ def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_paddle_that_goes_by_half_a_ball_a_step_hits_it(tmp_path: Path):
-    """Its point goes at three times the speed of sound of the ball, of which light nodes swing far out."""
+    """Its point goes at three times the speed of sound of the ball, of which light nodes swing far
+    out."""
     ball = trimesh.creation.icosphere(1, 0.1)
     ball.apply_translation([0.2, 0.14, 0])
     paddle = {"shape": "box", "box": [[-0.3, -0.01, -0.2], [0.3, 0.01, 0.2]], "center": [0, 0, 0]}

@@ -1,4 +1,5 @@
-"""What strikes an obstacle and leaps off again gains no energy, by its energy budget and by the sum of its frames."""
+"""What strikes an obstacle and leaps off again gains no energy, by its energy budget and by the sum
+of its frames."""
 
 from pathlib import Path
 

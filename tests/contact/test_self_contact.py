@@ -1,5 +1,5 @@
-"""A surface that meets itself: derivatives, momentum, no crossing on one rank and three, resumed runs, meshes that cut
-themselves, what is refused."""
+"""A surface that meets itself: derivatives, momentum, no crossing on one rank and three, resumed
+runs, meshes that cut themselves, what is refused."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,7 +44,8 @@ def closed(model: Model) -> np.ndarray:
 
 
 def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray]:
-    """The term of a step in which the left arm slides along the right one by so much [m], and where it ends."""
+    """The term of a step in which the left arm slides along the right one by so much [m], and where
+    it ends."""
     q = closed(model)
     assert model.collision is not None
     end = q.copy()
@@ -71,7 +72,8 @@ def test_gradient_is_that_of_the_energy(model, slid: float):
 
 @pytest.mark.parametrize("slid", [1e-7, 1e-4])
 def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
-    """By differences of energies it had none: line searches of blocks at rest then cut steps that lead down."""
+    """By differences of energies it had none: line searches of blocks at rest then cut steps that
+    lead down."""
     term, q = contact(model, slid)
     forward = np.zeros_like(q)
     forward[q[:, 0] < 0, 0] = 1.0  # one arm nearer to the other
@@ -287,7 +289,8 @@ def test_presets_of_a_are_refused(tmp_path):
 
 
 def sliding(folder: Path, angle: float, **given: float) -> Path:
-    """Scene of a block that falls onto a plate of the same mesh, all seen as tilted by an angle [degrees]."""
+    """Scene of a block that falls onto a plate of the same mesh, all seen as tilted by an angle
+    [degrees]."""
     cell, g, tilt = 1 / 16, 9.81, np.radians(angle)
     plate = (
         trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]])
@@ -311,7 +314,8 @@ def sliding(folder: Path, angle: float, **given: float) -> Path:
 
 
 def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
-    """Speed [m/s] of the block down the plate in each step from the 51st on, at rest on it, and these frames."""
+    """Speed [m/s] of the block down the plate in each step from the 51st on, at rest on it, and
+    these frames."""
     model, frames = play(path)
     free = model.lattice.nodes[:, 2] > 2 / 16
     mass = model.lattice.mass * free
@@ -320,7 +324,8 @@ def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
 
 
 def test_a_block_holds_on_a_tilted_one(tmp_path):
-    """It gives way once in the 20 steps for which that is remembered, as far as it would in each, were it not."""
+    """It gives way once in the 20 steps for which that is remembered, as far as it would in each,
+    were it not."""
     speed, frames = along_and_frames(sliding(tmp_path, 20.0))
     stick = 1e-2 * 1.5  # of the longest side of both, which are one mesh [m/s]
     creep = stick * (1 - np.sqrt(1 - np.tan(np.radians(20.0)) / 0.5))
@@ -361,7 +366,8 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
 
 
 def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Path, caplog):
-    """What bulges between passes: the upper one sinks further. Split as finely as the cells they touch all over."""
+    """What bulges between passes: the upper one sinks further. Split as finely as the cells they
+    touch all over."""
     sunk = []
     trimesh.creation.box(bounds=[[-0.5, -0.5, 0], [0.5, 0.5, 1]]).export(tmp_path / "cube.ply")
     below = {"region": {"box": [[-1, -1, -1], [1, 1, 1e-3]]}}

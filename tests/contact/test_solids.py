@@ -1,4 +1,5 @@
-"""Obstacles that are spheres, meshes or functions of the user's own: as the planes, boxes and spheres they describe."""
+"""Obstacles that are spheres, meshes or functions of the user's own: as the planes, boxes and
+spheres they describe."""
 
 from pathlib import Path
 
@@ -53,7 +54,8 @@ def solid_of(mesh: trimesh.Trimesh) -> MeshSolid:
 
 @pytest.mark.parametrize("mesh", [TORUS, STAR, CUT, trimesh.creation.icosphere(3)])
 def test_depths_are_igls_signed_distances(mesh: trimesh.Trimesh):
-    """Whose sign is that of the winding number, found in quite another way; of edges inwards and outwards, of parts."""
+    """Whose sign is that of the winding number, found in quite another way; of edges inwards and
+    outwards, of parts."""
     low, high = mesh.bounds
     x = np.random.default_rng(1).uniform(low - 0.3, high + 0.3, (3000, 3))
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
@@ -136,7 +138,8 @@ def test_a_function_is_the_sphere_that_it_describes(
 
 
 def test_a_mesh_is_the_box_that_it_describes(tmp_path: Path):
-    """The block falls aslant on a plate with friction; the faces by which it came in make no difference here."""
+    """The block falls aslant on a plate with friction; the faces by which it came in make no
+    difference here."""
     corners = np.array([[-0.2, -0.2, -0.5], [0.7, 0.7, -0.02]])
     trimesh.creation.box(bounds=corners).export(tmp_path / "plate.ply")
     shapes = [
@@ -168,7 +171,8 @@ def test_a_mesh_is_prepared_as_a_bodys_and_ranks_agree(tmp_path: Path):
 
 
 def test_the_surface_of_a_function_is_in_the_file(tmp_path: Path):
-    """By marching cubes, within a cell of its grid, cut below; under its number among the obstacles."""
+    """By marching cubes, within a cell of its grid, cut below; under its number among the
+    obstacles."""
     plane = {"shape": "plane", "point": [0, 0, -9], "normal": [0, 0, 1]}
     scene = block_scene(tmp_path, obstacle=[plane, OWN], **FALLING)
     with msm.open(msm.run(scene, tmp_path / "x.h5", quiet=True)) as result:
@@ -205,7 +209,8 @@ def test_a_large_sphere_is_a_plane(tmp_path: Path, integrator: str, response: di
 
 
 def test_a_node_is_turned_back_along_the_radius():
-    """What of its velocity goes to the centre becomes -e times itself; what goes along the sphere stays."""
+    """What of its velocity goes to the centre becomes -e times itself; what goes along the sphere
+    stays."""
     ball, q = (
         sphere([1.0, 2.0, 3.0], 0.5),
         np.array([[1.0, 2.3, 3.3], [1.0, 2.5, 3.5], [1.0, 2.2, 3.1]]),

@@ -1,4 +1,5 @@
-"""Nodes and plates that would pass each other within a step, obstacles that nodes begin in, and the energy of both."""
+"""Nodes and plates that would pass each other within a step, obstacles that nodes begin in, and the
+energy of both."""
 
 import re
 from pathlib import Path
@@ -97,7 +98,8 @@ STIFF = {"young_modulus": 1e6, "density": 1000.0}
 def against_a_plate(
     folder: Path, integrator: str, response: str, speed: float, moving: bool, **tables
 ) -> Path:
-    """A plate of a hundredth of a cell 0.1 m under a block that falls on it, or that it comes up to; no gravity."""
+    """A plate of a hundredth of a cell 0.1 m under a block that falls on it, or that it comes up
+    to; no gravity."""
     steps = 10 + int(np.ceil(0.4 / speed / STEP))
     plate = {"shape": "box", "box": [[-9, -9, -0.10125], [9, 9, -0.1]], "response": response}
     start = {}
@@ -137,7 +139,8 @@ def test_no_node_gets_past_a_thin_plate(
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_to_and_from_a_moving_frame_nothing_changes(tmp_path: Path, integrator: str):
-    """A plate that moves and one at rest, the body seen from it: with friction. Verlet's substeps differ."""
+    """A plate that moves and one at rest, the body seen from it: with friction. Verlet's substeps
+    differ."""
     tables = {"solver": {"preset": "newton", "error": 1e-10}}
     positions = []
     for moving in (False, True):
@@ -168,9 +171,9 @@ def test_a_body_rests_on_a_plate_thinner_than_its_push_is_deep(tmp_path: Path):
 
 
 def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path):
-    """One pushes from below, one reflects from the side and strikes the nodes of some ranks alone: positions, and the
-    energy that is known of them. A third has nodes inside, which one rank reports, and not again on resuming.
-    """
+    """One pushes from below, one reflects from the side and strikes the nodes of some ranks alone:
+    positions, and the energy that is known of them. A third has nodes inside, which one rank
+    reports, and not again on resuming."""
     time = {"step": 0.002, "duration": 0.046, "integrator": "bdf2"}
     pushing = {
         "shape": "box",
@@ -212,7 +215,8 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words(tmp_path: Path, mon
 
 
 def test_nodes_that_come_in_by_another_face_each_time_a_step_is_solved_settle(tmp_path: Path):
-    """A plate that comes edge first meets a fast body by its corner, out of a larger run of random boxes."""
+    """A plate that comes edge first meets a fast body by its corner, out of a larger run of random
+    boxes."""
     plate = {
         "shape": "box",
         "box": [[-1.481, 2.832, 0.2023], [1.519, 5.832, 0.2523]],
@@ -270,7 +274,8 @@ def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
 @pytest.mark.parametrize("response", ["reflect", "penalty"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_the_work_of_a_moving_obstacle_is_counted(tmp_path: Path, integrator: str, response: str):
-    """A plane that strikes a ball at rest: verlet with ``reflect`` used to end at once, having "gained" it all."""
+    """A plane that strikes a ball at rest: verlet with ``reflect`` used to end at once, having
+    "gained" it all."""
     floor = {"shape": "plane", "point": [0, 0, -0.53], "normal": [0, 0, 1], "response": response}
     floor["path"] = [{"time": 1.0, "by": [0, 0, 20.0]}]
     time = {"step": 0.001, "duration": 0.08, "integrator": integrator}
@@ -288,8 +293,8 @@ def told(caplog: pytest.LogCaptureFixture, what: str) -> list[str]:
 def test_energy_from_nowhere_is_told_once_with_its_frame(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    """The paper's exchange sets nodes back against their springs: 4% of a ball's energy at steps of 1 ms. What is told
-    is a share of what the body had, not of what the exchange put in."""
+    """The paper's exchange sets nodes back against their springs: 4% of a ball's energy at steps of
+    1 ms. What is told is a share of what the body had, not of what the exchange put in."""
     floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1], "response": "exchange"}
     scene = {
         "start": {"velocity": [0, 0, -10.0]},
@@ -324,7 +329,8 @@ def test_swings_and_loose_steps_are_no_gain(
 def test_nodes_that_begin_inside_are_told_with_number_depth_and_place(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    """A block 0.25 m high, of 3 x 3 x 3 nodes, half under the ground; the tops of two pins do not count."""
+    """A block 0.25 m high, of 3 x 3 x 3 nodes, half under the ground; the tops of two pins do not
+    count."""
     ground = {"shape": "plane", "point": [0, 0, 0.2], "normal": [0, 0, 1], "response": "exchange"}
     high = {"shape": "box", "box": [[-1, -1, 9], [1, 1, 10]], "response": "penalty"}
     late = {

@@ -39,7 +39,8 @@ def test_volumes_at_rest_and_mirrored():
 
 @pytest.mark.parametrize("corner", range(8))
 def test_a_corner_pushed_through_its_cell_makes_its_volume_least(corner: int):
-    """Unit cube, the corner moved inwards by s along all edges: its own edges are left 1 - s, less what they lean."""
+    """Unit cube, the corner moved inwards by s along all edges: its own edges are left 1 - s, less
+    what they lean."""
     one = lattice_of(1, 1, 1)
     cell, q = one.local_cells[0], one.nodes / H
     inwards = 2 * q.mean(axis=0) - 2 * q[cell[corner]]
@@ -61,8 +62,8 @@ def after_many_steps(lattice: Lattice, start: np.ndarray) -> np.ndarray:
 
 
 def test_a_cell_folded_into_its_neighbour_comes_back_as_a_solid_and_stays_as_springs():
-    """The end of a bar is pushed through the face that its last cell shares with the next. The cell is mirrored there:
-    all its springs have their lengths, so that to Hooke's law it is at rest."""
+    """The end of a bar is pushed through the face that its last cell shares with the next. The cell
+    is mirrored there: all its springs have their lengths, so that to Hooke's law it is at rest."""
     bar = lattice_of(3, 1, 1)
     start = bar.nodes + 0.02 * H * np.random.default_rng(7).normal(size=bar.nodes.shape)
     start[np.isclose(bar.nodes[:, 0], bar.nodes[:, 0].min()), 0] += 1.5 * H
@@ -93,7 +94,8 @@ def test_a_mirrored_cell_unfolds_without_a_step_that_fails(seed: int):
 def squeezed_step(
     preset: str, height: float, error: float
 ) -> tuple[np.ndarray, float, Lattice, np.ndarray]:
-    """A step of a block from rest at a share of its height: x, the error declared, the block, q_n."""
+    """A step of a block from rest at a share of its height: x, the error declared, the block,
+    q_n."""
     lattice = lattice_of(3, 3, 3)
     shake = 0.02 * H * np.random.default_rng(9).normal(size=lattice.nodes.shape)
     q = (lattice.nodes - lattice.nodes.mean(axis=0)) * [1, 1, height] + shake

@@ -1,4 +1,5 @@
-"""The neo-Hookean solid against closed forms, finite differences and dense eigenvalues, in whole and in cut cells."""
+"""The neo-Hookean solid against closed forms, finite differences and dense eigenvalues, in whole
+and in cut cells."""
 
 import numpy as np
 import pytest
@@ -21,14 +22,16 @@ YOUNG, H = 3e4, 0.1
 
 
 def points_inside(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Points (k, 3) of a random part of a cell about its middle: a half space of it, from a sliver to all but one."""
+    """Points (k, 3) of a random part of a cell about its middle: a half space of it, from a sliver
+    to all but one."""
     points = rng.random((n, 3)) - 0.5
     height = points @ rng.standard_normal(3)
     return points[height >= np.quantile(height, rng.uniform(0, 0.99))]
 
 
 def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Shares (8,) of the corners and squares (3,) of a part of a cell, that are sums over points of it."""
+    """Shares (8,) of the corners and squares (3,) of a part of a cell, that are sums over points of
+    it."""
     return 8 * (0.5 + SIGNS * points[:, None]).prod(axis=2).sum(axis=0) / n, (points**2).sum(
         axis=0
     ) / n
@@ -102,8 +105,9 @@ def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
-    """lambda = 49 mu, no more than mu meanwhile: as that of Poisson's ratio 1/4, by its mu. A Hessian with the pressure
-    of the softer solid is that solid's, and above it only by what resists the change of each cell's volume."""
+    """lambda = 49 mu, no more than mu meanwhile: as that of Poisson's ratio 1/4, by its mu. A
+    Hessian with the pressure of the softer solid is that solid's, and above it only by what resists
+    the change of each cell's volume."""
     lattice = solid(2, 2, 1, poisson=0.49, cut=cut)
     assert lattice.solid is not None
     elastic = Elasticity(lattice)
@@ -185,7 +189,8 @@ def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_
 
 
 def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
-    """mu |grad|^2 and the second variation of one cell each; and what F sees of strain is what the integral sees."""
+    """mu |grad|^2 and the second variation of one cell each; and what F sees of strain is what the
+    integral sees."""
     count, n = 10_000, 60
     share, squares = map(
         np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True)
@@ -211,7 +216,8 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
 
 
 def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
-    """As K of a trilinear cell has them, times 2 mu + 3 lambda, which bounds the Hessian: both are 1."""
+    """As K of a trilinear cell has them, times 2 mu + 3 lambda, which bounds the Hessian: both are
+    1."""
     lattice = build_lattice(
         cages_of(block(1, 1, 1), H), Material(density=1000, young_modulus=2.5, law="neo-hookean")
     )
@@ -244,7 +250,8 @@ def test_below_the_onset_the_volume_energy_goes_on_smoothly():
 
 
 def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
-    """A sliver's far corner may fold; the mean deformation gradient of what is inside has the say."""
+    """A sliver's far corner may fold; the mean deformation gradient of what is inside has the
+    say."""
     lattice = solid(1, 1, 1, poisson=0.45)
     points = 0.02 * RNG.random((100, 3)) - 0.5
     share, squares = moments(points, 10**8)
@@ -267,7 +274,8 @@ def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
 
 
 def test_viscosity_turns_with_its_cells_and_is_semidefinite_where_they_are_inside_out():
-    """A turn's rate costs nothing; a stretch of turned cells what it does at rest: 2 mu |eps|^2 + lambda (tr eps)^2."""
+    """A turn's rate costs nothing; a stretch of turned cells what it does at rest: 2 mu |eps|^2 +
+    lambda (tr eps)^2."""
     lattice = solid(3, 2, 2, poisson=0.45)
     viscosity = Viscosity(NeoHookean.of_lattice(lattice), 3.0, lattice.owned, lattice.nodes)
     turn, rest = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), lattice.nodes

@@ -20,8 +20,9 @@ def test_a_cantilever_two_cells_thick_bends_as_timoshenkos(poisson: float):
 
 @pytest.mark.parametrize(("poisson", "iterations"), [(0.25, 30), (0.49, 50), (0.4999, 70)])
 def test_an_elastica_two_cells_thick_ends_where_it_should(poisson: float, iterations: int):
-    """P L^2 / (E I) = 5: the tip is 0.71379 L down, 0.38763 L back; springs are 9% of the length off. All at once:
-    without softer solids that lead on, the second takes 64 and the third 1,108."""
+    """P L^2 / (E I) = 5: the tip is 0.71379 L down, 0.38763 L back; springs are 9% of the length
+    off. All at once: without softer solids that lead on, the second takes 64 and the third
+    1,108."""
     of = study.elastica(2, poisson)
     back, _, down = -of.moved(study.LENGTH) / study.LENGTH
     assert np.hypot(down - study.DOWN, back - study.BACK) < 0.015 and of.iterations < iterations
@@ -30,7 +31,8 @@ def test_an_elastica_two_cells_thick_ends_where_it_should(poisson: float, iterat
 @pytest.mark.parametrize("start", study.STARTS)
 @pytest.mark.parametrize("poisson", [0.25, 0.45, 0.49])
 def test_statics_find_one_state_wherever_a_bar_starts(poisson: float, start: str):
-    """A start that is twisted, mirrored or scattered ends in no fold: the state is that from the rest shape."""
+    """A start that is twisted, mirrored or scattered ends in no fold: the state is that from the
+    rest shape."""
     tables = {
         "pin": [study.held(0, 0, -1)],
         "gravity": {"acceleration": [0, 0, -1]},
@@ -52,7 +54,8 @@ def textbook(F: np.ndarray, poisson: float) -> np.ndarray:
 
 
 def stretched(poisson: float, s: float, sides: int) -> np.ndarray:
-    """Return the deformation gradient of stretches s along all axes but the last so many, whose faces are free."""
+    """Return the deformation gradient of stretches s along all axes but the last so many, whose
+    faces are free."""
 
     def shape(free: float) -> np.ndarray:
         return np.diag([*(3 - sides) * [s], *sides * [free]])

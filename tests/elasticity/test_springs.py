@@ -82,7 +82,8 @@ def test_projected_hessian_is_positive_where_the_true_one_is_not():
 
 
 def test_a_change_of_energy_keeps_its_digits():
-    """Against the first and second derivative: a plain difference of energies has no digit left here."""
+    """Against the first and second derivative: a plain difference of energies has no digit left
+    here."""
     v = (Q + 1e-10 * RNG.normal(size=Q.shape)) - Q  # as it is after rounding
     first, second = (gradient(Q) * v).sum(), 0.5 * (hessian_times(Q, v) * v).sum()
     change = OwnedSprings(HOOKE).change(Q + v, Q)

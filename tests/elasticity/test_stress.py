@@ -1,4 +1,5 @@
-"""Stress of neo-Hookean solids against closed forms: uniform strain, a bar, a beam, a plate with a hole."""
+"""Stress of neo-Hookean solids against closed forms: uniform strain, a bar, a beam, a plate with a
+hole."""
 
 from pathlib import Path
 
@@ -40,8 +41,8 @@ def along_x(low: float, high: float) -> dict:
 
 @pytest.mark.parametrize(("poisson", "cut"), [(0.25, False), (0.45, True)])
 def test_uniform_strain_has_the_textbooks_stress_in_cells_and_at_nodes(poisson: float, cut: bool):
-    """J sigma = mu (F F^T - I) + lambda (J - 1) J I; the pressure is the tensor's, von Mises' stress its principal
-    stresses'."""
+    """J sigma = mu (F F^T - I) + lambda (J - 1) J I; the pressure is the tensor's, von Mises'
+    stress its principal stresses'."""
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
     mu, lame = YOUNG / 2 / (1 + poisson), YOUNG * poisson / (1 + poisson) / (1 - 2 * poisson)
     elastic = Elasticity(lattice)
@@ -92,7 +93,8 @@ def test_a_bar_in_tension_has_force_over_area(tmp_path):
     """Of the area that it has when it is pulled."""
     scene = block_scene(
         tmp_path, np.array([1.0, 0.25, 0.25]), **STATIC, material=of_law(0.3),
-        pin=[{"region": along_x(-0.01, 0.01)}], force=[{"region": along_x(0.99, 1.01), "total": [1000.0, 0, 0]}],
+        pin=[{"region": along_x(-0.01, 0.01)}],
+        force=[{"region": along_x(0.99, 1.01), "total": [1000.0, 0, 0]}],
     )  # fmt: skip
     model, frame = at_rest(scene)
     middle = np.abs(model.lattice.nodes[:, 0] - 0.5) < 0.01
@@ -105,11 +107,13 @@ def test_a_bar_in_tension_has_force_over_area(tmp_path):
 
 
 def test_a_beam_in_bending_has_the_moment_times_the_height_over_i(tmp_path):
-    """Cells in the middle third of a cantilever: M z / I at their own middles, four through the depth."""
+    """Cells in the middle third of a cantilever: M z / I at their own middles, four through the
+    depth."""
     length, depth, width, pull = 4.0, 0.5, 0.25, -0.1
     scene = block_scene(
         tmp_path, np.array([length, width, depth]), **STATIC, material=of_law(0.25),
-        pin=[{"region": along_x(-0.01, 0.01)}], force=[{"region": along_x(3.99, 4.01), "total": [0, 0, pull]}],
+        pin=[{"region": along_x(-0.01, 0.01)}],
+        force=[{"region": along_x(3.99, 4.01), "total": [0, 0, pull]}],
     )  # fmt: skip
     model, frame = at_rest(scene)
     x, _, z = model.lattice.nodes[model.lattice.local_cells].mean(axis=1).T
@@ -141,12 +145,12 @@ def plate_with_a_hole(half: float, radius: float, thick: float) -> trimesh.Trime
 
 
 def test_a_plate_with_a_hole_has_thrice_the_stress_at_its_edge(tmp_path):
-    """Kirsch's  1/2 (2 + (a / r)^2 + 3 (a / r)^4)  beside the hole, 6 cells in radius, as far out as its cells lie.
+    """Kirsch's  1/2 (2 + (a / r)^2 + 3 (a / r)^4)  beside the hole, 6 cells in radius, as far out
+    as its cells lie.
 
-    Poisson's ratio is 0, on which it does not depend, so that the clamp disturbs nothing. The plate is 10 radii wide:
-    3 to 5% more than an endless one (Heywood: (2 + 0.8^3) / 0.8 = 3.14 for 3). Cells that the edge cuts scatter by more
-    than whole ones.
-    """
+    Poisson's ratio is 0, on which it does not depend, so that the clamp disturbs nothing. The plate
+    is 10 radii wide: 3 to 5% more than an endless one (Heywood: (2 + 0.8^3) / 0.8 = 3.14 for 3).
+    Cells that the edge cuts scatter by more than whole ones."""
     radius, cell, sigma = 1.0, 1 / 6, 10.0
     half, thick = 5.0, 1 / 6
     plate_with_a_hole(half, radius, thick).export(tmp_path / "plate.ply")

@@ -1,10 +1,10 @@
-"""A surface filled with cells: which cells it touches, what it encloses, the same on any number of ranks.
+"""A surface filled with cells: which cells it touches, what it encloses, the same on any number of
+ranks.
 
 Two oracles. Touched cells: a separating-axis test in integers, so nothing is rounded. A cell is the
-half-open box [i, i+1)^3, but what touches only its far faces, where it is interpolated, may be marked
-or not: so all cells of the half-open test must be there, and none beyond the closed one.
-Enclosed cells: scipy.ndimage.label on the dense grid.
-"""
+half-open box [i, i+1)^3, but what touches only its far faces, where it is interpolated, may be
+marked or not: so all cells of the half-open test must be there, and none beyond the closed one.
+Enclosed cells: scipy.ndimage.label on the dense grid."""
 
 import os
 import re
@@ -60,7 +60,8 @@ FINE = 1 << 34  # and a half-open cell is one that ends 1/64 * 2^-34 before its 
 
 
 def boxes_touched(triangle: np.ndarray, gap: int) -> set[tuple[int, ...]]:
-    """Separating axes between a triangle (3, 3) in 1/64 cells and all boxes [i, i + 1 - gap / (64 * 2^34)].
+    """Separating axes between a triangle (3, 3) in 1/64 cells and all boxes [i, i + 1 - gap / (64 *
+    2^34)].
 
     Akenine-Moller 2001, in integers below 2^63.
     """
@@ -159,7 +160,8 @@ def test_a_cavity_is_filled_but_where_cells_count_by_what_is_inside_and_it_is_wo
 
 
 def test_time_and_memory_follow_the_cells_not_the_bounding_box():
-    # a rod of 35,000 x 3 x 3 cells along the diagonal of a grid of 20,000^3: a bit for each of its cells is 1 TB
+    # a rod of 35,000 x 3 x 3 cells along the diagonal of a grid of 20,000^3: a bit for
+    # each of its cells is 1 TB
     ends = np.array([[0, 0, 0], [20_000, 20_000, 20_000]])
     body = body_of(trimesh.creation.cylinder(radius=1.5, segment=ends, sections=5))
     fill([body], 2000.0)  # compile

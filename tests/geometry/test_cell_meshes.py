@@ -1,4 +1,5 @@
-"""Meshes of cells: their boundary is closed and wound outwards, and their sets of cells and points are groups."""
+"""Meshes of cells: their boundary is closed and wound outwards, and their sets of cells and points
+are groups."""
 
 from itertools import product
 from pathlib import Path
@@ -29,7 +30,8 @@ INVERTED["pyramid"] = [3, 2, 1, 0, 4]
 
 
 def cells_of(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and cells of a cube of 1 m, every third cell inverted, and a point that no cell has."""
+    """Return points and cells of a cube of 1 m, every third cell inverted, and a point that no cell
+    has."""
     places: dict[tuple[float, ...], int] = {}
     cells = []
     for corner in product(range(N), repeat=3):
@@ -59,7 +61,8 @@ def write(path: Path, mesh: meshio.Mesh) -> None:
 
 
 CASES = [
-    *((end, kind, order) for end in ("vtu", "vtk") for kind in KINDS if KINDS[kind].dimension == 3 for order in (1, 2)
+    *((end, kind, order) for end in ("vtu",
+    "vtk") for kind in KINDS if KINDS[kind].dimension == 3 for order in (1, 2)
       if order == 1 or KINDS[kind].edges),
     *((end, kind, 1) for end in ("msh", "inp", "bdf") for kind in ("tetra", "hexahedron")),
     ("msh", "tetra", 2), ("msh", "hexahedron", 2), ("inp", "tetra", 2), ("bdf", "tetra", 2),
@@ -130,7 +133,8 @@ def test_sets_of_cells_and_points_are_groups(tmp_path: Path):
 
 @pytest.mark.parametrize("end", ["msh", "inp", "bdf", "vtu", "vtk"])
 def test_damaged_files_are_refused_in_one_line(end: str, tmp_path: Path):
-    """Cut short anywhere, or with bytes of garbage: a surface or a line, in bounded time and memory."""
+    """Cut short anywhere, or with bytes of garbage: a surface or a line, in bounded time and
+    memory."""
     points, cells = cells_of("tetra")
     path, chance = tmp_path / f"x.{end}", np.random.default_rng(0)
     write(path, meshio.Mesh(points, [("tetra", cells)]))

@@ -1,4 +1,5 @@
-"""The embedding weights: exactness, continuity, smoothness, accuracy, and a plain evaluation of Eq. 1-9."""
+"""The embedding weights: exactness, continuity, smoothness, accuracy, and a plain evaluation of Eq.
+1-9."""
 
 from itertools import permutations
 
@@ -51,7 +52,8 @@ def exists(masks):
 
 
 def surface_triangles(cells):
-    """Outward triangles, as nodes, of a union of cells (set of low corners); squares cut from low to high corner."""
+    """Outward triangles, as nodes, of a union of cells (set of low corners); squares cut from low
+    to high corner."""
     triangles = []
     for cell in cells:
         for axis, end in np.ndindex(3, 2):
@@ -170,14 +172,16 @@ def neighbours_of(valid, cells):
 
 
 def place(kind, valid, nodes, cells, u):
-    """Embedded points (p,3): valid as above, nodes (nx+1,ny+1,nz+1,3) positions, points at u (p,3) in cells (p,3)."""
+    """Embedded points (p,3): valid as above, nodes (nx+1,ny+1,nz+1,3) positions, points at u (p,3)
+    in cells (p,3)."""
     weights = stencil_weights(kind, u, neighbours_of(valid, cells))
     around = nodes[tuple(np.moveaxis(cells[:, None] + NODES, -1, 0))]
     return np.einsum("pk,pkx->px", weights, around)
 
 
 def random_cells(rng, shape=(6, 6, 6), share=0.5):
-    """valid with a margin, True at random: cells that touch at faces, at edges, at corners, or nowhere."""
+    """valid with a margin, True at random: cells that touch at faces, at edges, at corners, or
+    nowhere."""
     return np.pad(rng.random(shape) < share, 1)
 
 
@@ -188,7 +192,8 @@ def moved_nodes(rng, valid):
 
 
 def bend(X):
-    """The bar (its axis along x) bent to an arc in the x-z plane, about RADIUS below its middle. [m]"""
+    """The bar (its axis along x) bent to an arc in the x-z plane, about RADIUS below its middle.
+    [m]"""
     angle, radius = X[..., 0] / RADIUS, RADIUS + X[..., 2] - BAR[2] / 2
     return np.stack([radius * np.sin(angle), X[..., 1], radius * np.cos(angle) - RADIUS], -1)
 
@@ -207,7 +212,8 @@ def rms_error(kind, size, points=4000):
 
 
 def shared(rng, valid, offsets, points):
-    """Cells (p,3), their valid neighbours (p,3) at one of the offsets, and u (p,3) in the first, shared by both."""
+    """Cells (p,3), their valid neighbours (p,3) at one of the offsets, and u (p,3) in the first,
+    shared by both."""
     pairs = [
         (cell, cell + offset)
         for offset in offsets
@@ -221,7 +227,8 @@ def shared(rng, valid, offsets, points):
 
 
 def position_jump(kind, valid, points=3000):
-    """Greatest distance [cells] between the answers of two cells for a point on a face, edge or corner of both."""
+    """Greatest distance [cells] between the answers of two cells for a point on a face, edge or
+    corner of both."""
     rng = np.random.default_rng(2)
     nodes = moved_nodes(rng, valid)
     first, second, u = shared(rng, valid, BLOCK[14:], points)
@@ -231,7 +238,8 @@ def position_jump(kind, valid, points=3000):
 
 
 def kinks(kind, valid, points=2000):
-    """Jumps (p,) of the derivative along the normal across shared faces, from one-sided second-order differences."""
+    """Jumps (p,) of the derivative along the normal across shared faces, from one-sided
+    second-order differences."""
     rng = np.random.default_rng(3)
     nodes = moved_nodes(rng, valid)
     first, second, u = shared(rng, valid, np.eye(3, dtype=int), points)

@@ -1,4 +1,5 @@
-"""Shares of cells and of their corners: volumes, first moments, planes, open surfaces, surfaces wound both ways."""
+"""Shares of cells and of their corners: volumes, first moments, planes, open surfaces, surfaces
+wound both ways."""
 
 import logging
 
@@ -26,7 +27,8 @@ BODIES["hollow"].faces[320:] = BODIES["hollow"].faces[320:, ::-1]
 def columns_of(
     mesh: trimesh.Trimesh, h: float, offset: float = 0.0
 ) -> tuple[Columns, np.ndarray, np.ndarray]:
-    """Of a mesh in cells of h from ``offset`` cells before it; all cells of its box, and where they begin."""
+    """Of a mesh in cells of h from ``offset`` cells before it; all cells of its box, and where they
+    begin."""
     origin = mesh.bounds[0] - offset * h
     corners = (mesh.vertices - origin)[mesh.faces] / h
     shape = np.ceil(corners.max(axis=(0, 1))).astype(np.int64) + 1
@@ -37,7 +39,8 @@ def columns_of(
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 @pytest.mark.parametrize("name", BODIES)
 def test_shares_have_the_bodys_volume_and_its_centre(name: str, offset: float):
-    """Both exactly: the corners' functions sum to 1, and to the position when each is taken times its corner's."""
+    """Both exactly: the corners' functions sum to 1, and to the position when each is taken times
+    its corner's."""
     mesh, h = BODIES[name], 0.17
     columns, cells, origin = columns_of(mesh, h, offset)
     share, _ = columns.inside(cells)
@@ -49,7 +52,8 @@ def test_shares_have_the_bodys_volume_and_its_centre(name: str, offset: float):
 
 
 def test_a_plane_through_a_cell_gives_its_corners_what_lies_near_them():
-    """Below z: 2 z - z^2 at the lower corners, z^2 at the upper ones, the integrals of 2 (1 - z) and 2 z."""
+    """Below z: 2 z - z^2 at the lower corners, z^2 at the upper ones, the integrals of 2 (1 - z)
+    and 2 z."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], [3, 2, 1.3]])
     columns, _, _ = columns_of(box, 1.0)
     share, _ = columns.inside(np.array([[1, 1, 1], [1, 1, 0]]))

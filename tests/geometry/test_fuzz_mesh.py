@@ -1,4 +1,5 @@
-"""Mesh files of all formats, whole, damaged or hostile: a mesh of finite points comes out, or one line does."""
+"""Mesh files of all formats, whole, damaged or hostile: a mesh of finite points comes out, or one
+line does."""
 
 import base64
 import json
@@ -70,7 +71,8 @@ def gltf(
         "nodes": [{"children": [1]}, {"mesh": 0, "scale": [1, 2, 1]}],
         "buffers": [{"uri": uri, "byteLength": len(IN_GLTF)}],
         "bufferViews": [
-            {"buffer": 0, "byteLength": 96}, {"buffer": 0, "byteOffset": 96, "byteLength": 144, "byteStride": 4},
+            {"buffer": 0, "byteLength": 96},
+            {"buffer": 0, "byteOffset": 96, "byteLength": 144, "byteStride": 4},
         ],
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 8},
@@ -191,7 +193,8 @@ def test_polygons_are_cut_into_triangles(tmp_path):
 
 
 def box_in_obj(line: str = "{}\n", face: str = "f {} {} {}", first: int = 1) -> str:
-    """A box as an OBJ: each of its lines as ``line`` has it, the first of its points numbered ``first``."""
+    """A box as an OBJ: each of its lines as ``line`` has it, the first of its points numbered
+    ``first``."""
     rows = ["v {} {} {}".format(*point) for point in BOX.vertices]
     rows += [face.format(*corners) for corners in BOX.faces + first]
     return "".join(line.format(row) for row in rows)
@@ -255,7 +258,8 @@ REFUSED = {
     "control characters": ("ply", b"ply\nformat ascii 1.0\n\x1b[31m 3\nend_header\n", "x.ply"),
     "one point": ("obj", b"v 0 0 0\nf 1 1 1\n", "fewer than four points"),
     "lists for coordinates": (
-        "ply", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty list uchar float x\nproperty list uchar float y\n"
+        "ply",
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty list uchar float x\nproperty list uchar float y\n"
         b"property list uchar float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
         b"1 0 1 0 1 0\n2 0 0 1 0 1 0\n1 0 1 0 1 0\n3 0 1 2\n", "x.ply",
     ),
@@ -351,7 +355,8 @@ def glb(instances: int, faces: int, parts: int = 1) -> bytes:
             {"buffer": 0, "byteOffset": points.nbytes, "byteLength": corners.nbytes},
         ],
         "accessors": [
-            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3, "min": [0, 0, 0], "max": [1, 1, 1]},
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3, "min": [0, 0, 0],
+            "max": [1, 1, 1]},
             {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 3 * faces},
         ],
     }  # fmt: skip

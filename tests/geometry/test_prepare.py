@@ -1,4 +1,5 @@
-"""The prepare steps, scaling and placing; slow steps are computed once, and never wrongly taken from the cache."""
+"""The prepare steps, scaling and placing; slow steps are computed once, and never wrongly taken
+from the cache."""
 
 import os
 from pathlib import Path
@@ -172,7 +173,8 @@ def test_orient_turns_each_part_outwards_also_loose_and_open_ones():
 
 @given(st.lists(st.booleans(), min_size=7, max_size=7), st.floats(0, 1e7))
 def test_orient_winds_cavities_inwards_and_their_cores_outwards(inwards, shift):
-    """A ball in a ball in a ball beside a box with a box in it, a second box over its edge, and one far away."""
+    """A ball in a ball in a ball beside a box with a box in it, a second box over its edge, and one
+    far away."""
     balls = [surface_of(trimesh.creation.icosphere(1, radius=radius)) for radius in (1.0, 0.7, 0.4)]
     parts = [*balls, box((5, 0, 0), 2.0), box((5.2, 0, 0)), box((6, 0, 0)), box((9, 0, 0))]
     outwards = np.array([examine(part).volume for part in parts]) * [1, -1, 1, 1, -1, 1, 1]

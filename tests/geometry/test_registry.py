@@ -50,7 +50,8 @@ def site(tmp_path):
 
 @pytest.fixture
 def toy(site, tmp_path, monkeypatch):
-    """Models 'toybox', whose original can be fetched, and 'toyscan', whose original lies in a package; empty places."""
+    """Models 'toybox', whose original can be fetched, and 'toyscan', whose original lies in a
+    package; empty places."""
     folder, address = site
     (folder / "box.stl").write_bytes(ORIGINAL)
     for name in ("meshes", "packages", "cache"):

@@ -76,7 +76,8 @@ def limits() -> Iterator[None]:
 
 
 def refusal(call: Callable, lines: bool = False) -> str:
-    """What an InputError of the call says, in one line that a terminal can show; "" if it goes well."""
+    """What an InputError of the call says, in one line that a terminal can show; "" if it goes
+    well."""
     with limits():
         try:
             call()

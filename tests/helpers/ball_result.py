@@ -29,7 +29,8 @@ normal = [0, 0, 2]
 [gravity]
 acceleration = [0, 0, -9.81]
 """
-# A ball of radius 0.1 m falls, touches the ground, is squashed, leaps and comes to rest: height of its middle [m].
+# A ball of radius 0.1 m falls, touches the ground, is squashed, leaps and comes to
+# rest: height of its middle [m].
 HEIGHTS = [0.5, 0.45, 0.3, 0.1, 0.07, 0.05, 0.08, 0.2, 0.35, 0.2, 0.1]
 KINETIC = [0, 1, 4, 8, 4, 0, 5, 3, 0, 2, 0]
 ELASTIC = [0, 0, 0, 0, 5, 9, 3, 0.1, 0.1, 0.1, 0]

@@ -20,7 +20,8 @@ STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (lattice.material)
 
 
 def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **tables) -> Path:
-    """A scene file of a block with a corner at the origin; ``tables`` are added to it, or take a table's place.
+    """A scene file of a block with a corner at the origin; ``tables`` are added to it, or take a
+    table's place.
 
     A material without a law is of springs.
     """

@@ -1,4 +1,5 @@
-"""A headless Chromium that tests drive by mouse and keys, over its debugging pipe (the Chrome DevTools Protocol).
+"""A headless Chromium that tests drive by mouse and keys, over its debugging pipe (the Chrome
+DevTools Protocol).
 
 The pipe needs no package and no port: messages are JSON that ends in a null byte.
 """
@@ -127,7 +128,8 @@ class Browser:
     def drag(
         self, start: tuple[float, float], by: tuple[float, float], shift: bool = False
     ) -> None:
-        """Press the left button, move by so many pixels in ten steps, and let go; with the shift key, or without."""
+        """Press the left button, move by so many pixels in ten steps, and let go; with the shift
+        key, or without."""
         held: dict[str, Any] = {"button": "left", "modifiers": 8 if shift else 0}
         self._mouse("mousePressed", *start, buttons=1, clickCount=1, **held)
         for share in np.linspace(0.1, 1, 10):

@@ -1,5 +1,5 @@
-"""Whether a surface crosses itself: each edge against each triangle, by signs of volumes, without any library of
-contact."""
+"""Whether a surface crosses itself: each edge against each triangle, by signs of volumes, without
+any library of contact."""
 
 import numba
 import numpy as np

@@ -1,8 +1,9 @@
-"""Programs without their start: a process that has imported the package forks a child for each run, and for each rank.
+"""Programs without their start: a process that has imported the package forks a child for each run,
+and for each rank.
 
-A small run takes 3 s of a core with its start, 0.7 s in a fork. Ranks are those of a real mpiexec: what it starts for
-each leaves the environment of the rank, by which a forked child joins the others, and ends as the child does.
-"""
+A small run takes 3 s of a core with its start, 0.7 s in a fork. Ranks are those of a real mpiexec:
+what it starts for each leaves the environment of the rank, by which a forked child joins the
+others, and ends as the child does."""
 
 import os
 import runpy
@@ -24,7 +25,8 @@ read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
 def run_forked(
     arguments: Sequence[str], environment: Mapping[str, str], timeout: float
 ) -> subprocess.CompletedProcess:
-    """``msmpetsc`` with these arguments, as subprocess.run gives it. Raises subprocess.TimeoutExpired."""
+    """``msmpetsc`` with these arguments, as subprocess.run gives it. Raises
+    subprocess.TimeoutExpired."""
     with tempfile.TemporaryDirectory() as folder:
         out, error = Path(folder, "out"), Path(folder, "error")
         child = Forked(environment)
@@ -43,7 +45,8 @@ def run_forked(
 def run_ranks(
     ranks: int, arguments: Sequence[str], environment: Mapping[str, str], timeout: float
 ) -> subprocess.CompletedProcess:
-    """Python with these arguments on so many ranks, as subprocess.run gives it. Raises subprocess.TimeoutExpired."""
+    """Python with these arguments on so many ranks, as subprocess.run gives it. Raises
+    subprocess.TimeoutExpired."""
     end = time.monotonic() + timeout
     with tempfile.TemporaryDirectory() as folder:
         streams = [Path(folder, name) for name in ("out", "error")]

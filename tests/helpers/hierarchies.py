@@ -1,5 +1,5 @@
-"""Lattices that are hard for multigrid, on any number of ranks, and the parts of the cycle as dense matrices whose rows
-and columns are x, y, z of one node after another, whatever the ranks."""
+"""Lattices that are hard for multigrid, on any number of ranks, and the parts of the cycle as dense
+matrices whose rows and columns are x, y, z of one node after another, whatever the ranks."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -44,7 +44,8 @@ def tilted_beam(length: int = 9) -> np.ndarray:
 
 
 def limbs(reach: int = 7) -> np.ndarray:
-    """A cube with an arm along each axis that is a cell thick; none of them begins at an even index."""
+    """A cube with an arm along each axis that is a cell thick; none of them begins at an even
+    index."""
     arms = [
         at(block(reach, 1, 1), 4, 2, 1),
         at(block(1, reach, 1), 1, 4, 2),
@@ -60,7 +61,8 @@ def box_of_cells(low: list[int], high: list[int], fineness: int) -> np.ndarray:
 def figure(fineness: int = 1) -> np.ndarray:
     """A trunk with a head, legs, arms that reach out and a tail."""
     parts = [
-        ([6, 2, 8], [12, 8, 18]), ([7, 3, 18], [11, 7, 22]), ([7, 4, 0], [9, 6, 8]), ([10, 4, 0], [12, 6, 8]),
+        ([6, 2, 8], [12, 8, 18]), ([7, 3, 18], [11, 7, 22]), ([7, 4, 0], [9, 6, 8]),
+        ([10, 4, 0], [12, 6, 8]),
         ([0, 4, 14], [6, 6, 16]), ([12, 4, 15], [18, 6, 16]), ([8, 0, 17], [9, 2, 18]),
     ]  # fmt: skip
     return np.concatenate([box_of_cells(*ends, fineness) for ends in parts])
@@ -135,7 +137,8 @@ def crushed(nodes: np.ndarray) -> np.ndarray:
 
 
 def turned(nodes: np.ndarray) -> np.ndarray:
-    """By half a rad a metre about an axis along x, and stretched, so that no spring is compressed."""
+    """By half a rad a metre about an axis along x, and stretched, so that no spring is
+    compressed."""
     x, y, z = (nodes - ORIGIN - 0.1).T
     angle = 0.5 * x
     across = [np.cos(angle) * y - np.sin(angle) * z, np.sin(angle) * y + np.cos(angle) * z]
@@ -151,7 +154,8 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def contact_blocks(lattice: Lattice) -> np.ndarray:
-    """(owned, 9) [N/m]: a push along an oblique normal on every third node, its stiffness no small one."""
+    """(owned, 9) [N/m]: a push along an oblique normal on every third node, its stiffness no small
+    one."""
     normal = np.array([0.6, 0.0, 0.8])
     touched = lattice.global_numbers[: lattice.owned] % 3 == 0
     return touched[:, None] * 5e4 * np.outer(normal, normal).ravel()
@@ -191,7 +195,8 @@ class Case:
         return 3 * self.unknowns.total
 
     def dense(self, act: Callable[[PETSc.Vec, PETSc.Vec], None], every: int = 1) -> np.ndarray:
-        """Matrix of what writes into its second vector, column by column, or some of its columns (collective)."""
+        """Matrix of what writes into its second vector, column by column, or some of its columns
+        (collective)."""
         first = self.multigrid.operator.getOwnershipRange()[0] // 3
         own = np.zeros((3 * self.unknowns.size, self.size))
         for column in range(0, self.size, every):
@@ -222,7 +227,8 @@ class Case:
         return self.dense(self.multigrid.pc.apply)
 
     def interpolation(self, level: int) -> np.ndarray:
-        """P to the ``level``-th coarse grid's finer neighbour; 0 is that from the first coarse grid to the nodes."""
+        """P to the ``level``-th coarse grid's finer neighbour; 0 is that from the first coarse grid
+        to the nodes."""
         p = self.gathered(self.multigrid.levels[level].interpolation)
         if level:
             return p
@@ -243,8 +249,8 @@ class Case:
         return np.concatenate(self.comm.allgather(own))
 
     def iterations(self, rtol: float, rough: bool) -> int:
-        """CG's on the true Hessian with the cycle, to this tolerance in the norm of the error, as newton's; of a step
-        under weight, or of pushes that differ from node to node."""
+        """CG's on the true Hessian with the cycle, to this tolerance in the norm of the error, as
+        newton's; of a step under weight, or of pushes that differ from node to node."""
         hessian = TrueHessian(self.unknowns, self.elasticity, self.time_step)
         hessian.linearise(self.q, None)
         operator = python_matrix(self.unknowns, hessian, self.comm)

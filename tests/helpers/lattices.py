@@ -89,7 +89,8 @@ def one_spring(m: float, k: float, r: float) -> Lattice:
 
 
 def chain(m: float, k: float, r: float) -> Lattice:
-    """Masses 1 apart along z, joined by springs of rest length r, the first and the last of the four pinned."""
+    """Masses 1 apart along z, joined by springs of rest length r, the first and the last of the
+    four pinned."""
     count = 4
     return Lattice(
         table=SortedKeys(COMM, np.arange(count)),

@@ -35,8 +35,8 @@ Answers = list[tuple[int, str]]  # status and what was told, of each rank
 def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers]:
     """Return the answers to each of these commands, which one process a rank carries out.
 
-    None leaves a PETSc object to Python's collector: what one rank alone has collected, PETSc waits for at its end.
-    """
+    None leaves a PETSc object to Python's collector: what one rank alone has collected, PETSc waits
+    for at its end."""
     words = [[*map(str, command)] for command in commands]
     done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(words), status=0)
     assert done.stderr.strip() == "", "not even the C libraries speak"
@@ -69,7 +69,8 @@ def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str)
 
 
 def command_error(*arguments: object) -> str:
-    """Return the one line of error with which a command ends, status 2; of notes there may be more."""
+    """Return the one line of error with which a command ends, status 2; of notes there may be
+    more."""
     stream = io.StringIO()
     with contextlib.redirect_stderr(stream):
         status = main([*map(str, arguments)])

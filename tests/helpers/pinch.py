@@ -45,7 +45,8 @@ def u_tube(around: int = 16, along: int = 60) -> trimesh.Trimesh:
 
 
 def pinch_scene(folder: Path, **tables: dict) -> Path:
-    """Return a scene file of it: forces close its arms; ``tables`` are added to it, or take a table's place."""
+    """Return a scene file of it: forces close its arms; ``tables`` are added to it, or take a
+    table's place."""
     u_tube().export(folder / "u.ply")
     upper = {"relative": True}
     left = {"box": [[0, 0, 0.7], [0.3, 1, 1]]} | upper

@@ -1,8 +1,9 @@
-"""A GPU that is none: arrays that behave as CuPy's do towards NumPy's, in the memory of the CPU, where the bodies of
-kernels are run one index after another. What a run on a GPU would mix up or carry to and fro is an error or counted.
+"""A GPU that is none: arrays that behave as CuPy's do towards NumPy's, in the memory of the CPU,
+where the bodies of kernels are run one index after another. What a run on a GPU would mix up or
+carry to and fro is an error or counted.
 
-CuPy's arrays refuse what these refuse: to become NumPy's unasked, and to be computed with together with them.
-"""
+CuPy's arrays refuse what these refuse: to become NumPy's unasked, and to be computed with together
+with them."""
 
 import sys
 from collections import Counter
@@ -19,7 +20,8 @@ from msmpetsc.solve.petsc import device
 
 # what CuPy 13 has of NumPy's functions, of those that the steps call
 KNOWN = [
-    "array_equal", "asarray", "bincount", "concatenate", "copyto", "cross", "einsum", "empty", "empty_like",
+    "array_equal", "asarray", "bincount", "concatenate", "copyto", "cross", "einsum", "empty",
+    "empty_like",
     "flatnonzero", "linalg.norm", "tile", "vdot", "where", "zeros", "zeros_like",
 ]  # fmt: skip
 FEW = 9  # numbers are no array that grows with a body
@@ -181,7 +183,8 @@ def send(array: np.ndarray) -> Array:
 
 @contextmanager
 def module(name: str, **contents) -> Iterator[None]:
-    """One that is imported in place of what has that name. (patch.dict would forget all that is imported meanwhile.)"""
+    """One that is imported in place of what has that name. (patch.dict would forget all that is
+    imported meanwhile.)"""
     before = sys.modules.get(name)
     sys.modules[name] = SimpleNamespace(**contents)
     try:

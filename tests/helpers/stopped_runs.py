@@ -1,4 +1,5 @@
-"""Runs to be stopped: a hanging block, signals at a step, the ranks of an mpiexec; whether two results are the same."""
+"""Runs to be stopped: a hanging block, signals at a step, the ranks of an mpiexec; whether two
+results are the same."""
 
 import copy
 import os
@@ -25,7 +26,8 @@ EVERY, STEPS = 3, 40
 
 @pytest.fixture(scope="module", autouse=True)
 def every_step_forgets() -> Iterator[None]:
-    """Have, where it is imported, a checkpoint after each step, so that a run goes on from wherever it was stopped."""
+    """Have, where it is imported, a checkpoint after each step, so that a run goes on from wherever
+    it was stopped."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "REMEMBERED", 1)
         yield
@@ -96,8 +98,9 @@ def assert_equal(found: dict, expected: dict) -> None:
 
 
 def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
-    """Take two steps from some checkpoints of a run, which are every so many steps: frames and checkpoints are the same
-    to the last bit. Returns the frames of the whole run, None where a step has none."""
+    """Take two steps from some checkpoints of a run, which are every so many steps: frames and
+    checkpoints are the same to the last bit. Returns the frames of the whole run, None where a step
+    has none."""
     scene, comm = load_scene(path), MPI.COMM_SELF
     model, frames, saved = build_model(comm, scene), [], []
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,5 @@
-"""Uniform strains of a lattice at rest, and what an isotropic solid of Poisson's ratio 1/4 has of them."""
+"""Uniform strains of a lattice at rest, and what an isotropic solid of Poisson's ratio 1/4 has of
+them."""
 
 from collections.abc import Iterator
 
@@ -11,13 +12,15 @@ C11, C12, C44 = 6 / 5 * E, 2 / 5 * E, 2 / 5 * E  # [Pa]
 
 
 def elastic_constant(lattice: Lattice, G: np.ndarray, other: np.ndarray) -> float:
-    """u^T H v / volume [Pa] of the linear displacements u = G x, v = other x, their gradients (3, 3)."""
+    """u^T H v / volume [Pa] of the linear displacements u = G x, v = other x, their gradients (3,
+    3)."""
     u, v = ((lattice.nodes @ gradient.T).ravel() for gradient in (G, other))
     return u @ (hessian(lattice) @ v) * DENSITY / lattice.mass.sum()
 
 
 def uniform_strains() -> Iterator[tuple[str, np.ndarray, np.ndarray, float]]:
-    """Name, two displacement gradients, and what u^T H v / volume is in an isotropic solid of nu = 1/4 [Pa]."""
+    """Name, two displacement gradients, and what u^T H v / volume is in an isotropic solid of nu =
+    1/4 [Pa]."""
     x, y, z = np.eye(3)
     yield "C11: stretch along an edge", np.outer(x, x), np.outer(x, x), C11
     yield "C12: stretch along one edge against another", np.outer(x, x), np.outer(y, y), C12

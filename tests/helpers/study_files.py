@@ -84,7 +84,8 @@ VOID = {"meta", "br"}  # elements of HTML that need no end
 
 
 def row_of(label: str, **given) -> dict[str, str]:
-    """A row of the table as text; frames a second and seconds a simulated second follow from the time a frame."""
+    """A row of the table as text; frames a second and seconds a simulated second follow from the
+    time a frame."""
     row = {
         "label": label,
         "preset": label,

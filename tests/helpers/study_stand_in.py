@@ -1,11 +1,12 @@
-"""Stands in for ``msmpetsc run`` in tests of studies: a lattice of 8 nodes that swings by a formula.
+"""Stands in for ``msmpetsc run`` in tests of studies: a lattice of 8 nodes that swings by a
+formula.
 
     study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
 
-What it does is ruled by the options: -ksp_fail ends it with an error, -ksp_hang never ends it, -ksp_children starts
-another process before that, -ksp_exit N ends it with that status, -ksp_kind K tells of a failed step of that kind. Its
-wall time counts up with the runs of the folder, its motion is off by the time step.
-"""
+What it does is ruled by the options: -ksp_fail ends it with an error, -ksp_hang never ends it,
+-ksp_children starts another process before that, -ksp_exit N ends it with that status, -ksp_kind K
+tells of a failed step of that kind. Its wall time counts up with the runs of the folder, its motion
+is off by the time step."""
 
 import json
 import os
@@ -20,7 +21,8 @@ CALLS = "calls.txt"
 
 
 def begin(words: list[str]) -> None:
-    """Say that it was called, and start and do what is to be stopped: before imports, which take long on busy cores."""
+    """Say that it was called, and start and do what is to be stopped: before imports, which take
+    long on busy cores."""
     folder = Path(words[words.index("-o") + 1]).parent.parent
     if os.environ.get("OMPI_COMM_WORLD_RANK", "0") == "0":
         with open(folder / CALLS, "a") as file:

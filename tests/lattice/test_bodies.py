@@ -32,11 +32,14 @@ GROUND = {
     "response": "penalty",
     "stiffness": 2e3,
 }
-# a ball that falls spinning on the ground, a bar in the same place that hangs and is pulled, a block half of lead
+# a ball that falls spinning on the ground, a bar in the same place that hangs and is
+# pulled, a block half of lead
 BODIES: list[dict[str, Any]] = [
-    {"mesh": {"source": "ball.ply"}, "start": {"velocity": [0.5, 0, -1], "spin": [0, 3, 0], "scale": [1, 1, 0.9]}},
+    {"mesh": {"source": "ball.ply"},
+    "start": {"velocity": [0.5, 0, -1], "spin": [0, 3, 0], "scale": [1, 1, 0.9]}},
     {
-        "mesh": {"source": "bar.ply", "prepare": [{"rotate": {"axis": [0, 0, 1], "degrees": 30.0}}]},
+        "mesh": {"source": "bar.ply",
+        "prepare": [{"rotate": {"axis": [0, 0, 1], "degrees": 30.0}}]},
         "material": {"young_modulus": 3e5},
         "pin": [{"region": UPPER}],
         "force": [{"region": {"painted": [0, 1]}, "total": [2.0, 0, 0]}],
@@ -44,7 +47,8 @@ BODIES: list[dict[str, Any]] = [
     {
         "mesh": {"source": "block.ply", "base": [0.2, 0.1, 0.02]},
         "part": [{"region": {"box": [[0, 0, 0.5], [1, 1, 1]], "relative": True}, "density": 5e3}],
-        "anchor": [{"region": UPPER, "path": [{"time": 0.05, "by": [0, 0.02, 0.03]}], "stop": 0.06}],
+        "anchor": [{"region": UPPER, "path": [{"time": 0.05, "by": [0, 0.02, 0.03]}],
+        "stop": 0.06}],
     },
 ]  # fmt: skip
 
@@ -84,8 +88,8 @@ def alone(folder: Path, number: int, **tables: Any) -> Path:
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
 def test_bodies_move_as_each_does_alone(folder: Path, integrator: str):
-    """They overlap from the start, and do not touch: an obstacle, parts, pins, anchors, forces and starts are all there
-    is, and regions are of one body each."""
+    """They overlap from the start, and do not touch: an obstacle, parts, pins, anchors, forces and
+    starts are all there is, and regions are of one body each."""
     time = {"step": 0.01, "duration": 0.1, "integrator": integrator}
     time |= {"substep": 5e-4} if integrator == "verlet" else {}
     together, frames = play(write(folder, "three", body=BODIES, time=time))
@@ -228,7 +232,8 @@ def test_count_is_that_of_all_bodies(folder: Path):
 
 
 def test_tables_of_the_scene_are_of_all_bodies(folder: Path):
-    """The scene's pin holds what of any body lies in its region; its start is that of a body without one."""
+    """The scene's pin holds what of any body lies in its region; its start is that of a body
+    without one."""
     bodies = [{"mesh": {"source": "bar.ply", "base": [x, 0, 0]}} for x in (0, 1)]
     bodies[1]["start"] = {"velocity": [0, 1.0, 0]}
     pin, part = (
@@ -268,7 +273,8 @@ def test_in_statics_each_body_must_be_held(folder: Path):
 
 
 def test_the_shape_of_each_body_counts_alone(folder: Path, msmpetsc: Run):
-    """Bodies that fly apart are as they were, each of them; the farthest from its shape is the error."""
+    """Bodies that fly apart are as they were, each of them; the farthest from its shape is the
+    error."""
     bodies = [
         {"mesh": {"source": "block.ply"}, "start": {"velocity": [v, 0, 0]}} for v in (-1.0, 1.0)
     ]

@@ -1,4 +1,5 @@
-"""Mass and stiffness of cells that the surface cuts, and bodies that do not lie along the grid against elasticity."""
+"""Mass and stiffness of cells that the surface cuts, and bodies that do not lie along the grid
+against elasticity."""
 
 from functools import cache
 
@@ -42,7 +43,8 @@ def test_springs_have_the_mean_share_of_the_corners_that_agree_with_both_ends():
 
 
 def test_uniform_strain_costs_the_energy_of_the_volume_inside():
-    """Of a box askew in the grid: u^T H u = C volume of any uniform strain, but for the least share of corners."""
+    """Of a box askew in the grid: u^T H u = C volume of any uniform strain, but for the least share
+    of corners."""
     box = tilted_box()
     lattice = study.lattice_of(box, 0.06, "fill")
     assert lattice.mass.sum() == pytest.approx(DENSITY * box.volume, rel=1e-3)
@@ -53,7 +55,8 @@ def test_uniform_strain_costs_the_energy_of_the_volume_inside():
 
 
 def test_every_node_has_the_mass_that_its_springs_diagonal_says():
-    """So no light corner is stiff: the limit of explicit steps is a whole cell's, and CG brings in no net force."""
+    """So no light corner is stiff: the limit of explicit steps is a whole cell's, and CG brings in
+    no net force."""
     lattice = study.lattice_of(tilted_box(), 0.06, "fill")
     assert lattice.mass.min() < 0.01 * lattice.mass.max()
     diagonal = np.bincount(lattice.springs.ravel(), np.repeat(lattice.stiffness, 2))
@@ -65,7 +68,8 @@ def test_every_node_has_the_mass_that_its_springs_diagonal_says():
 
 @pytest.mark.parametrize("name", BARS)
 def test_bars_across_the_grid_sag_as_timoshenkos(name: str):
-    """A fifth of what whole cells are off, whose mass is a third too large; nearly as beams along the grid."""
+    """A fifth of what whole cells are off, whose mass is a third too large; nearly as beams along
+    the grid."""
     errors = np.array([bar_errors(name, size) for size in (0.4, 0.25)])
     assert (errors < 0).all() and errors[0].mean() > -0.105 and errors[1].mean() > -0.055
     assert np.ptp(errors, axis=1).max() < 0.015  # wherever the grid lies

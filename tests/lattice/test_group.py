@@ -1,4 +1,5 @@
-"""Regions by the names that a mesh gives: of every format, after every step of prepare, on any ranks."""
+"""Regions by the names that a mesh gives: of every format, after every step of prepare, on any
+ranks."""
 
 from itertools import product
 from pathlib import Path
@@ -104,7 +105,8 @@ def test_a_group_is_where_its_triangles_are(end: str, name: str | int, tmp_path:
 
 
 def test_nodes_of_a_group_are_those_nearest_to_its_points(tmp_path: Path):
-    """Askew in the grid: each point of the triangles, and no other, has the node that is nearest to it."""
+    """Askew in the grid: each point of the triangles, and no other, has the node that is nearest to
+    it."""
     turn = {
         "prepare": [{"rotate": {"axis": [1.0, 2.0, 3.0], "degrees": 50.0}}],
         "base": [0.3, 0.1, 0.2],

@@ -49,7 +49,8 @@ def test_a_body_in_a_point_is_refused(tmp_path: Path, more: dict):
 
 
 def test_twist_about_a_slanted_axis_turns_all_in_planes_across_it(tmp_path: Path):
-    """The angle by the cosine of what is across the axis; at the corners of the box, where it is 0 and 30 degrees."""
+    """The angle by the cosine of what is across the axis; at the corners of the box, where it is 0
+    and 30 degrees."""
     axis = np.array([1, 1, 1]) / np.sqrt(3)
     model, frames = begin(tmp_path, {"twist": {"axis": [1, 1, 1], "degrees": -30}})
     p, q = model.lattice.nodes - MIDDLE, frames[0].position - MIDDLE
@@ -64,7 +65,8 @@ def test_twist_about_a_slanted_axis_turns_all_in_planes_across_it(tmp_path: Path
 
 
 def test_scale_comes_before_twist_and_scatter_after_it(tmp_path: Path):
-    """Collapsed to its axis, a twist changes nothing; and where all goes to its random place, nothing else is left."""
+    """Collapsed to its axis, a twist changes nothing; and where all goes to its random place,
+    nothing else is left."""
     line = begin(tmp_path, {"scale": [1, 0, 0], "twist": {"axis": [1, 0, 0], "degrees": 90}})[1][
         0
     ].position
@@ -83,7 +85,8 @@ def test_scale_comes_before_twist_and_scatter_after_it(tmp_path: Path):
 
 
 def test_scatter_is_anywhere_in_the_box(tmp_path: Path):
-    """Mean and variance of an even spread, a 1/2 and 1/12 of a side, within four standard deviations of each."""
+    """Mean and variance of an even spread, a 1/2 and 1/12 of a side, within four standard
+    deviations of each."""
     q = begin(tmp_path, {"scatter": 1.0})[1][0].position / SIDES
     n = len(q)
     assert (q >= 0).all() and (q < 1).all() and len(np.unique(q)) == q.size

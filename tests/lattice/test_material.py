@@ -1,4 +1,5 @@
-"""The material against elasticity: constants, a clamped beam, a wave, free flight, and scikit-fem's hexahedra."""
+"""The material against elasticity: constants, a clamped beam, a wave, free flight, and scikit-fem's
+hexahedra."""
 
 from functools import cache
 
@@ -48,7 +49,8 @@ def test_elastic_constants_in_every_direction(name: str, poisson: float | None):
 
 @cache
 def fem_sag(across: int, order: int = 1) -> float:
-    """Tip deflection [m] of the same beam of scikit-fem's hexahedra on the same grid: trilinear, or of order 2."""
+    """Tip deflection [m] of the same beam of scikit-fem's hexahedra on the same grid: trilinear, or
+    of order 2."""
     sides = [np.linspace(0, side * WIDTH, side * across + 1) for side in (BEAM, 1, 1)]
     element = skfem.ElementVector({1: skfem.ElementHex1, 2: skfem.ElementHex2}[order]())
     basis = skfem.Basis(
@@ -64,15 +66,16 @@ def fem_sag(across: int, order: int = 1) -> float:
 
 @pytest.mark.parametrize("across", ACROSS)
 def test_the_excess_stiffness_is_that_of_cells_that_cannot_curve(across: int):
-    """E I (1 + 169/140 (h/b)^2); what is left is the clamp, which holds the width too (0.7% by scikit-fem), and at
-    two cells across twice that."""
+    """E I (1 + 169/140 (h/b)^2); what is left is the clamp, which holds the width too (0.7% by
+    scikit-fem), and at two cells across twice that."""
     sag, frequency = lattice_beam(across)
     assert -0.015 < sag / study.timoshenko_sag(across) - 1 < 0
     assert 0 < frequency / study.timoshenko_frequency(across) - 1 < 0.0075
 
 
 def test_it_comes_to_the_solid_of_scikit_fem_with_second_order():
-    """Trilinear hexahedra on the same grid: their excess is 1/2 (h/b)^2, so the difference goes as h^2."""
+    """Trilinear hexahedra on the same grid: their excess is 1/2 (h/b)^2, so the difference goes as
+    h^2."""
     difference = [1 - lattice_beam(across)[0] / fem_sag(across) for across in ACROSS]
     assert 0 < difference[-1] < 0.013  # (169/140 - 1/2) / 8^2 = 1.1%
     assert 1.6 < slope(1 / np.array(ACROSS), difference) < 2.2
@@ -86,7 +89,8 @@ def test_it_comes_to_the_solid_of_scikit_fem_with_second_order():
 
 @pytest.mark.parametrize(("poisson", "late"), [(None, -0.0024), (NU, -0.0029)], ids=study.LAWS)
 def test_a_compression_wave_runs_at_the_root_of_E_over_rho(poisson: float | None, late: float):
-    """Its centre to the strain, its peak as dispersion and implicit Euler move it, its height as Euler damps it."""
+    """Its centre to the strain, its peak as dispersion and implicit Euler move it, its height as
+    Euler damps it."""
     centre, peak, height = study.wave_speeds(*study.struck_bar(1 / 4, poisson))
     assert abs(centre) < study.STRAIN
     assert peak == pytest.approx(
@@ -99,7 +103,8 @@ def test_a_compression_wave_runs_at_the_root_of_E_over_rho(poisson: float | None
 
 
 def free_flight(t: float, shake: float, error: float, poisson: float | None) -> tuple[float, float]:
-    """Return the drift of momentum and the loss of angular momentum in a second, of a block that spins at 2 rad/s.
+    """Return the drift of momentum and the loss of angular momentum in a second, of a block that
+    spins at 2 rad/s.
 
     shake : standard deviation of random node velocities [m/s]. A body that stays symmetric about its middle keeps
             its momentum whatever the solver does, a shaken one need not
@@ -125,18 +130,19 @@ def free_flight(t: float, shake: float, error: float, poisson: float | None) -> 
 def test_a_shaken_body_keeps_its_momentum_however_loose_its_steps(
     error: float, poisson: float | None
 ):
-    """Every cell gives each of its corners the same mass and the same diagonal entry of L: Jacobi's preconditioner
-    is a multiple of M, and CG then brings in no net force however early it stops. (A start from q_n does, but this
-    one is not taken here.)"""
+    """Every cell gives each of its corners the same mass and the same diagonal entry of L: Jacobi's
+    preconditioner is a multiple of M, and CG then brings in no net force however early it stops. (A
+    start from q_n does, but this one is not taken here.)"""
     assert free_flight(1 / 100, 0.1, error, poisson)[0] < 1e-12
 
 
 def rigid_loss(angle: float, steps: int) -> float:
-    """Angular momentum that implicit Euler takes from a rigid body turning by ``angle`` a step, as a share.
+    """Angular momentum that implicit Euler takes from a rigid body turning by ``angle`` a step, as
+    a share.
 
-    Central forces make no torque, so sum_i x_(n+1) x M (x_(n+1) - 2 x_n + x_(n-1)) = 0: with a_n the n-th turn
-    sin(a_n + a_(n-1)) = 2 sin a_n. The momentum goes as sin a_n; da/dn = -a^3 for small ones.
-    """
+    Central forces make no torque, so sum_i x_(n+1) x M (x_(n+1) - 2 x_n + x_(n-1)) = 0: with a_n
+    the n-th turn sin(a_n + a_(n-1)) = 2 sin a_n. The momentum goes as sin a_n; da/dn = -a^3 for
+    small ones."""
     last = angle
     for _ in range(steps):
         last = np.arctan2(np.sin(last), 2 - np.cos(last))

@@ -1,4 +1,5 @@
-"""Bodies of several materials: shares of cells in springs and masses, bars against closed forms, extreme ratios."""
+"""Bodies of several materials: shares of cells in springs and masses, bars against closed forms,
+extreme ratios."""
 
 from pathlib import Path
 
@@ -40,7 +41,8 @@ def test_each_cell_gives_its_own_mass_to_its_corners(tmp_path: Path):
 
 
 def test_each_cell_gives_its_share_to_its_springs(tmp_path: Path):
-    """A spring inside a part is as of a body of that alone; in the plane between two it has half of each."""
+    """A spring inside a part is as of a body of that alone; in the plane between two it has half of
+    each."""
     stiffer = {"young_modulus": 5 * YOUNG}
     lattice, soft, stiff = (
         of_parts(tmp_path, *parts).lattice
@@ -100,7 +102,8 @@ def forces(model: Model, displacement: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("ratio", [0.1, 4.0, 1e3])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_halves_one_behind_the_other_are_springs_in_series(tmp_path: Path, ratio: float, sign: int):
-    """Sides held, so that C11 = 6/5 E counts: the same stress in both, strains as 1 / E; no net force between."""
+    """Sides held, so that C11 = 6/5 E counts: the same stress in both, strains as 1 / E; no net
+    force between."""
     model = of_parts(tmp_path, {"region": FAR, "young_modulus": ratio * YOUNG})
     x, strain = model.lattice.nodes[:, 0], sign * 1e-6
     moved = np.zeros_like(model.lattice.nodes)
@@ -117,7 +120,8 @@ def test_halves_one_behind_the_other_are_springs_in_series(tmp_path: Path, ratio
 
 @pytest.mark.parametrize("ratio", [0.1, 1e6])
 def test_halves_side_by_side_are_springs_in_parallel(tmp_path: Path, ratio: float):
-    """Both narrow by 1/4 of the strain: nothing pulls across, at the surface or between, and E is the mean."""
+    """Both narrow by 1/4 of the strain: nothing pulls across, at the surface or between, and E is
+    the mean."""
     model = of_parts(tmp_path, {"region": BACK, "young_modulus": ratio * YOUNG})
     nodes, strain = model.lattice.nodes, 1e-7
     force = forces(model, strain * nodes * [1, -1 / 4, -1 / 4])
@@ -136,7 +140,8 @@ def test_halves_side_by_side_are_springs_in_parallel(tmp_path: Path, ratio: floa
 
 
 def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp_path: Path):
-    """Momentum is that of the heavy half, thrown; steps long enough that the light one has no swing left."""
+    """Momentum is that of the heavy half, thrown; steps long enough that the light one has no swing
+    left."""
     path = block_scene(
         tmp_path,
         part=[{"region": FAR, "density": 1e6 * DENSITY}],

@@ -56,7 +56,8 @@ def test_the_example_of_tables_runs_as_written(tmp_path, monkeypatch):
 
 
 def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
-    """Nodes below parts that are only near the plane were pinned, too: 67 of 91, and the body 10 times too stiff."""
+    """Nodes below parts that are only near the plane were pinned, too: 67 of 91, and the body 10
+    times too stiff."""
     path = CASES / "bunny_grazing_pin.toml"
     model = build(path)
     surface = read_surface(CASES / "bunny_cut.ply")
@@ -88,7 +89,8 @@ def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
     ("law", "low", "high"), [("neo-hookean", 0.95, 1.05), ("linear", 0.7, 1.0)]
 )
 def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
-    """Work of the weight: 9.65e-5 J by 11,206 quadratic tetrahedra (scikit-fem), clamped where they touch the plane."""
+    """Work of the weight: 9.65e-5 J by 11,206 quadratic tetrahedra (scikit-fem), clamped where they
+    touch the plane."""
     scene = load_scene(CASES / "bunny_grazing_pin.toml", [f"material.law={law}"])
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         first, *_, last = simulation.frames()
@@ -112,7 +114,8 @@ def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind
 
 @pytest.mark.parametrize("held", [1.0, 0.0], ids=["plane through cells", "end face"])
 def test_a_tilted_clamp_converges_in_second_order(held):
-    """A round bar tilted about two axes. By nodes' positions it was +7% to +20% too soft at R/4, of first order."""
+    """A round bar tilted about two axes. By nodes' positions it was +7% to +20% too soft at R/4, of
+    first order."""
     sizes = (4, 8)
     errors = study.clamp_errors(sizes, limit(), held)
     assert np.abs(errors).max() < 0.03

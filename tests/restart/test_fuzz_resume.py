@@ -1,4 +1,5 @@
-"""Damaged and hostile result files given to run --resume: it goes on, or says in one line why not."""
+"""Damaged and hostile result files given to run --resume: it goes on, or says in one line why
+not."""
 
 import re
 import signal
@@ -123,12 +124,15 @@ def number(value: float):
 
 
 DAMAGE = [
-    (a_group, "frames/iterations"), (dangling, "frames/substeps"), (short, "frames/kinetic"), (short, "frames/ksp_its"),
-    (short, "frames/momentum"), (without, "checkpoint/lowest_mode"), (a_group, "checkpoint/lowest_mode"),
+    (a_group, "frames/iterations"), (dangling, "frames/substeps"), (short, "frames/kinetic"),
+    (short, "frames/ksp_its"),
+    (short, "frames/momentum"), (without, "checkpoint/lowest_mode"),
+    (a_group, "checkpoint/lowest_mode"),
     (short, "checkpoint/lowest_mode"), (a_group, "checkpoint/q"), (a_group, "checkpoint/numbers"),
     (dangling, "checkpoint/step"), (without, "surface/triangles"), (a_group, "surface/points"),
     (short, "lattice/springs"), (without, "lattice/cells"), (dangling, "embedding/weights"),
-    (dangling, "lattice/cell_kind"), (a_group, "frames/surface"), (number(5), "LowestCurvature.knows_mode"),
+    (dangling, "lattice/cell_kind"), (a_group, "frames/surface"),
+    (number(5), "LowestCurvature.knows_mode"),
     (number(np.inf), "Monitors.work.iterations"), (number(np.nan), "put_in"),
     (number(-1), "Monitors.frames"), (number(np.nan), "LowestCurvature.searched.total"),
 ]  # fmt: skip

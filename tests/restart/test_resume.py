@@ -1,4 +1,5 @@
-"""Runs that go on from a checkpoint: exactly, on other ranks, with another scene, in a file that has no room."""
+"""Runs that go on from a checkpoint: exactly, on other ranks, with another scene, in a file that
+has no room."""
 
 import json
 import multiprocessing
@@ -257,7 +258,8 @@ def test_other_options_of_petsc_are_refused_unless_they_only_tell(whole: Path):
 
 
 def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
-    """From a stopped and from a finished file; the 40th step had a frame as the last one, and has none any more."""
+    """From a stopped and from a finished file; the 40th step had a frame as the last one, and has
+    none any more."""
     longer = tmp_path / "longer.h5"
     more = ["--set", "time.duration=0.56"]
     assert (
@@ -383,7 +385,8 @@ def test_positions_that_no_frame_knows_are_refused(
 def test_a_file_cannot_name_meshes_of_another_folder(
     whole: Path, stopped: Path, tmp_path, lies_there: str
 ):
-    """What it says of its scene's folder is not believed: that scene must lie there, and name the mesh."""
+    """What it says of its scene's folder is not believed: that scene must lie there, and name the
+    mesh."""
     other = tmp_path / "other"
     other.mkdir()
     shutil.copy(whole.parent / "scene.ply", other / "scene.ply")
@@ -404,7 +407,8 @@ def test_a_file_cannot_name_meshes_of_another_folder(
 def test_a_file_cannot_make_a_run_do_more_than_solve(
     stopped: Path, tmp_path, monkeypatch, option: str
 ):
-    """Options without effect on results are forgotten, all others that choose no solver are refused."""
+    """Options without effect on results are forgotten, all others that choose no solver are
+    refused."""
     monkeypatch.chdir(tmp_path)
     with h5py.File(stopped, "r+") as file:
         file.attrs["petsc_options"] = option

@@ -29,7 +29,8 @@ def of(frames: list[Frame], name: str) -> np.ndarray:
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
 def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
-    """Implicit Euler only loses; explicit substeps and BDF2 swing about what is there by a few percent."""
+    """Implicit Euler only loses; explicit substeps and BDF2 swing about what is there by a few
+    percent."""
     _, frames = play(beam(tmp_path, time=TIME | {"integrator": integrator}))
     worked = (
         of(frames, "potential")[0] - of(frames, "potential").min()
@@ -43,7 +44,8 @@ def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
 
 @pytest.mark.parametrize("integrator, share", [("implicit-euler", 1e-6), ("bdf2", 0.01)])
 def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, share: float):
-    """What anchors and moving obstacles put in is work: a plate of much friction that is pressed in and pulled away."""
+    """What anchors and moving obstacles put in is work: a plate of much friction that is pressed in
+    and pulled away."""
     time = TIME | {"integrator": integrator, "step": STEP / 4 if integrator == "bdf2" else STEP}
     floor = {
         "shape": "plane",
@@ -61,7 +63,8 @@ def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, s
 
 
 class Overshooting:
-    """Makes whole steps of the usual solver go too far by a share, from the first on: what is wrong grows."""
+    """Makes whole steps of the usual solver go too far by a share, from the first on: what is wrong
+    grows."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, share: float):
         step = Stepper.step
@@ -78,7 +81,8 @@ class Overshooting:
 def test_a_run_that_gains_energy_without_end_is_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Forces that act three times as long as they should, at steps far beyond the explicit limit."""
+    """Forces that act three times as long as they should, at steps far beyond the explicit
+    limit."""
     Overshooting(monkeypatch, 2.0)
     told = r"frame \d+ \(.* gained .* J from nowhere, of .* J that were there: worst at node \d+, at rest at \("
     with pytest.raises(StepFailed, match=told) as caught:
@@ -111,7 +115,8 @@ def test_a_step_that_is_not_finite_fails(tmp_path: Path, monkeypatch: pytest.Mon
 def test_inverted_cells_are_counted_and_told_with_their_place(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    """A mirrored block is at rest for its springs: all 32 cells stay inside out, and it says so once."""
+    """A mirrored block is at rest for its springs: all 32 cells stay inside out, and it says so
+    once."""
     scene = block_scene(tmp_path, time=TIME, start={"scale": [-1.0, 1.0, 1.0]})
     _, frames = play(scene)
     assert of(frames, "inverted").tolist() == [32] * (STEPS + 1)
@@ -167,8 +172,8 @@ def test_stop_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_a_failed_step_is_halved_and_whole_steps_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Call 3 is step 3 as a whole, call 4 its first half, call 5 the first quarter: 2 quarters, 1 half; then step 4
-    in quarters, step 5 in halves, and whole steps again."""
+    """Call 3 is step 3 as a whole, call 4 its first half, call 5 the first quarter: 2 quarters, 1
+    half; then step 4 in quarters, step 5 in halves, and whole steps again."""
     failing = Failing(monkeypatch, {3, 4})
     _, frames = play(beam(tmp_path), "safety.on_failure=substep")
     assert (
@@ -181,7 +186,8 @@ def test_a_failed_step_is_halved_and_whole_steps_follow(
 def test_steps_in_halves_are_those_of_half_the_time_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """A rescued first step is two steps of t / 2 of another run, to the solver's error; and so is its velocity."""
+    """A rescued first step is two steps of t / 2 of another run, to the solver's error; and so is
+    its velocity."""
     scene = beam(tmp_path)
     _, half = play(scene, f"time.step={STEP / 2}")
     Failing(monkeypatch, {1})

@@ -1,4 +1,5 @@
-"""msmpetsc compare: errors are those of the formulas it states; it names the first frame and node that differ."""
+"""msmpetsc compare: errors are those of the formulas it states; it names the first frame and node
+that differ."""
 
 import re
 from pathlib import Path
@@ -116,7 +117,8 @@ def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
 
 
 def test_rounding_is_no_difference(tmp_path: Path):
-    """A body at rest: its displacements and energies are rounding, and the surface has single precision."""
+    """A body at rest: its displacements and energies are rounding, and the surface has single
+    precision."""
     still = dict(kinetic=0.0, elastic=1e-30, potential=0.0, momentum=np.zeros(3))
 
     def written(sign: int, **other) -> Path:
@@ -178,7 +180,8 @@ def test_other_lattices_are_refused_with_the_reason(
 
 
 def other_lattice(path: Path, by: float = 0.0, points: np.ndarray = POINTS) -> Path:
-    """A run of the same mesh on a lattice twice as coarse; from frame 2 on its surface point 3 is off by so much."""
+    """A run of the same mesh on a lattice twice as coarse; from frame 2 on its surface point 3 is
+    off by so much."""
     frames = [frame(i, surface=points + 0.01 * i * small_result.X) for i in range(FRAMES)]
     for one in frames[2:]:
         one.surface[3, 1] += by

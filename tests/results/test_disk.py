@@ -1,4 +1,5 @@
-"""A disk that is full, or may not be written: one line, exit status 2, and the run goes on when there is room."""
+"""A disk that is full, or may not be written: one line, exit status 2, and the run goes on when
+there is room."""
 
 import subprocess
 from collections.abc import Iterator

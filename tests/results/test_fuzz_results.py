@@ -1,4 +1,5 @@
-"""Result files that are damaged or hostile: they are read, or one line says why not; no other file is opened."""
+"""Result files that are damaged or hostile: they are read, or one line says why not; no other file
+is opened."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""msmpetsc.open: what is in the file comes out, of running and of old files too; a bad file ends in one line."""
+"""msmpetsc.open: what is in the file comes out, of running and of old files too; a bad file ends in
+one line."""
 
 import sys
 from collections.abc import Callable
@@ -46,7 +47,8 @@ def test_what_was_written_is_read(bar_result: Path):
 @pytest.mark.parametrize(
     "key",
     [
-        3, -1, np.int64(2), slice(None), slice(4, 1), (slice(1, 3), 7), (slice(None), 7, 2), ..., (..., 1), (),
+        3, -1, np.int64(2), slice(None), slice(4, 1), (slice(1, 3), 7), (slice(None), 7, 2), ...,
+        (..., 1), (),
         ([0, 2], 5), (slice(None), [3, 5]), (2, [1, 4]), [], np.arange(FRAMES) > 2,
         ([True, False, True, False, False], slice(2)), (slice(0), [1, 2]),
     ],
@@ -229,13 +231,18 @@ BAD = {
     "no time": (replaced("frames/time"), "no dataset frames/time"),
     "no nodes": (replaced("lattice/nodes"), "it has no lattice/nodes"),
     "10^12 nodes": (
-        replaced("lattice/nodes", **HUGE | dict(shape=(10**12, 3), chunks=(99, 3))), "claims 1000000000000 x 3"
+        replaced("lattice/nodes", **HUGE | dict(shape=(10**12, 3), chunks=(99, 3))),
+        "claims 1000000000000 x 3"
     ),
     "text for positions": (replaced("frames/position", ["a", "b"]), "frames/position has type"),
-    "one number for all": (replaced("frames/time", 1.0), "frames/time has type float64 and shape ()"),
-    "other nodes": (replaced("lattice/nodes", np.ones((11, 3))), "12 long along axis 0, and 11 are expected"),
-    "flat": (replaced("frames/position", np.ones((5, 12, 2))), "2 long along axis 2, and 3 are expected"),
-    "too few energies": (replaced("frames/kinetic", np.ones(3)), "3 long along axis 0, and 5 frames are finished"),
+    "one number for all": (replaced("frames/time", 1.0),
+    "frames/time has type float64 and shape ()"),
+    "other nodes": (replaced("lattice/nodes", np.ones((11, 3))),
+    "12 long along axis 0, and 11 are expected"),
+    "flat": (replaced("frames/position", np.ones((5, 12, 2))),
+    "2 long along axis 2, and 3 are expected"),
+    "too few energies": (replaced("frames/kinetic", np.ones(3)),
+    "3 long along axis 0, and 5 frames are finished"),
     "linked away": (damage(linked_away), "position"),
 }  # fmt: skip
 

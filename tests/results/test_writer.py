@@ -111,7 +111,8 @@ def test_who_writes_does_not_show_in_the_file(tmp_path):
 
 
 def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
-    """Every write of HDF5, the trimming's too, is replayed: the file after each opens and holds all finished frames."""
+    """Every write of HDF5, the trimming's too, is replayed: the file after each opens and holds all
+    finished frames."""
     disk = Disk()
     path = tmp_path / "x.h5"
 

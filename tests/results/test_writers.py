@@ -1,7 +1,8 @@
-"""Every writer there is, in one table: on a disk that fills up it says so in one line and leaves nothing half-written.
+"""Every writer there is, in one table: on a disk that fills up it says so in one line and leaves
+nothing half-written.
 
-By the limit on the size of files, which the system tells like a full disk, and which needs no rights.
-"""
+By the limit on the size of files, which the system tells like a full disk, and which needs no
+rights."""
 
 import re
 import resource
@@ -76,7 +77,8 @@ def chart(path: Path) -> None:
 
 
 def ask_for_no_cases(path: Path) -> None:
-    """Write a study file all of whose cases are for --full: run_study notes what it was asked, and runs nothing."""
+    """Write a study file all of whose cases are for --full: run_study notes what it was asked, and
+    runs nothing."""
     scene = ROOT / "scenes" / "studies" / "beam_soft.toml"
     text = f'[[scene]]\nname = "a"\nfile = "{scene}"\n[[sweep]]\nfull = true\n'
     path.parent.with_name("asked.toml").write_text(text)
@@ -125,7 +127,8 @@ def writers(sources: Path) -> dict[str, Writer]:
 
 NUMBERS = check.Numbers(run=check.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={})
 NAMES = [*writers(Path())]
-# what never ends a run, and what needs one to be called: these too write by the one way, and nothing else
+# what never ends a run, and what needs one to be called: these too write by the one
+# way, and nothing else
 NOT_TRIED = {"app/summary.py", "cli/commands/series.py"}
 
 

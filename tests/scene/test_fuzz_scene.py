@@ -94,7 +94,8 @@ STUDY = '[[scene]]\nname = "a"\nfile = "scene.toml"\nset = ["{}"]\n[[sweep]]\nop
 @pytest.mark.parametrize(
     "options",
     [
-        "-pc_type python -pc_python_type evil.Solver", "-ksp_type python", "-dll_append evil.so", "-options_file x",
+        "-pc_type python -pc_python_type evil.Solver", "-ksp_type python", "-dll_append evil.so",
+        "-options_file x",
         "-ksp_view :stolen.txt", "-log_view :x", "-o important.h5", "--overwrite", "-ksp_monitor",
         "-debug_terminal xterm",
         "-ksp_rtol ../x", "-on_error_attach_debugger", "-mat_view binary", "evil.py",

@@ -1,4 +1,5 @@
-"""The keys of a scene as ``msmpetsc keys`` and editors have them: each with its unit, default and range."""
+"""The keys of a scene as ``msmpetsc keys`` and editors have them: each with its unit, default and
+range."""
 
 import tomllib
 

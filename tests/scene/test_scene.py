@@ -375,7 +375,8 @@ def test_what_changes_in_time_wants_both(tmp_path, change):
 
 TABLES = [name for name, field in SceneFile.model_fields.items() if field.annotation is not str]
 PLACES = [  # of tables and vectors within tables
-    "gravity.acceleration", "start.velocity", "start.spin", "start.scale", "start.twist", "pin.0.region",
+    "gravity.acceleration", "start.velocity", "start.spin", "start.scale", "start.twist",
+    "pin.0.region",
     "anchor.0.path", "force.0.total", "obstacle.0.path", "output.probe",
 ]  # fmt: skip
 

@@ -1,4 +1,5 @@
-"""scripts/bench.py: how figures are made of runs, and a real run; bench_peers.py: what programs of others are given."""
+"""scripts/bench.py: how figures are made of runs, and a real run; bench_peers.py: what programs of
+others are given."""
 
 import sys
 from pathlib import Path
@@ -13,12 +14,14 @@ import pytest
 from msmpetsc.solve.petsc import device
 
 COST = {
-    "device": "cpu", "cells": 1000, "nodes": 100_000, "memory": 2e8, "time": {"setup": 1.5, "cycle": 4.0, "fine": 3.0}
+    "device": "cpu", "cells": 1000, "nodes": 100_000, "memory": 2e8,
+    "time": {"setup": 1.5, "cycle": 4.0, "fine": 3.0}
 }  # fmt: skip
 
 
 def sample(seconds: list[float]) -> bench.Sample:
-    """Return what a run of so many seconds a frame measures, with one iteration, 30 its and 60 products each."""
+    """Return what a run of so many seconds a frame measures, with one iteration, 30 its and 60
+    products each."""
     frames = {"wall_time": np.array(seconds), "step_error": np.linspace(0, 1e-4, len(seconds))}
     counts = {"iterations": 1, "ksp_its": 30, "products": 60, "proof_products": 6}
     return bench.Sample(

@@ -1,5 +1,5 @@
-"""The scripts run from a clone as their README writes them, whatever Python is found first; scripts/setup and
-scripts/build_petsc_cuda, with stand-ins for what they call."""
+"""The scripts run from a clone as their README writes them, whatever Python is found first;
+scripts/setup and scripts/build_petsc_cuda, with stand-ins for what they call."""
 
 import os
 import shutil
@@ -181,7 +181,8 @@ def test_a_folder_of_others_is_left_alone(bare: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
-    """Two cards of one kind and one of another name the build; the same call then only prints what to export."""
+    """Two cards of one kind and one of another name the build; the same call then only prints what
+    to export."""
     program(bare, "nvidia-smi", "printf '9.0\\n8.0\\n9.0\\n'")
     prefix = tmp_path / "petsc"
     prefix.mkdir()

@@ -24,7 +24,8 @@ def dense() -> np.ndarray:
 def solved(
     dense: np.ndarray, right: np.ndarray, its: int
 ) -> Iterator[tuple[SolveBound, float, np.ndarray]]:
-    """The bound of so many iterations of CG with D, the residual that they leave, |r|_(D^-1), and what they find."""
+    """The bound of so many iterations of CG with D, the residual that they leave, |r|_(D^-1), and
+    what they find."""
     bound, ksp, matrix = (
         SolveBound(),
         PETSc.KSP().create(),

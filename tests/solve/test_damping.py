@@ -1,4 +1,5 @@
-"""Damping by the mass, and by viscosity: decay in free flight, a swing's energy, creep, a solid that spins."""
+"""Damping by the mass, and by viscosity: decay in free flight, a swing's energy, creep, a solid
+that spins."""
 
 from pathlib import Path
 
@@ -82,7 +83,8 @@ def viscous(
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
-    """Under a force that comes at once it gives as 1 - exp(-t / beta); its inertia takes 1/70 of beta."""
+    """Under a force that comes at once it gives as 1 - exp(-t / beta); its inertia takes 1/70 of
+    beta."""
     top = {"box": [[-1, -1, 0.24], [1, 1, 0.26]]}
     pulled = {"pin": [{"region": FOOT}], "force": [{"region": top, "total": [0, 0, 50.0]}]}
     model, frames = play(

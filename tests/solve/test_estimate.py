@@ -1,4 +1,5 @@
-"""What a run says of its errors: the estimate, the true error, the way of a step, and what it cost."""
+"""What a run says of its errors: the estimate, the true error, the way of a step, and what it
+cost."""
 
 import json
 from pathlib import Path
@@ -56,7 +57,8 @@ SCENES = {
 def test_the_estimate_is_within_three_of_the_true_error(
     tmp_path: Path, name: str, preset: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """Without early ends. Where the bound alone would do, what is said may be further above; it is never far below."""
+    """Without early ends. Where the bound alone would do, what is said may be further above; it is
+    never far below."""
     for module in (error_control, minimum):
         monkeypatch.setattr(module, "KNOWN", 0.0)
     monkeypatch.setattr(SolveBound, "of", lambda *_: np.inf)
@@ -80,7 +82,8 @@ def test_the_estimate_is_within_three_of_the_true_error(
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
 def test_with_multigrid_one_cycle_confirms_what_a_step_has_left(tmp_path: Path, law: str):
-    """What is said is then a bound; a share of 0.6 of all products proved these steps when each was estimated by CG."""
+    """What is said is then a bound; a share of 0.6 of all products proved these steps when each was
+    estimated by CG."""
     scene = SCENES["swings"] | {"material": {"young_modulus": 5e5, "density": 1000.0, "law": law}}
     solver = "solver={preset='newton-multigrid', error=1e-3}"
     loaded = load_scene(
@@ -99,7 +102,8 @@ def test_with_multigrid_one_cycle_confirms_what_a_step_has_left(tmp_path: Path, 
 
 
 def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
-    """A mass on a spring along z: x* in closed form, and g is a parabola, so its error is the other's square."""
+    """A mass on a spring along z: x* in closed form, and g is a parabola, so its error is the
+    other's square."""
     m, k, r = 0.3, 40.0, 1.0
     lattice = one_spring(m, k, r)
     stepper = Stepper(COMM, lattice, T, find_preset("newton"))
@@ -157,7 +161,8 @@ def test_what_cannot_be_measured_is_one_clear_line(tmp_path: Path, words: list[s
 
 
 def test_linear_solves_are_no_tighter_than_the_step_needs():
-    """A step to 1e-1 asks for looser ones than a step to 1e-8 does, whose last goes as far as the step needs."""
+    """A step to 1e-1 asks for looser ones than a step to 1e-8 does, whose last goes as far as the
+    step needs."""
 
     def tolerances(error: float) -> list[float]:
         lattice, seen = beam(), []
@@ -175,7 +180,8 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
 
 
 def test_a_short_solve_does_not_forget_the_least_eigenvalue_of_a_long_one():
-    """A step said 0.004 of its error of 0.02 where 91 iterations had come to 5e-4, and the next five to 0.38."""
+    """A step said 0.004 of its error of 0.02 where 91 iterations had come to 5e-4, and the next
+    five to 0.38."""
 
     class Solve(NamedTuple):
         its: int
@@ -199,11 +205,14 @@ def test_a_short_solve_does_not_forget_the_least_eigenvalue_of_a_long_one():
 
 @pytest.mark.slow
 def test_an_estimate_does_not_trust_a_cycle_that_smooths_nothing(tmp_path: Path):
-    """The norm of such a preconditioner does not see what it leaves: 0.59 off was said to be 2.6e-4."""
+    """The norm of such a preconditioner does not see what it leaves: 0.59 off was said to be
+    2.6e-4."""
     held = [{"region": {"half_space": {"point": [0, 0, 0], "normal": [-1, 0, 0]}}}]
     tables = {
-        "cages": {"cell_size": 0.0015}, "time": {"integrator": "static"}, "gravity": GRAVITY, "pin": held,
-        "material": {"young_modulus": 1e9, "poisson_ratio": 0.0, "density": 1000.0, "law": "neo-hookean"},
+        "cages": {"cell_size": 0.0015}, "time": {"integrator": "static"}, "gravity": GRAVITY,
+        "pin": held,
+        "material": {"young_modulus": 1e9, "poisson_ratio": 0.0, "density": 1000.0,
+        "law": "neo-hookean"},
         "solver": {"preset": "newton-multigrid"},
     }  # fmt: skip
     scene, out = block_scene(tmp_path, np.array([0.1, 0.02, 0.001]), **tables), tmp_path / "o.h5"

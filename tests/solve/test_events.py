@@ -32,7 +32,8 @@ def logged(text: str) -> dict[str, dict[str, tuple[int, float]]]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, dict, dict]:
-    """Stages of the log, the measure file and the frames' numbers of a run that has a reference, too."""
+    """Stages of the log, the measure file and the frames' numbers of a run that has a reference,
+    too."""
     folder = tmp_path_factory.mktemp("run")
     words = (
         "-o",

@@ -14,13 +14,15 @@ SWING = {
 
 
 def bar(folder: Path, **tables) -> Path:
-    """Two cells, so that no mode is much faster than another: the motion is smooth at the steps tried."""
+    """Two cells, so that no mode is much faster than another: the motion is smooth at the steps
+    tried."""
     return block_scene(folder, np.array([0.25, 0.125, 0.125]), **SWING | tables)
 
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """By explicit substeps of which 60 make the shortest step tried: their own error is of second order."""
+    """By explicit substeps of which 60 make the shortest step tried: their own error is of second
+    order."""
     time = {
         "step": DURATION / 8,
         "duration": DURATION,
@@ -49,11 +51,11 @@ def test_order_in_time(
 @pytest.mark.parametrize("steps", [4, 8, 16])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
-    """A spinless mode of frequency w loses as the scheme's own roots say: implicit Euler 1 / (1 + w^2 t^2) a step.
+    """A spinless mode of frequency w loses as the scheme's own roots say: implicit Euler 1 / (1 +
+    w^2 t^2) a step.
 
-    One cell whose shape is blown up evenly is that mode: by the forces of its springs, all in step, at small strain;
-    w^2 from the run's own elastic energy, 1/2 w^2 sum m |u|^2.
-    """
+    One cell whose shape is blown up evenly is that mode: by the forces of its springs, all in step,
+    at small strain; w^2 from the run's own elastic energy, 1/2 w^2 sum m |u|^2."""
     small = 1e-5
     scene = block_scene(
         tmp_path,
@@ -73,8 +75,9 @@ def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
 
 
 def energy_left(integrator: str, wt: float, steps: int) -> float:
-    """Of x'' = -w^2 x from x = 1, x' = 0, by the scheme itself on z = x + i x' / w, whose rate is -i w z; BDF2 with
-    the history that an implicit Euler step of two thirds makes up (solve.integrators.implicit.Bdf2)."""
+    """Of x'' = -w^2 x from x = 1, x' = 0, by the scheme itself on z = x + i x' / w, whose rate is
+    -i w z; BDF2 with the history that an implicit Euler step of two thirds makes up
+    (solve.integrators.implicit.Bdf2)."""
     matrix = wt * np.array([[0, 1], [-1, 0]])  # t d/dt of (x, x' / w)
     one = np.array([1.0, 0.0])
     if integrator == "implicit-euler":

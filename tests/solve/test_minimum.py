@@ -1,8 +1,8 @@
-"""Where a step ends: at a minimum, no saddle, and as near to it as it says; what rounding leaves is an error like any
-other.
+"""Where a step ends: at a minimum, no saddle, and as near to it as it says; what rounding leaves is
+an error like any other.
 
-Cases in which a run once said of a step an error of 1e-3 or less that was 0.4 to 1, and a random sample of hard scenes.
-"""
+Cases in which a run once said of a step an error of 1e-3 or less that was 0.4 to 1, and a random
+sample of hard scenes."""
 
 import json
 from contextlib import suppress
@@ -43,7 +43,8 @@ PLATES = [
 ]
 CASES = {
     "crushed": dict(
-        sides=BEAM, cells=80, young=283262.4, step=0.00208, frames=1, gravity=GRAVITY, start={"scale": [2, 0.05, 2]}
+        sides=BEAM, cells=80, young=283262.4, step=0.00208, frames=1, gravity=GRAVITY,
+        start={"scale": [2, 0.05, 2]}
     ),
     "pressed": dict(
         sides=BEAM, cells=80, young=174399181.2, step=0.003704954, frames=4, gravity=GRAVITY,
@@ -101,7 +102,8 @@ def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(
 
 
 def test_a_budget_that_ends_where_no_minimum_is_near_says_so(tmp_path: Path):
-    """One published iteration leaves the crushed beam flat: nothing bounds how far it is from where it will go."""
+    """One published iteration leaves the crushed beam flat: nothing bounds how far it is from where
+    it will go."""
     (frame,) = play(
         write_case(tmp_path, "crushed", preset="newton", max_iterations=1),
         "solver={preset='newton', max_iterations=1}",
@@ -121,8 +123,9 @@ def squashed(tmp_path: Path, share: float) -> tuple[Stepper, np.ndarray]:
 def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, multigrid: bool
 ):
-    """Of a squashed beam, free, so that its rigid motions are among the modes; after a search that knows nothing, of a
-    step with Jacobi's preconditioner, which has multigrid for the search where there are many nodes."""
+    """Of a squashed beam, free, so that its rigid motions are among the modes; after a search that
+    knows nothing, of a step with Jacobi's preconditioner, which has multigrid for the search where
+    there are many nodes."""
     monkeypatch.setattr(preconditioning, "LARGE", 1 if multigrid else 10**9)
     simulation, q = squashed(tmp_path, share)
     stepper = simulation.integrator.stepper
@@ -191,9 +194,9 @@ def dense_hessian(stepper: Stepper) -> np.ndarray:
 @pytest.mark.parametrize("preset", ["newton", "anderson", "fast-msm"])
 @pytest.mark.parametrize("shift", [0.0, 0.1], ids=["exactly", "by rounding"])
 def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: float):
-    """Its error is 0 / 0, or rounding over 0. With the push c = k (r - 1) across each spring, M^(-1) H is no less than
-    1 - 4 t^2 c / m by the springs one by one, which is negative here and calls for a search; its lowest eigenvalue is
-    1 - 3 t^2 c / m."""
+    """Its error is 0 / 0, or rounding over 0. With the push c = k (r - 1) across each spring,
+    M^(-1) H is no less than 1 - 4 t^2 c / m by the springs one by one, which is negative here and
+    calls for a search; its lowest eigenvalue is 1 - 3 t^2 c / m."""
     k, r = 2e3, 1.1
     lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
     stepper = Stepper(MPI.COMM_SELF, lattice, T, find_preset(preset), error=1e-3)
@@ -207,10 +210,13 @@ def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: flo
 
 
 def test_a_body_at_rest_is_not_far_off_its_solution(tmp_path: Path, caplog):
-    """Once only rounding moves it, by 1e-12 of its size, the estimate is as large as the motion, or 2.8 times that."""
+    """Once only rounding moves it, by 1e-12 of its size, the estimate is as large as the motion, or
+    2.8 times that."""
     path = blocks.block_scene(
-        tmp_path, sides=blocks.CELL * np.array([16, 1, 1]), pin=[{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}],
-        material={"young_modulus": 1.92e7, "density": 1000.0}, time={"step": 0.3, "duration": 12.0}, gravity=GRAVITY,
+        tmp_path, sides=blocks.CELL * np.array([16, 1, 1]),
+        pin=[{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}],
+        material={"young_modulus": 1.92e7, "density": 1000.0}, time={"step": 0.3, "duration": 12.0},
+        gravity=GRAVITY,
         solver={"preset": "newton", "error": 1e-3},
     )  # fmt: skip
     _, frames = blocks.play(path)
@@ -221,7 +227,8 @@ def test_a_body_at_rest_is_not_far_off_its_solution(tmp_path: Path, caplog):
 
 
 def test_rounding_is_an_error_and_no_zero(tmp_path: Path):
-    """At a goal below what doubles can do the step says what they leave; it does not go on for ever, nor say 0."""
+    """At a goal below what doubles can do the step says what they leave; it does not go on for
+    ever, nor say 0."""
     for preset in ("newton", "anderson"):
         (frame,) = play(
             write_case(tmp_path, "crushed", preset=preset),
@@ -282,9 +289,10 @@ SOLID = 'material.law="neo-hookean"', "material.poisson_ratio=0.45"
 def test_what_cg_has_left_is_no_bound_across_a_kink(
     seed: int, number: int, changes: tuple[str, ...]
 ):
-    """Friction and contact make F at the next iterate another than CG has left of it: errors of 0.3 and 1.6 were
-    said to be 0.08 and 0.07, 0.27 and 0.04 of them. What is said is an estimate all the same: where a body springs
-    back from an eighth of its length, of the first step's error 0.47, 0.76 or over 0.9, by the way of 70 iterations."""
+    """Friction and contact make F at the next iterate another than CG has left of it: errors of 0.3
+    and 1.6 were said to be 0.08 and 0.07, 0.27 and 0.04 of them. What is said is an estimate all
+    the same: where a body springs back from an eighth of its length, of the first step's error
+    0.47, 0.76 or over 0.9, by the way of 70 iterations."""
     said = shares_said(seed, number, 'solver.preset="newton-multigrid"', *changes)
     assert said[0] > 1 / 3 and said[1] > 0.6 and said[2] > 0.6
 
@@ -293,8 +301,9 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(
 def test_an_error_is_no_less_than_what_its_estimate_does_not_know(
     seed: int, number: int, was: float
 ):
-    """A stiff block lands on a plane with friction (40, 54): nodes come to touch within what is missing of e, where g
-    was never looked at. A cell hangs by an edge (115): CG of few iterations has nothing of its mode.
+    """A stiff block lands on a plane with friction (40, 54): nodes come to touch within what is
+    missing of e, where g was never looked at. A cell hangs by an edge (115): CG of few iterations
+    has nothing of its mode.
 
     was : the least share that was said
     """
@@ -302,15 +311,17 @@ def test_an_error_is_no_less_than_what_its_estimate_does_not_know(
 
 
 def test_a_mode_that_stiffens_hides_no_lower_one():
-    """A step said 0.13 of its error while the search for curvature followed the mode of the step before (1.57, when the
-    lowest was 0.29): on the way to its solution the Hessian had negative curvatures."""
+    """A step said 0.13 of its error while the search for curvature followed the mode of the step
+    before (1.57, when the lowest was 0.29): on the way to its solution the Hessian had negative
+    curvatures."""
     said = shares_said(28, 11, 'solver.preset="newton-projected"')
     assert len(said) == 3 and min(said) > 0.85  # 0.98 with PETSc 3.18, 0.896 with 3.22
 
 
 def test_a_preconditioner_far_from_the_hessian_bounds_no_error(tmp_path: Path):
-    """A ball that a step of fast spin has folded: the least eigenvalue of P^(-1) H that CG had come to was 0.008, and
-    what a solve of nine iterations had left was 22 times as much as that had bounded: 0.18 of the error was said."""
+    """A ball that a step of fast spin has folded: the least eigenvalue of P^(-1) H that CG had come
+    to was 0.008, and what a solve of nine iterations had left was 22 times as much as that had
+    bounded: 0.18 of the error was said."""
     trimesh.creation.icosphere(2, 0.3).export(tmp_path / "ball.ply")
     scene = {
         "mesh": {"source": "ball.ply"},

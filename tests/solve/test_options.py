@@ -113,7 +113,8 @@ WITH_THE_SOLVERS = {
     "-ksp_rtol abc": "abc",
     "-snes_type nonsense": "loop and a line search of their own",
     "-pc_type nonsense": "nonsense",
-    "-pc_type composite": "composite",  # the dense block that was being worked on could not be destroyed
+    # the dense block that was being worked on could not be destroyed
+    "-pc_type composite": "composite",
     "--set time.integrator=verlet -ksp_type cg": "-ksp_type",
 }
 

@@ -1,7 +1,8 @@
-"""Each option that -help lists for the objects of a run, with values of wrong types, zero, negative and no numbers.
+"""Each option that -help lists for the objects of a run, with values of wrong types, zero, negative
+and no numbers.
 
-Each is tried in a fork of this process, which has carried out the scene: a fifth of a second, where a start takes two.
-"""
+Each is tried in a fork of this process, which has carried out the scene: a fifth of a second, where
+a start takes two."""
 
 import os
 import re
@@ -57,7 +58,8 @@ def options_in(text: str) -> Iterator[tuple[str, str]]:
 
 
 def attempt(folder: Path, words: list[str]) -> tuple[int | None, str]:
-    """Return the status of a command in a fork, negative for a signal, None for no end; and all that it says."""
+    """Return the status of a command in a fork, negative for a signal, None for no end; and all
+    that it says."""
     path = folder / "said"
     sys.stdout.flush()
     child = os.fork()

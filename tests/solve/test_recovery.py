@@ -1,4 +1,5 @@
-"""Small cases that are hard on a solver (scenes/studies/stability.toml): what comes of each, good or bad, and why."""
+"""Small cases that are hard on a solver (scenes/studies/stability.toml): what comes of each, good
+or bad, and why."""
 
 import tomllib
 from dataclasses import dataclass
@@ -151,7 +152,8 @@ def test_it_comes_back_to_its_rest_shape(name: str):
 
 
 def test_a_micrometre_of_rubber_comes_back():
-    """Where CG's way climbs PETSc calls it a minimum in such units; the projected Hessian takes over all the same."""
+    """Where CG's way climbs PETSc calls it a minimum in such units; the projected Hessian takes
+    over all the same."""
     played = play("tiny", "material.law=neo-hookean", "material.poisson_ratio=0.49")
     assert not played.words and played.shape_error() < 1e-4
 
@@ -183,9 +185,9 @@ def test_it_hangs_at_rest(name: str):
 
 @pytest.mark.parametrize("name", ["column", "column, solid"])
 def test_a_column_bows_aside(name: str):
-    """The middle goes aside by w, by itself: all of the way that is not squeezed would be pi^2 w^2 / 4 L. With springs
-    alone it twists as well where it folds, 15% lower in energy than the hinge in one plane that it was, with w =
-    0.20."""
+    """The middle goes aside by w, by itself: all of the way that is not squeezed would be pi^2 w^2
+    / 4 L. With springs alone it twists as well where it folds, 15% lower in energy than the hinge
+    in one plane that it was, with w = 0.20."""
     played = play(name)
     middle = np.abs(played.lattice.nodes[:, 0] - 0.5) < 0.01
     assert 0.15 < np.linalg.norm(played.moved[middle].mean(axis=0)[1:]) < 0.41
@@ -194,7 +196,8 @@ def test_a_column_bows_aside(name: str):
 
 
 def test_parts_of_the_greatest_contrast_are_solved():
-    """A clamped beam squashed to 0.62, half of it 1e6 times as stiff: at 1e8, now refused, a step did not end."""
+    """A clamped beam squashed to 0.62, half of it 1e6 times as stiff: at 1e8, now refused, a step
+    did not end."""
     played = play(
         "stiff half", "start.scale=[0.62, 0.62, 0.62]", "cages.cell_size=0.125", "time.duration=0.5"
     )
@@ -249,7 +252,8 @@ def test_faces_led_through_each_other_leave_a_body_turned_over():
 
 
 def test_springs_pass_through_no_length_exactly():
-    """Those upright in the half that is led, 9 x 17 of them; let go, the half is turned over, but for a crease."""
+    """Those upright in the half that is led, 9 x 17 of them; let go, the half is turned over, but
+    for a crease."""
     played = play("through, sheet")
     lattice, flat = played.lattice, played.frames[8].position
     length = np.linalg.norm(flat[lattice.springs[:, 0]] - flat[lattice.springs[:, 1]], axis=1)
@@ -281,16 +285,19 @@ OTHERS = {
 }
 COMES_BACK = [
     ("newton-multigrid", "stretched"), ("newton-multigrid", "flat, solid"),
-    ("anderson", "squeezed"), ("anderson", "pressed, solid"), ("fast-msm", "stretched"), ("fast-msm", "flat, solid"),
+    ("anderson", "squeezed"), ("anderson", "pressed, solid"), ("fast-msm", "stretched"),
+    ("fast-msm", "flat, solid"),
     ("fast-msm", "one cell, free"),
 ]  # fmt: skip
 NOT_FINITE = REASON[-4]  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 DIVERGES = [
-    # A is no less than the Hessian of springs, but far from it where all are pressed: steps are small, or too long
+    # A is no less than the Hessian of springs, but far from it where all are pressed:
+    # steps are small, or too long
     ("anderson", "flat", "DIVERGED_MAX_IT after 300 iterations"),
     ("fast-msm", "column", "DIVERGED_MAX_IT after 1000 iterations"),
     ("anderson", "column, solid", "DIVERGED_MAX_IT after 300 iterations"),
-    # A is of the solid at rest, and no line search holds the steps of cells that are inside out back
+    # A is of the solid at rest, and no line search holds the steps of cells that are
+    # inside out back
     ("anderson", "mirrored, solid", "DIVERGED_"),
     ("fast-msm", "mirrored, solid", NOT_FINITE),
 ]
@@ -320,7 +327,8 @@ RESCUED = [("substep", "cages.cell_size=0.125"), ("fallback", "material.poisson_
 
 @pytest.mark.parametrize(("how", "change"), RESCUED)
 def test_what_anderson_cannot_do_is_rescued(how: str, change: str):
-    """Inertia holds nodes where they are in shorter steps; newton-projected sees the Hessian of cells inside out."""
+    """Inertia holds nodes where they are in shorter steps; newton-projected sees the Hessian of
+    cells inside out."""
     name, anderson = "mirrored, solid", [*OTHERS["anderson"], change]
     assert "DIVERGED" in play(name, *anderson).words
     played = play(name, *anderson, f"safety.on_failure={how}")

@@ -1,4 +1,5 @@
-"""Statics: equilibria against closed forms and against motions that have come to rest, what is refused, load steps."""
+"""Statics: equilibria against closed forms and against motions that have come to rest, what is
+refused, load steps."""
 
 from pathlib import Path
 
@@ -54,7 +55,8 @@ def test_a_mass_hangs_on_a_spring(preset: str):
 
 
 def test_a_hanging_bar(tmp_path: Path):
-    """rho g L^2 / (2 E) longer, but for the layer that the pins keep from narrowing: less than 2% here."""
+    """rho g L^2 / (2 E) longer, but for the layer that the pins keep from narrowing: less than 2%
+    here."""
     scene = column(tmp_path, pin=[{"region": TOP}], gravity={"acceleration": [0.0, 0.0, -0.1]})
     model, frames = play(scene)
     bottom = model.lattice.nodes[:, 2] < 0.01
@@ -129,8 +131,8 @@ def test_what_only_motion_has_is_refused(tmp_path: Path, words: str):
 @pytest.mark.parametrize("sideways", [0.0, 1e-3])
 @pytest.mark.parametrize("share, buckles", [(0.8, False), (2.0, True)])
 def test_a_column_buckles(tmp_path: Path, sideways: float, share: float, buckles: bool):
-    """Under more than Euler's load (its own bending is stiffer by 169/140 (h/b)^2) it is no longer straight, even
-    where nothing pushes it aside: the straight state is a saddle."""
+    """Under more than Euler's load (its own bending is stiffer by 169/140 (h/b)^2) it is no longer
+    straight, even where nothing pushes it aside: the straight state is a saddle."""
     force = [{"region": TOP, "total": [sideways * EULER, 0.0, -share * EULER]}]
     model, frames = play(column(tmp_path, pin=[{"region": BOTTOM}], force=force))
     aside = np.hypot(*moved(model, frames[-1])[:2])
@@ -169,7 +171,8 @@ def test_shares_of_a_load():
 def test_a_state_that_fails_is_found_another_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_failure: str
 ):
-    """By the robust preset, or by way of states at times between, which are states, too: anchors go there in parts."""
+    """By the robust preset, or by way of states at times between, which are states, too: anchors go
+    there in parts."""
     anchor = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.05, 0.0]}]}]
     tables = {"pin": [{"region": BOTTOM}], "anchor": anchor}
     _, usual = play(column(tmp_path, **tables))

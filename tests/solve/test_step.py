@@ -37,7 +37,8 @@ def reference() -> list:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_free_fall_is_the_schemes_own(preset: str):
-    """q_n = q_0 + g t^2 n (n + 1) / 2: implicit Euler from rest, to the KSP's tolerance for ``paper``."""
+    """q_n = q_0 + g t^2 n (n + 1) / 2: implicit Euler from rest, to the KSP's tolerance for
+    ``paper``."""
     lattice = build_lattice(
         cages_of(block(3, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
     )
@@ -58,7 +59,8 @@ def test_newton_solves_the_step_to_rounding(reference: list):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
-    """Along a spring of length r the scheme is linear: (m + t^2 k) x = m (2 q_n - q_(n-1)) + t^2 k r."""
+    """Along a spring of length r the scheme is linear: (m + t^2 k) x = m (2 q_n - q_(n-1)) + t^2 k
+    r."""
     m, k, r = 0.3, 40.0, 1.0
     lattice = one_spring(m, k, r)
     stepper = Stepper(COMM, lattice, T, find_preset(preset), error=1e-7)
@@ -74,8 +76,8 @@ def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("error", [1e-2, 1e-4])
 def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
-    """The stated error is the true one of the step, |x - x*|_M / |x* - y|_M, within a factor of 3 where it was
-    estimated; where the bound did already, it may be further below."""
+    """The stated error is the true one of the step, |x - x*|_M / |x* - y|_M, within a factor of 3
+    where it was estimated; where the bound did already, it may be further below."""
     lattice = beam()
     q = swing("newton", 3, error=1e-12)
     q, before = q[-1].position, q[-2].position
@@ -146,7 +148,8 @@ def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: di
 
 
 def test_a_fault_of_ours_within_petsc_is_no_bad_option():
-    """PETSc 3.18 lets the exception of a callback through, 3.26 makes it the cause of its own error."""
+    """PETSc 3.18 lets the exception of a callback through, 3.26 makes it the cause of its own
+    error."""
     from petsc4py import PETSc
 
     def fault(*_):
@@ -169,7 +172,8 @@ def test_a_preset_leaves_no_options_behind():
 
 
 def test_A_is_M_plus_t2_L():
-    """Against a dense sum over springs: symmetric, positive definite, its rows sum to the mass without pins."""
+    """Against a dense sum over springs: symmetric, positive definite, its rows sum to the mass
+    without pins."""
     lattice = build_lattice(
         cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
     )
@@ -186,7 +190,8 @@ def test_A_is_M_plus_t2_L():
 
 
 def test_a_plain_iteration_is_the_papers_global_step():
-    """x <- x - A^(-1) F(x) from y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext) (Eq. 17), dense here."""
+    """x <- x - A^(-1) F(x) from y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext) (Eq. 17), dense
+    here."""
     lattice = build_lattice(
         cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
     )
@@ -207,8 +212,9 @@ def test_a_plain_iteration_is_the_papers_global_step():
 
 
 def test_a_strut_that_buckles_under_its_load():
-    """A spring pressed to half by a load in balance with it: the only force left is across, with negative
-    curvature, and CG goes up. It must come to F = 0 all the same (which may be a saddle)."""
+    """A spring pressed to half by a load in balance with it: the only force left is across, with
+    negative curvature, and CG goes up. It must come to F = 0 all the same (which may be a
+    saddle)."""
     m, k, r, length = 0.3, 4000.0, 1.0, 0.5
     lattice = one_spring(m, k, r)
     load = np.array([[0.0, 0, 0], [0, 0, -k * (r - length)]])
@@ -237,7 +243,8 @@ def test_a_body_pressed_to_half_still_gives_a_descent():
     Elasticity(lattice).add_gradient(x, g)
     F = lattice.mass[:, None] * (x - pressed) + T**2 * (g - weight(lattice))
     away = np.sqrt(((x - pressed) ** 2).sum(axis=1) @ lattice.mass)
-    # the bound on the error, which was to be 1e-6: it may be too large by the root of H over M, 20 here
+    # the bound on the error, which was to be 1e-6: it may be too large by the root of H
+    # over M, 20 here
     assert np.sqrt((F**2).sum(axis=1) @ (1 / lattice.mass)) <= 20 * 1e-6 * away
     energy = Elasticity(lattice).energy
     assert energy(x) < energy(pressed)

@@ -1,4 +1,5 @@
-"""The choice of steps by an account of their errors, without a body; and the times that steps may start and end at."""
+"""The choice of steps by an account of their errors, without a body; and the times that steps may
+start and end at."""
 
 from collections.abc import Callable
 
@@ -16,8 +17,8 @@ def control(order: int, error: float, levels: tuple[int, int] = LEVELS) -> StepC
 def march(
     control: StepControl, rate: Callable[[float], float], until: float = 1.0
 ) -> list[tuple[float, int]]:
-    """Start and level of each step of a motion of size 1; local errors are t^(order + 1) times the greater rate at
-    their ends."""
+    """Start and level of each step of a motion of size 1; local errors are t^(order + 1) times the
+    greater rate at their ends."""
     ticks, tick, taken = Ticks(STEP, STEPS, LEVELS[0], []), 0, []
     while tick < until * ticks.ticks:
         level, start = ticks.fitting(tick, control.level), ticks.time(tick)
@@ -45,7 +46,8 @@ def test_what_an_even_flight_saves_is_spent_on_the_impact_after_it():
 
 
 def test_no_moment_takes_all_the_steps():
-    """One a million times as hard, when all credit is spent, takes twenty times the steps of all others at most."""
+    """One a million times as hard, when all credit is spent, takes twenty times the steps of all
+    others at most."""
     account = control(2, 1e-2)
     levels = march(account, lambda time: 1e6 if 2.0 <= time <= 2.1 else 1.0)
     assert len(levels) < 20 * len(march(control(2, 1e-2), lambda _: 1.0))

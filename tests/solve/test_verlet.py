@@ -1,4 +1,5 @@
-"""The explicit integrator: against the leapfrog's closed forms, numpy's eigenvalues, Coulomb's law."""
+"""The explicit integrator: against the leapfrog's closed forms, numpy's eigenvalues, Coulomb's
+law."""
 
 from pathlib import Path
 
@@ -68,7 +69,8 @@ def shaken(lattice: Lattice, size: float) -> np.ndarray:
 
 
 def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
-    """x_n = cos(w n dt), v_n = -sin(w dt) / dt sin(w n dt) with w = 2 / dt asin(omega dt / 2), omega^2 = k / m."""
+    """x_n = cos(w n dt), v_n = -sin(w dt) / dt sin(w n dt) with w = 2 / dt asin(omega dt / 2),
+    omega^2 = k / m."""
     m, k, r, size, count = 0.3, 400.0, 1.0, 0.2, 4
     dt = T / count
     w = 2 / dt * np.arcsin(np.sqrt(k / m) * dt / 2)
@@ -80,7 +82,8 @@ def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
 
 
 def test_free_flight_keeps_momentum_and_angular_momentum():
-    """The forces are central, and a kick changes v at one q: the leapfrog keeps r x m v, implicit Euler does not."""
+    """The forces are central, and a kick changes v at one q: the leapfrog keeps r x m v, implicit
+    Euler does not."""
     lattice = cube()
     v = np.cross([0, 2, 9], lattice.nodes) + np.random.default_rng(1).normal(
         size=lattice.nodes.shape
@@ -113,7 +116,8 @@ VERLET = 'time.integrator="verlet"'
 
 def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_path: Path):
     def lost(frames: list[Frame]) -> tuple[float, float]:
-        """How far the energy is from the start's at the end and at most, of the greatest kinetic energy."""
+        """How far the energy is from the start's at the end and at most, of the greatest kinetic
+        energy."""
         total = np.array([f.kinetic + f.elastic + f.potential for f in frames])
         away = np.abs(total - total[0]) / max(f.kinetic for f in frames)
         return away[-1], away.max()
@@ -122,7 +126,8 @@ def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_p
     _, fine = swing(tmp_path, T, 4.0, VERLET, "time.substep=1e-3")  # of 8.3e-3: 1/70 of the square
     _, implicit = swing(tmp_path, T, 0.5)
     assert lost(implicit)[0] > 0.2
-    # at the limit, which the springs that the clamp cuts set, 6%; of 70 times shorter squares the 40th part or less
+    # at the limit, which the springs that the clamp cuts set, 6%; of 70 times shorter
+    # squares the 40th part or less
     assert lost(explicit)[1] < 0.07 and lost(fine)[1] < 0.07 / 40
     late = [f.kinetic for f in explicit if f.time > 3]
     assert max(late) > 0.5 * max(f.kinetic for f in explicit)  # still swinging
@@ -174,7 +179,8 @@ def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Pa
     material = {"young_modulus": 1e4, "density": 1000.0, "law": "neo-hookean"}
     time = {"step": T, "duration": 0.4} | EXPLICIT
     scene = block_scene(
-        tmp_path, time=time, material=material, gravity={"acceleration": [0, 0, -2 * G]}, obstacle=[floor],
+        tmp_path, time=time, material=material, gravity={"acceleration": [0, 0, -2 * G]},
+        obstacle=[floor],
         cages={"cell_size": CELL / 2},
     )  # fmt: skip
     _, frames = play(scene)
@@ -185,8 +191,8 @@ def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Pa
 
 
 def test_a_body_that_folds_is_not_heated(tmp_path: Path, monkeypatch):
-    """A soft beam that is stretched and let go folds over itself: springs of nearly no length turn about in a substep
-    at the limit. It gained 43% of its energy in one step of 0.1 s."""
+    """A soft beam that is stretched and let go folds over itself: springs of nearly no length turn
+    about in a substep at the limit. It gained 43% of its energy in one step of 0.1 s."""
     scene = block_scene(
         tmp_path, sides=CELL * np.array([8, 2, 2]), time={"step": 0.1, "duration": 1.0} | EXPLICIT,
         start={"scale": [2, 1, 1]},
@@ -227,7 +233,8 @@ def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp
 
 @pytest.mark.parametrize("stop", [6.0, 6.5])
 def test_the_work_of_an_anchor_that_lets_go_is_no_energy_from_nowhere(tmp_path: Path, stop: float):
-    """It turns round half a step before it lets go within a step, and the nodes keep the speed that this gave them."""
+    """It turns round half a step before it lets go within a step, and the nodes keep the speed that
+    this gave them."""
     top = {"box": [[-1, -1, 0.2], [1, 1, 1]]}
     path = [
         {"time": time * T, "by": [0, 0, 0.03 * height]} for time, height in ((6.25, 1), (12, 6))
@@ -273,14 +280,16 @@ def go_on(scene: Path, state: State, steps: int) -> tuple[Model, list[Frame]]:
 
 
 def test_a_block_sticks_to_a_slope_below_the_angle_of_friction(tmp_path: Path):
-    """Not a creep: half a second at rest, though the substep is no smaller than without friction."""
+    """Not a creep: half a second at rest, though the substep is no smaller than without
+    friction."""
     scene, state = settled(tmp_path, 2 * np.tan(TILT))
     _, frames = go_on(scene, state, 30)
     assert np.abs(frames[-1].position - state.q).max() < 1e-7
 
 
 def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
-    """p_x = m g sin t - mu (p_z + m g cos t), whatever the push does in between: it is p_z + m g cos t in all."""
+    """p_x = m g sin t - mu (p_z + m g cos t), whatever the push does in between: it is p_z + m g
+    cos t in all."""
     mu, start = 0.5 * np.tan(TILT), settled(tmp_path, 0.5 * np.tan(TILT))[1]
     scene = on_a_slope(tmp_path, mu, step=T, duration=1.0)
     model, frames = go_on(scene, State(start.q, start.q), 30)

@@ -127,7 +127,8 @@ def test_a_case_is_its_scene_its_mesh_and_its_options(tmp_path: Path):
 
 
 def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
-    """It has neither a case's cells nor what a sweep changes, and surfaces are stored, which are compared."""
+    """It has neither a case's cells nor what a sweep changes, and surfaces are stored, which are
+    compared."""
     reference = 'reference = { cells = 5000, integrator = "bdf2", step = 0.005 }\n'
     sweep = '[[sweep]]\ncells = [10, 80]\n[[sweep]]\ncells = [10]\nset = ["cages.boundary=whole"]'
     found = all_cases(tmp_path, ONE_SCENE + reference + sweep)

@@ -1,4 +1,5 @@
-"""The figures of a run: its error against a reference, means of its steps, medians of its repeats."""
+"""The figures of a run: its error against a reference, means of its steps, medians of its
+repeats."""
 
 import math
 from pathlib import Path
@@ -34,8 +35,9 @@ def result(
 
 
 def test_the_trajectory_error_of_a_motion_by_hand(tmp_path: Path):
-    """Two nodes of 1 and 4 kg: node 0 moves by 3 and 0 at the two common times, node 1 by 0 and 2; node 1 is off by 1
-    once, node 0 by 2 once: sqrt((4 * 1 + 1 * 4) / (1 * 9 + 4 * 4)) = sqrt(8 / 25)."""
+    """Two nodes of 1 and 4 kg: node 0 moves by 3 and 0 at the two common times, node 1 by 0 and 2;
+    node 1 is off by 1 once, node 0 by 2 once: sqrt((4 * 1 + 1 * 4) / (1 * 9 + 4 * 4)) = sqrt(8 /
+    25)."""
     rest = np.array([[0.0, 0, 0], [1, 0, 0]])
     x, z = np.array([[1.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, 0], [0, 0, 1]])
     reference = result(tmp_path / "r.h5", [0, 0.1, 0.2], [rest, rest + 3 * x, rest + 2 * z], [1, 4])
@@ -65,7 +67,8 @@ def test_means_are_of_steps_and_leave_the_first_frame_out(tmp_path: Path):
     """Frames of 2 steps: 9 s, 2 s and 4 s of computing; the first does not count."""
     positions = [np.zeros((1, 3))] * 4
     file = result(
-        tmp_path / "x.h5", [0, 0.2, 0.4, 0.6], positions, [1], wall_time=[0, 9.0, 2.0, 4.0], iterations=[0, 50, 4, 8],
+        tmp_path / "x.h5", [0, 0.2, 0.4, 0.6], positions, [1], wall_time=[0, 9.0, 2.0, 4.0],
+        iterations=[0, 50, 4, 8],
         ksp_its=[0, 0, 40, 0], products=[0, 0, 60, 12], step_error=[0, 0.3, 0.4, 0.0],
     )  # fmt: skip
     row = frame_metrics(file, 0.1)
@@ -98,7 +101,8 @@ def test_a_rigid_motion_is_no_error_of_shape():
 
 
 def test_the_error_of_a_swollen_body_by_hand():
-    """All grows by 10% about the centre of mass: a tenth of the root mean square distance from it."""
+    """All grows by 10% about the centre of mass: a tenth of the root mean square distance from
+    it."""
     rest, mass = block()
     centre = mass @ rest / mass.sum()
     spread = math.sqrt(mass @ ((rest - centre) ** 2).sum(axis=1) / mass.sum())

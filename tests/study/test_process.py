@@ -1,4 +1,5 @@
-"""The processes of a study: runs that need not start the program, under mpiexec, and with more ranks than cores."""
+"""The processes of a study: runs that need not start the program, under mpiexec, and with more
+ranks than cores."""
 
 import json
 import os
@@ -75,7 +76,8 @@ def test_one_process_serves_until_a_command_fails(tmp_path: Path, processes: Pro
 def test_a_process_alone_takes_no_folder_from_others(
     tmp_path: Path, processes: Processes, monkeypatch
 ):
-    """One that ended robbed one that began of a folder of both: a case in 300 failed. Open MPI 5 leaves them."""
+    """One that ended robbed one that began of a folder of both: a case in 300 failed. Open MPI 5
+    leaves them."""
     (tmp_path / "shared").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "shared"))
     look = "import os; from mpi4py import MPI; print(*os.listdir(os.environ['TMPDIR']))"

@@ -1,4 +1,5 @@
-"""Sizing: errors from runs of several sizes, and the cheapest split of an error among cells, time step and solution."""
+"""Sizing: errors from runs of several sizes, and the cheapest split of an error among cells, time
+step and solution."""
 
 # ruff: noqa: F811 (fixtures are imported)
 import json
@@ -56,7 +57,8 @@ def test_three_sizes_tell_order_and_error(order: float, sizes: tuple):
 
 
 def test_an_order_that_cannot_be_is_not_believed():
-    """Distances that do not shrink have no order: the least is taken, which makes the error the greatest."""
+    """Distances that do not shrink have no order: the least is taken, which makes the error the
+    greatest."""
     stuck = error_law((4, 2, 1), [0.05, 0.05], ORDERS)
     assert not stuck.observed and stuck.order == 1 and stuck.error(1) == pytest.approx(0.05)
     steep = error_law((4, 2, 1), [0.5, 0.01], ORDERS)
@@ -66,7 +68,8 @@ def test_an_order_that_cannot_be_is_not_believed():
 
 
 def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
-    """Errors go as the size, but for 0.02 of chance, which the last two sizes alone would make much of."""
+    """Errors go as the size, but for 0.02 of chance, which the last two sizes alone would make much
+    of."""
     sizes, errors = (4, 1.4, 1), (0.4, 0.16, 0.08)
     near = error_law(sizes, [0.24, 0.08], ORDERS)
     wide = error_law(sizes, [0.24, 0.08], ORDERS, across=errors[0] - errors[2])
@@ -79,7 +82,8 @@ def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
 
 @pytest.mark.parametrize(("order", "cosine"), [(1.0, 0.0), (1.5, 0.0), (1.5, 0.5), (2.0, 0.9)])
 def test_lattices_that_err_by_chance(order: float, cosine: float):
-    """What parts two runs is at an angle to the finer one's error, which as if it were at none is too great."""
+    """What parts two runs is at an angle to the finer one's error, which as if it were at none is
+    too great."""
     sizes, e = (4.0, 2.0, 1.0), [0.03 * size**order for size in (4, 2, 1)]
     first, second = (math.sqrt(a**2 - (1 - cosine**2) * b**2) - cosine * b for a, b in pairwise(e))
     across = math.sqrt(first**2 + second**2 + 2 * cosine * first * second)
@@ -134,7 +138,8 @@ def test_a_smaller_error_costs_more_and_none_is_promised_that_cannot_be():
 
 
 def test_explicit_substeps_shorten_with_the_cells():
-    """Eight times the cells are twice the substeps; the costs known are of implicit steps, or of explicit ones."""
+    """Eight times the cells are twice the substeps; the costs known are of implicit steps, or of
+    explicit ones."""
     for explicit, factor in ((False, 16), (True, 8)):
         model = replace(MODEL, steppings=[stepping("verlet", 0.01, 1e-4, 3.0)], explicit=explicit)
         costs = [
@@ -144,7 +149,8 @@ def test_explicit_substeps_shorten_with_the_cells():
 
 
 def test_cost_grows_with_cells_as_measured():
-    """Read off the lattices; beyond them as between the last two, but in proportion to the cells at least."""
+    """Read off the lattices; beyond them as between the last two, but in proportion to the cells at
+    least."""
     model = replace(MODEL, costs=[(100, 1.0), (800, 2.0), (6400, 20.0)])
     assert model.growth(800, 6400) == pytest.approx(10) and model.growth(800, 100) == pytest.approx(
         0.5
@@ -155,14 +161,16 @@ def test_cost_grows_with_cells_as_measured():
 
 
 class Bodies:
-    """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution.
+    """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of
+    their solution.
 
     slow        : whether explicit substeps take too long
     inverted    : cells inside out at the end, by cells
     """
 
     def __init__(
-        self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0, most=math.inf,
+        self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0,
+        most=math.inf,
         fails=lambda *_: False, slow=lambda substep: False, inverted=lambda cells: 0.0,
     ):  # fmt: skip
         self.explicit, self.impacts, self.cell_error, self.fails = (
@@ -233,7 +241,8 @@ def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePla
 
 def case_of(method: Candidate) -> Case:
     return Case(
-        scene="", file=Path(), content="", set=(), integrator=method.integrator, time_step=method.time_step,
+        scene="", file=Path(), content="", set=(), integrator=method.integrator,
+        time_step=method.time_step,
         error=method.step_error,
     )  # fmt: skip
 
@@ -265,7 +274,8 @@ def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell
 def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
     tmp_path: Path, monkeypatch, target
 ):
-    """What parts two runs is at right angles to the finer one's error, of order 1; added up it was twice as much."""
+    """What parts two runs is at right angles to the finer one's error, of order 1; added up it was
+    twice as much."""
 
     def apart(a: Path, b: Path) -> float:
         return math.sqrt(abs(bench.errors[a] ** 2 - bench.errors[b] ** 2))
@@ -274,7 +284,8 @@ def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
     bench = Bodies(explicit=False)
     monkeypatch.setattr(Bodies, "error_of", lambda self, case, cells: 1.4 * cells ** (-1 / 3))
     monkeypatch.setattr(trials, "surface_error", apart)
-    plan = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), print).plan()  # fmt: skip
+    plan = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000),
+    print).plan()  # fmt: skip
     assert plan.met and 0.6 * target < 1.4 * plan.choice.cells ** (-1 / 3) < 1.1 * target
 
 
@@ -300,7 +311,8 @@ def test_statics_are_planned_by_their_cells_alone(tmp_path: Path, monkeypatch):
 
 
 def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
-    """64,000 cells may be tried: 0.1 takes a hundred, which 1,000 tell; 0.01 takes as many as there are."""
+    """64,000 cells may be tried: 0.1 takes a hundred, which 1,000 tell; 0.01 takes as many as there
+    are."""
     (tmp_path / "scene.toml").write_text(SCENE)
     for target, finest in ((0.1, 1000), (0.01, 64_000)):
         bench = Bodies(cell_error=1.0)
@@ -312,7 +324,8 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
 
 
 def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path, monkeypatch):
-    """At 300 cells, as where a foot folds one way or another: no lattice has the error asked for, or little less."""
+    """At 300 cells, as where a foot folds one way or another: no lattice has the error asked for,
+    or little less."""
     monkeypatch.setattr(
         Bodies,
         "error_of",
@@ -324,14 +337,16 @@ def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path,
 
 
 def test_a_coarsest_lattice_that_is_good_by_chance_takes_no_cells(tmp_path: Path, monkeypatch):
-    """Errors of 0.1, 0.07 and 0.025 show no order, so the last is taken as 0.046, until a finer one is asked."""
+    """Errors of 0.1, 0.07 and 0.025 show no order, so the last is taken as 0.046, until a finer one
+    is asked."""
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.1, cell_error=2.0, most=0.1)
     assert max(each.cells for each in plan.tried) == round(6400 * 2**1.5)
     assert plan.met and bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.75 * 0.1
 
 
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
-    """Verlet runs away on the cells that are chosen, though not on those tried before: BDF2 it is, and that is said."""
+    """Verlet runs away on the cells that are chosen, though not on those tried before: BDF2 it is,
+    and that is said."""
     first, *_ = sized(tmp_path, monkeypatch, 0.1)
     runs_away = lambda integrator, cells: integrator == "verlet" and cells == first.choice.cells  # noqa: E731
     plan, _, said = sized(tmp_path, monkeypatch, 0.1, fails=runs_away)
@@ -418,7 +433,8 @@ def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monk
 
 
 def true_error(scene: Path, *, choice: list[str], finer: list[str]) -> float:
-    """Return the error of what a plan wrote, against a run of 32 times the cells; each with changes of its own."""
+    """Return the error of what a plan wrote, against a run of 32 times the cells; each with changes
+    of its own."""
     fine = [f"cages.count={32 * load_scene(scene).cages.count}", *finer]
     results = [scene.with_name("choice.h5"), scene.with_name("finer.h5")]
     for result, changes in zip(results, (choice, fine), strict=True):

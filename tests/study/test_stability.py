@@ -1,4 +1,5 @@
-"""Maps of a study: their cases, how a run is judged, and what the charts show of it. The runs are stand-ins."""
+"""Maps of a study: their cases, how a run is judged, and what the charts show of it. The runs are
+stand-ins."""
 
 # ruff: noqa: F811 (fixtures are imported)
 import re

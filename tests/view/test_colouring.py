@@ -110,7 +110,8 @@ def test_the_scale_has_ticks_at_round_numbers_of_a_fitting_unit(high, unit, labe
 
 
 def test_few_points_at_a_clamp_do_not_rule_the_scale_and_it_says_so():
-    """A grid of 51 x 51 points: stress to 100 kPa along it, and 5 MPa at two points of its clamped edge."""
+    """A grid of 51 x 51 points: stress to 100 kPa along it, and 5 MPa at two points of its clamped
+    edge."""
     x, y = np.mgrid[0:51, 0:51].reshape(2, -1)
     first = np.flatnonzero((x < 50) & (y < 50))
     triangles = np.concatenate([first[:, None] + [0, 51, 52], first[:, None] + [0, 52, 1]])

@@ -42,7 +42,8 @@ def pictures_of(path: Path) -> list[np.ndarray]:
 
 
 def middle_of_body(picture: np.ndarray) -> float:
-    """The row halfway between the first and the last with pixels that are clearly blue: the body's."""
+    """The row halfway between the first and the last with pixels that are clearly blue: the
+    body's."""
     rows = np.flatnonzero((picture[..., 2] - picture[..., 0] > 15).sum(axis=1) > 3)
     return (rows[0] + rows[-1]) / 2
 
@@ -70,7 +71,8 @@ def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
 
 
 def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplog):
-    """The ball's way is four times as high as wide, and so is the film, as far as its caption lets it."""
+    """The ball's way is four times as high as wide, and so is the film, as far as its caption lets
+    it."""
     with caplog.at_level("INFO", logger="msmpetsc"):
         render(falling_ball, "-o", tmp_path / "x.gif")
     with Image.open(tmp_path / "x.gif") as film:
@@ -131,7 +133,8 @@ def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, ca
 
 
 def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
-    """The bar of colours goes from the neutral grey to the darkest, and without colours there is none."""
+    """The bar of colours goes from the neutral grey to the darkest, and without colours there is
+    none."""
     for name, words in {"plain": [], "coloured": ["--colour", "displacement"]}.items():
         render(falling_ball, "-o", tmp_path / f"{name}.png", "--frames", "0,5", *words)
     plain, coloured = (
@@ -174,7 +177,8 @@ def test_what_cannot_be_drawn_ends_in_one_line(falling_ball, words, line):
     "sides", [(1.0, 0.1, 0.1), (0.1, 0.1, 1.0), (0.3, 0.3, 0.3)], ids=["long", "high", "cube"]
 )
 def test_no_third_of_a_film_is_empty(sides, tmp_path):
-    """A box that sways by a tenth of its longest side: in each third of the picture it is seen at some time."""
+    """A box that sways by a tenth of its longest side: in each third of the picture it is seen at
+    some time."""
     box = trimesh.creation.box(sides).subdivide().subdivide()
     sway = 0.1 * max(sides) * np.array([1.0, 0, 0])
     points = np.array(box.vertices)

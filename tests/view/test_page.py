@@ -1,4 +1,5 @@
-"""The page of a result: what is packed into it comes out again, and a browser shows the body where it should."""
+"""The page of a result: what is packed into it comes out again, and a browser shows the body where
+it should."""
 
 import base64
 import json

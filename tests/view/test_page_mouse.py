@@ -1,4 +1,5 @@
-"""The page of a result in a browser, driven by mouse and keys: it turns, comes nearer, plays, goes to a frame."""
+"""The page of a result in a browser, driven by mouse and keys: it turns, comes nearer, plays, goes
+to a frame."""
 
 import shutil
 from collections.abc import Iterator
@@ -47,7 +48,8 @@ def dark(browser: Browser) -> int:
 
 
 def test_dragging_turns_the_body(browser: Browser):
-    """Half a turn is 450 pixels: the dark side, seen first, is behind then, and back after the other half."""
+    """Half a turn is 450 pixels: the dark side, seen first, is behind then, and back after the
+    other half."""
     before = dark(browser)
     left, middle = np.array(browser.middle("#view")) - [225, 0], browser.middle("#view")
     browser.drag(tuple(left), (450, 0))
@@ -108,7 +110,8 @@ def test_play_plays_and_pauses(browser: Browser):
 
 
 def test_the_slider_goes_to_a_frame(browser: Browser):
-    """Of eleven frames the fourth stands at 3/10 of the slider; there the ball is 0.4 m lower than at the start."""
+    """Of eleven frames the fourth stands at 3/10 of the slider; there the ball is 0.4 m lower than
+    at the start."""
     first = seen(browser)
     metre = np.ptp(first, axis=0)[0] / 0.2  # pixels, of the ball's 0.2 m
     x, y = browser.middle("#slider")

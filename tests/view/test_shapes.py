@@ -67,7 +67,8 @@ def with_mesh(path: Path, bounds) -> Path:
 
 
 def right_of_the_ball(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rows and columns of what is drawn a diameter and more right of the ball's left end, and the ball's diameter."""
+    """Rows and columns of what is drawn a diameter and more right of the ball's left end, and the
+    ball's diameter."""
     rows, columns = np.nonzero(picture.min(axis=2) < 230)
     left = columns.min()
     # ball from 0 to 0.2 m, cube from 0.25 to 0.35 m

@@ -1,4 +1,5 @@
-"""Contact sheets: the moments, the axes, and a picture that shows what it should (never compared as an image)."""
+"""Contact sheets: the moments, the axes, and a picture that shows what it should (never compared as
+an image)."""
 
 import os
 from dataclasses import replace

@@ -1,4 +1,5 @@
-"""The surface as it is drawn: what the points put into long edges follow, and where sharp edges part the shading."""
+"""The surface as it is drawn: what the points put into long edges follow, and where sharp edges
+part the shading."""
 
 from dataclasses import replace
 
@@ -54,7 +55,8 @@ def test_a_block_of_twelve_triangles_is_drawn_as_its_cells_bend():
         rest[subject.triangles] - rest[np.roll(subject.triangles, 1, axis=1)], axis=2
     ).max()
     assert longest <= H * (1 + 1e-9)
-    # trilinear between nodes: 0.3 h^2 / 4 off the parabola in the middle of a cell, where 12 triangles are 0.075 off
+    # trilinear between nodes: 0.3 h^2 / 4 off the parabola in the middle of a cell,
+    # where 12 triangles are 0.075 off
     assert points == pytest.approx(bent(rest), abs=0.3 * H**2 / 4 + 1e-9)
     assert subject.embedding @ subject.nodes(1) == pytest.approx(points)
 
@@ -135,7 +137,8 @@ def test_bodies_have_a_colour_each():
 
 
 def test_a_clamp_ends_in_a_straight_line_whatever_the_triangles():
-    """The front of a block in triangles of any shape; its nodes are pinned up to a plane of the lattice."""
+    """The front of a block in triangles of any shape; its nodes are pinned up to a plane of the
+    lattice."""
     whole, size = block(), H * CELLS
     inner = np.random.default_rng(0).uniform([0, 0], size[[0, 2]], (400, 2))
     flat = np.concatenate([np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size[[0, 2]], inner])

@@ -25,7 +25,8 @@ def drawn(*words: object) -> np.ndarray:
 
 
 def sized(folder: Path, sides: tuple[float, float, float]) -> Path:
-    """A block with the points of its west side painted, pinned by a file, and pulled at its east."""
+    """A block with the points of its west side painted, pinned by a file, and pulled at its
+    east."""
     path = block_scene(folder, np.array(sides), **SCENE)
     (folder / "spots.txt").write_text(
         "0 1 2 3\n"

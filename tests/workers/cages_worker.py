@@ -16,13 +16,15 @@ FILLED = [("closed", 0.11), ("open", 0.11), ("one cell", 2.5)]
 
 
 def enclosed(boundary: np.ndarray) -> np.ndarray:
-    """What a dense flood fill from outside does not reach, without the boundary itself (bool grids)."""
+    """What a dense flood fill from outside does not reach, without the boundary itself (bool
+    grids)."""
     label, _ = ndimage.label(np.pad(~boundary, 1, constant_values=True))
     return ((label != label[0, 0, 0]) & (label != 0))[1:-1, 1:-1, 1:-1]
 
 
 def check_random_grids(shapes: list[tuple[int, int, int]], seeds: int) -> None:
-    """Random boundary cells are labyrinths: a third to two thirds of the grid, where both phases percolate."""
+    """Random boundary cells are labyrinths: a third to two thirds of the grid, where both phases
+    percolate."""
     for shape in shapes:
         for seed in range(seeds):
             rng = np.random.default_rng(seed)

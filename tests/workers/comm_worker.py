@@ -1,4 +1,5 @@
-"""Checks msmpetsc.comm against plain arrays that every rank knows in full. Run by test_comm.py under mpiexec."""
+"""Checks msmpetsc.comm against plain arrays that every rank knows in full. Run by test_comm.py
+under mpiexec."""
 
 import numpy as np
 from mpi4py import MPI
@@ -18,7 +19,8 @@ def same(found: np.ndarray, expected: np.ndarray) -> None:
 
 
 def check_route(rng: np.random.Generator, rows: int, senders: int) -> None:
-    """``rows`` of several types, held by the first ``senders`` ranks, go anywhere and are answered."""
+    """``rows`` of several types, held by the first ``senders`` ranks, go anywhere and are
+    answered."""
     holder = np.sort(rng.integers(0, senders, rows))
     destination = rng.integers(0, comm.size, rows)
     number = np.arange(rows)
@@ -63,7 +65,8 @@ def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit:
 
 
 def check_shares_are_even(rng: np.random.Generator) -> None:
-    """All keys come from one rank, clustered; no rank ends with more than a few per cent above its part."""
+    """All keys come from one rank, clustered; no rank ends with more than a few per cent above its
+    part."""
     given = np.unique((rng.random(40_000) ** 4 * 1e12).astype(np.int64))
     table = SortedKeys(comm, given if comm.rank == comm.size - 1 else given[:0])
     assert len(table.keys) < 1.05 * len(given) / comm.size

@@ -1,4 +1,5 @@
-"""Writes result files for test_writer.py, on as many ranks as mpiexec gives: frames_worker.py ACTION PATH."""
+"""Writes result files for test_writer.py, on as many ranks as mpiexec gives: frames_worker.py
+ACTION PATH."""
 
 import os
 import sys
@@ -78,8 +79,8 @@ def refuse(path: str) -> None:
 
 
 def fill_disk(path: str, gathers: bool = True) -> None:
-    """The disk is full at the third frame, when the other ranks are already sending; or, not gathered, for one of them
-    in the midst of its rows."""
+    """The disk is full at the third frame, when the other ranks are already sending; or, not
+    gathered, for one of them in the midst of its rows."""
     layout.PIECE_BYTES = 100
     nodes = share(NODES)
     store = h5py.Dataset.__setitem__

@@ -1,7 +1,8 @@
-"""Scenes whose kernels run in numba's CUDA simulator: SCENE... -> the kernels that ran, and the last positions of each.
+"""Scenes whose kernels run in numba's CUDA simulator: SCENE... -> the kernels that ran, and the
+last positions of each.
 
-The kernels are those of a GPU, one thread an index, with blocks that are not full; only the arrays are pretended.
-"""
+The kernels are those of a GPU, one thread an index, with blocks that are not full; only the arrays
+are pretended."""
 
 import os
 import sys

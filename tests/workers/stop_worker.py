@@ -1,5 +1,5 @@
-"""The command line, stopped by SIGUSR1 to the last rank after a step: stop_worker.py STEP ARGUMENTS; -1 for never.
-Checkpoints are of every second step."""
+"""The command line, stopped by SIGUSR1 to the last rank after a step: stop_worker.py STEP
+ARGUMENTS; -1 for never. Checkpoints are of every second step."""
 
 import signal
 import sys

@@ -1,4 +1,5 @@
-"""Frames by multigrid are those by Jacobi's preconditioner, to the error that was asked for, whatever a scene has."""
+"""Frames by multigrid are those by Jacobi's preconditioner, to the error that was asked for,
+whatever a scene has."""
 
 from pathlib import Path
 

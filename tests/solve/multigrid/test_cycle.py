@@ -1,5 +1,6 @@
-"""The cycle is symmetric and positive definite, and no more than the inverse of what it is built from; CG on the true
-Hessian takes few iterations with it, whatever the time step, and no more on a finer lattice."""
+"""The cycle is symmetric and positive definite, and no more than the inverse of what it is built
+from; CG on the true Hessian takes few iterations with it, whatever the time step, and no more on a
+finer lattice."""
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ LOOSE = {"two bodies", "many bodies"}  # of which some are not held
 
 
 def check(case: Case, least: float, beyond: float = BEYOND) -> None:
-    """Symmetric, B H with eigenvalues between ``least`` and 1: each part of B moves along a descent, none too far."""
+    """Symmetric, B H with eigenvalues between ``least`` and 1: each part of B moves along a
+    descent, none too far."""
     b, h = case.cycle(), case.hessian()
     assert np.isfinite(b).all()
     assert np.abs(b - b.T).max() < SYMMETRIC * np.abs(b).max()
@@ -34,7 +36,8 @@ def test_cycles(name: str, shape: str, coarsest: int):
 @pytest.mark.parametrize("coarsest", [pytest.param(800, marks=pytest.mark.slow), 10])
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "a cell"])
 def test_cycles_of_solids_with_contact_and_pins(name: str, coarsest: int):
-    """Of cells pressed to a fifth the cycle has less: their curvature is along few directions that it cannot smooth."""
+    """Of cells pressed to a fifth the cycle has less: their curvature is along few directions that
+    it cannot smooth."""
     lattice = build(COMM, LATTICES[name], poisson=0.25, pins=True)
     with hierarchy(COMM, lattice, SHAPES["crushed"], contact=True, coarsest=coarsest) as case:
         check(case, 0.002)
@@ -44,7 +47,8 @@ def test_cycles_of_solids_with_contact_and_pins(name: str, coarsest: int):
 @pytest.mark.parametrize("shape", ["twisted", "crushed"])
 @pytest.mark.parametrize("name", LATTICES)
 def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):
-    """A light body that nothing holds moves as a whole by what the raised diagonals lets it, a 1e10th."""
+    """A light body that nothing holds moves as a whole by what the raised diagonals lets it, a
+    1e10th."""
     pinned = heavier(build(COMM, LATTICES[name], pins=True), mass)
     with hierarchy(COMM, pinned, SHAPES[shape], coarsest=10) as case:
         loose = name in LOOSE and mass < 1
@@ -77,7 +81,8 @@ def test_one_free_node():
 @pytest.mark.parametrize("density", [1e-3, 1e3])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_sheet_with_its_underside_held(density: float, shape: str):
-    """Its free nodes lie halfway between layers of coarse ones: P^T H P is singular, but for the raised diagonal."""
+    """Its free nodes lie halfway between layers of coarse ones: P^T H P is singular, but for the
+    raised diagonal."""
     lattice = build(COMM, LATTICES["thin sheet"], density=density)
     with hierarchy(
         COMM, lattice.pin(lattice.nodes[:, 2] < 3.01), SHAPES[shape], coarsest=10
@@ -128,7 +133,8 @@ AT_REST = {None: 3, 0.25: 3, 0.45: 4, 0.49: 8, 0.499: 20}  # by Poisson's ratio,
 
 @pytest.mark.parametrize("poisson", AT_REST)
 def test_few_iterations_of_a_slender_body_at_rest(poisson: float | None):
-    """Coarse diagonals that are raised by 1e-5 hold it to the ground: 5, 5, 8, 18 and 59 iterations."""
+    """Coarse diagonals that are raised by 1e-5 hold it to the ground: 5, 5, 8, 18 and 59
+    iterations."""
     with hierarchy(
         COMM, build(COMM, BENT, pins=True, poisson=poisson), SHAPES["rest"], STATIC
     ) as case:

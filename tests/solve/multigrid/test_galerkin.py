@@ -1,4 +1,5 @@
-"""Coarse matrices are P^T H P, H the projected Hessian as its products have it, whatever the lattice has."""
+"""Coarse matrices are P^T H P, H the projected Hessian as its products have it, whatever the
+lattice has."""
 
 import numpy as np
 import pytest
@@ -51,7 +52,8 @@ def check_levels(case: Case) -> None:
 
 
 def check_operator(coarse: CoarseOperator) -> None:
-    """It is the matrix in single precision, and symmetric; a translation keeps its digits whatever the stiffness."""
+    """It is the matrix in single precision, and symmetric; a translation keeps its digits whatever
+    the stiffness."""
     x, expected = coarse.matrix.createVecs()
     found, noise = expected.duplicate(), np.random.default_rng(1).standard_normal(x.getLocalSize())
     translation = np.tile([1.0, 2.0, 3.0], len(noise) // 3)
@@ -75,7 +77,8 @@ def test_levels_are_galerkin_products(name: str):
             len(case.multigrid.levels) > 1 or name == "many"
         )  # of one cell each: no grid is coarser
         check_levels(case)
-        np.testing.assert_allclose(case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y)), case.hessian(),
+        np.testing.assert_allclose(case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y)),
+        case.hessian(),
                                    rtol=0, atol=1e-5 * np.abs(case.hessian()).max())  # fmt: skip
 
 

@@ -1,4 +1,5 @@
-"""Runs with multigrid go on from a checkpoint to the last bit: the hierarchy of then is built again."""
+"""Runs with multigrid go on from a checkpoint to the last bit: the hierarchy of then is built
+again."""
 
 from pathlib import Path
 
@@ -58,7 +59,8 @@ CASES = {
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several coarse levels; hierarchies that are given up soon; newton that changes over after a few steps."""
+    """Several coarse levels; hierarchies that are given up soon; newton that changes over after a
+    few steps."""
     monkeypatch.setattr(cycle, "COARSEST", 10)
     monkeypatch.setattr(preconditioning, "WORTH", 1.0)
     monkeypatch.setattr(preconditioning, "LONG", 4)
@@ -75,7 +77,8 @@ QUICK = {"solid, pressed", "switched, pressed", "fallback"}  # each takes some f
 def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(
     tmp_path: Path, case: str, monkeypatch
 ):
-    """Of runs that build hierarchies in some steps and keep them in others, or change over in the midst of a step."""
+    """Of runs that build hierarchies in some steps and keep them in others, or change over in the
+    midst of a step."""
     built, chosen, build, choose = [], [], LatticePreconditioner._build, StepPreconditioner._choose
     monkeypatch.setattr(
         LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1]

@@ -1,4 +1,5 @@
-"""Contact of the surface with itself in multigrid's cycle: Woodbury's formula, and steps that it leads to."""
+"""Contact of the surface with itself in multigrid's cycle: Woodbury's formula, and steps that it
+leads to."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +21,8 @@ POINTS, NODES, T2 = 7, 12, 1e-3
 
 @pytest.fixture
 def surface() -> SurfaceHessian:
-    """Three stiff pairs of points, each of which five nodes carry; the last pair is the stiffest by far."""
+    """Three stiff pairs of points, each of which five nodes carry; the last pair is the stiffest by
+    far."""
     rng = np.random.default_rng(5)
     weights = np.where(rng.random((POINTS, NODES)) < 0.4, rng.normal(size=(POINTS, NODES)), 0.0)
     points = np.zeros((3 * POINTS, 3 * POINTS))
@@ -60,7 +62,8 @@ def test_the_smoother_inverts_blocks_and_contact_together(surface: SurfaceHessia
 def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
     surface: SurfaceHessian,
 ):
-    """Stiff are those that give way less than their nodes let them, of the pairs here the last one's."""
+    """Stiff are those that give way less than their nodes let them, of the pairs here the last
+    one's."""
     compliance = np.full(NODES, 1e-8)
     stiff, others = surface.split(compliance, POINTS)
     assert stiff is not None and others is not None and stiff.points.shape == (6, 6)
@@ -107,7 +110,8 @@ SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}
 def test_contact_that_joins_nodes_takes_a_part_of_the_iterations_to_the_same_frames(
     tmp_path: Path, monkeypatch
 ):
-    """In its first two steps, to 1e-12: to 1e-10 the second of them comes to either of two minima."""
+    """In its first two steps, to 1e-12: to 1e-10 the second of them comes to either of two
+    minima."""
     tables = {"material": SOLID, "time": {"step": 0.002, "duration": 0.068}}
     its, positions = [], []
     for most in (0, cycle.POINTS):

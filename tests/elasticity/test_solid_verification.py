@@ -1,4 +1,4 @@
-"""The neo-Hookean solid as the product runs it, against theory (msmpetsc/elasticity/README.md has the tables)."""
+"""The neo-Hookean solid in runs of scenes, against theory (tables: scripts/results/solid.md)."""
 
 from collections.abc import Iterator
 

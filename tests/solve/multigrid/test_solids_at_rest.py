@@ -1,5 +1,8 @@
-"""Iterations of CG with multigrid, to newton's tolerance, for solids at rest by Poisson's ratio: whole cells, and scans
-that the grid cuts. With -s it prints the table of msmpetsc/elasticity/README.md."""
+"""Iterations of CG with multigrid, to newton's tolerance, for solids at rest by Poisson's ratio.
+
+Bodies are whole cells, and scans that the grid cuts. With -s it prints the table of
+scripts/results/multigrid.md.
+"""
 
 import os
 from pathlib import Path

@@ -23,8 +23,10 @@ ABOUT = {
 
 
 def cell(text: object) -> str:
-    """Return a text as the content of a cell: no line ends, no separators."""
-    return " ".join(str(text).split()).replace("|", "\\|")
+    """Return a text as the content of a cell: no line ends, and no separators but within code."""
+    parts = " ".join(str(text).split()).split("`")
+    parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
+    return "`".join(parts)
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:

@@ -23,7 +23,7 @@ out.mkdir(parents=True, exist_ok=True)
 # each step to rounding, so that the true error of each step is known.
 
 # %%
-trimesh.creation.box(bounds=[[0, 0, 0], [1.25, 0.5, 0.5]]).export(out / "soft_beam.obj")
+trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [1.25, 0.5, 0.5]]).export(out / "soft_beam.obj")
 (out / "soft_beam.toml").write_text("""
 [mesh]
 source = "soft_beam.obj"

@@ -109,7 +109,10 @@ def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball:
     done = subprocess.run([*pip, f"{tmp_path / 'clone'}[render]"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     write_ball(tmp_path / "ball.h5")
-    absent = f"from importlib.util import find_spec; print([name for name in {OF_RUNS} if find_spec(name)])"
+    absent = (
+        f"from importlib.util import find_spec; print([name for name in {OF_RUNS} if "
+        f"find_spec(name)])"
+    )
     assert in_the_clean(python, "-c", absent, folder=tmp_path).stdout == "[]\n"
     for command in ("render ball.h5 -o x.png", "export ball.h5 -o x.glb --frames 0:9:3"):
         done = in_the_clean(python, "-m", "msmpetsc", *command.split(), folder=tmp_path)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from msmpetsc.app.request import OPTIONS, Option, flag_of
-from msmpetsc.cli.command_table import COMMANDS, SAID, Argument
+from msmpetsc.cli.command_table import COMMANDS, VERBOSITY, Argument
 from msmpetsc.fields import DIMENSIONS, FIELDS
 from msmpetsc.scene.key_table import keys
 from msmpetsc.scene.schema import OF_REGIONS, SceneFile
@@ -112,7 +112,7 @@ def commands() -> str:
         lines += [f"## {name}", about, "```text\n" + "\n".join(command.examples) + "\n```"]
         if arguments:
             lines.append(table(("argument", "meaning"), map(row_of, arguments)))
-    lines += ["## Every command", table(("argument", "meaning"), map(row_of, SAID))]
+    lines += ["## Every command", table(("argument", "meaning"), map(row_of, VERBOSITY))]
     return "\n\n".join(lines)
 
 

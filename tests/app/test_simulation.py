@@ -203,7 +203,8 @@ import msmpetsc as msm
 from mpi4py import MPI
 for _ in range(2):
     try:
-        msm.run(sys.argv[1], sys.argv[2] + "/x.h5", frames=1, petsc_options={"info": ":/dev/null", "ksp_rtol": 1e-3})
+        options = {"info": ":/dev/null", "ksp_rtol": 1e-3}
+        msm.run(sys.argv[1], sys.argv[2] + "/x.h5", frames=1, petsc_options=options)
     except msm.errors.InputError as error:
         print("refused:", str(error).partition(" exists")[1])
 simulation = msm.Simulation(sys.argv[1])
@@ -235,5 +236,8 @@ def test_a_frame_of_far_more_work_than_the_median_is_named(
     with msm.open(msm.run(scene, tmp_path / "x.h5", set={"material.young_modulus": 1e4})) as result:
         products = result.frames.products[1:]
     ratio = products.max() / np.median(products)
-    said = f"frame {1 + products.argmax()} took {products.max()} products with the Hessian, {ratio:.0f} times"
+    said = (
+        f"frame {1 + products.argmax()} took {products.max()} products with the Hessian, "
+        f"{ratio:.0f} times"
+    )
     assert 1 <= ratio < 1.5 and (said in caplog.text) == (ratio > limit)

@@ -18,7 +18,10 @@ from msmpetsc.backend import kernel_cache
 PACKAGE = Path(msmpetsc.__file__).parent
 FILES = resource.RLIMIT_FSIZE
 NOWHERE = "/dev/null/home"  # not even root can make this folder
-PLAIN = "from typing import NamedTuple\nFACTOR = 2.0\nclass Pair(NamedTuple):\n    first: float\n    second: float\n"
+PLAIN = (
+    "from typing import NamedTuple\nFACTOR = 2.0\nclass Pair(NamedTuple):\n    first: float\n"
+    "    second: float\n"
+)
 CALLED = "from msmpetsc.backend.kernel import njit\n@njit()\ndef called(x):\n    return x + 1.0\n"
 CALLER = """
 from msmpetsc.backend.called import called

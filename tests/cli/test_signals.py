@@ -44,7 +44,10 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
     with monkeypatch.context() as patch:
         signal_after(patch, 10, number)  # between frames
         assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path)]) == STATUS[number]
-    told = f"stopped by {number.name} after step 10 of 40 (t = 0.1 s); to go on: msmpetsc run --resume {path}\n"
+    told = (
+        f"stopped by {number.name} after step 10 of 40 (t = 0.1 s); to go on: msmpetsc run "
+        f"--resume {path}\n"
+    )
     assert told in capsys.readouterr().err
     assert signal.getsignal(number) == handler
     with h5py.File(path) as file:

@@ -332,7 +332,7 @@ def test_friction_goes_on_from_the_slip_that_the_last_step_ended_with():
 
 
 @pytest.mark.parametrize("beyond", [-1.0, 1.0])
-def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_it_from_the_first_step_on(
+def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_it_at_once(
     tmp_path: Path, beyond: float
 ):
     """By a degree. Friction of no push in the first step let it go 4.7 mm; then it crept at 0.8

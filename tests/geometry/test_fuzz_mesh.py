@@ -162,7 +162,10 @@ def test_the_parts_of_a_gltf_are_joined_where_they_stand(tmp_path):
         assert np.ptp(surface.points, axis=0) == pytest.approx([6, 2, 3])
 
 
-PLY = "ply\nformat {} 1.0\nelement vertex {}\nproperty {} x\nproperty {} y\nproperty {} z\nelement face {}\n"
+PLY = (
+    "ply\nformat {} 1.0\nelement vertex {}\nproperty {} x\nproperty {} y\nproperty {} z\n"
+    "element face {}\n"
+)
 PLY += "property list uchar int vertex_indices\nend_header\n"
 
 
@@ -259,8 +262,10 @@ REFUSED = {
     "one point": ("obj", b"v 0 0 0\nf 1 1 1\n", "fewer than four points"),
     "lists for coordinates": (
         "ply",
-        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty list uchar float x\nproperty list uchar float y\n"
-        b"property list uchar float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty list uchar float x\n"
+        b"property list uchar float y\n"
+        b"property list uchar float z\nelement face 1\nproperty list uchar int vertex_indices\n"
+        b"end_header\n"
         b"1 0 1 0 1 0\n2 0 0 1 0 1 0\n1 0 1 0 1 0\n3 0 1 2\n", "x.ply",
     ),
     "nothing": ("ply", b"", "is empty"),
@@ -379,10 +384,12 @@ def vtu(points: int, blocks: int = 1, compressor: str = "ZLib") -> bytes:
     header = np.array([blocks, 12 * points, 12 * points, *[len(block)] * blocks], "<u4").tobytes()
     numbers = base64.b64encode(header) + base64.b64encode(block * blocks)
     return (
-        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" compressor="vtk%sDataCompressor">'
+        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" '
+        b'compressor="vtk%sDataCompressor">'
         b'<UnstructuredGrid><Piece NumberOfPoints="%d" NumberOfCells="0"><Points>'
         b'<DataArray type="Float32" Name="Points" '
-        b'NumberOfComponents="3" format="binary">%s</DataArray></Points></Piece></UnstructuredGrid></VTKFile>'
+        b'NumberOfComponents="3" '
+        b'format="binary">%s</DataArray></Points></Piece></UnstructuredGrid></VTKFile>'
         % (compressor.encode(), points * blocks, numbers)
     )
 
@@ -397,8 +404,10 @@ def shared_vtu(arrays: int) -> bytes:
     numbers = base64.b64encode(np.uint32(3 * 10**5).tobytes() + bytes(3 * 10**5))
     array = b'<DataArray type="Float32" Name="x" format="appended" offset="0"/>'
     return (
-        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian"><UnstructuredGrid>'
-        b'<Piece NumberOfPoints="0" NumberOfCells="0"><PointData>%s</PointData></Piece></UnstructuredGrid>'
+        b'<VTKFile type="UnstructuredGrid" version="0.1" '
+        b'byte_order="LittleEndian"><UnstructuredGrid>'
+        b'<Piece NumberOfPoints="0" '
+        b'NumberOfCells="0"><PointData>%s</PointData></Piece></UnstructuredGrid>'
         b'<AppendedData encoding="base64">_%s</AppendedData></VTKFile>' % (array * arrays, numbers)
     )
 

@@ -18,7 +18,8 @@ from pathlib import Path
 
 from msmpetsc.study.forkserver import SERVER, Forked, enter, leave, redirect_output
 
-STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new; mv $OMPI_COMM_WORLD_RANK.new $OMPI_COMM_WORLD_RANK.env
+STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new
+mv $OMPI_COMM_WORLD_RANK.new $OMPI_COMM_WORLD_RANK.env
 read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
 
 

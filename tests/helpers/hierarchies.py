@@ -94,8 +94,12 @@ def build(
     pins: bool = False,
     poisson: float | None = None,
 ) -> Lattice:
-    """contrast : the cells beyond the middle of x are so many times stiffer; pins: the lowest nodes of x are held;
-    poisson : of a solid."""
+    """Return the lattice of some cells.
+
+    contrast : factor on the stiffness of cells beyond the middle of x
+    pins     : whether the lowest nodes of x are fixed
+    poisson  : of a solid; None for springs
+    """
     middle = cells[:, 0].mean()
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:

@@ -106,8 +106,8 @@ def free_flight(t: float, shake: float, error: float, poisson: float | None) -> 
     """Return the drift of momentum and the loss of angular momentum in a second, of a block that
     spins at 2 rad/s.
 
-    shake : standard deviation of random node velocities [m/s]. A body that stays symmetric about its middle keeps
-            its momentum whatever the solver does, a shaken one need not
+    shake : standard deviation of random node velocities [m/s]. A body that stays symmetric about
+            its middle keeps its momentum whatever the solver does, a shaken body need not
     """
     lattice, throw = study.box((4, 3, 2), 0.1, poisson), np.array([0.6, -0.48, 0.64])
     mass, q = lattice.mass, lattice.nodes

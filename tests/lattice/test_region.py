@@ -107,7 +107,10 @@ def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind
     }
     table |= own.get(kind, {})
     path = block_scene(tmp_path, time=TIME, cages={"cell_size": 0.11}, **{kind: [table]})
-    where = r": the body is from \(0, 0, 0\) to \(0.5, 0.5, 0.25\) m, the region from \(0, 0, 0.251\) to \(1, 1, 2\) m"
+    where = (
+        r": the body is from \(0, 0, 0\) to \(0.5, 0.5, 0.25\) m, the region from \(0, 0, "
+        r"0.251\) to \(1, 1, 2\) m"
+    )
     with pytest.raises(InputError, match=rf"^{kind}\.0\.region holds .*no.*{where}$"):
         build(path)
 

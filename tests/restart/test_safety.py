@@ -84,7 +84,10 @@ def test_a_run_that_gains_energy_without_end_is_stopped(
     """Forces that act three times as long as they should, at steps far beyond the explicit
     limit."""
     Overshooting(monkeypatch, 2.0)
-    told = r"frame \d+ \(.* gained .* J from nowhere, of .* J that were there: worst at node \d+, at rest at \("
+    told = (
+        r"frame \d+ \(.* gained .* J from nowhere, of .* J that were there: worst at node \d+, "
+        r"at rest at \("
+    )
     with pytest.raises(StepFailed, match=told) as caught:
         play(beam(tmp_path, time={"step": STEP, "duration": 1.0}))
     assert caught.value.kind == "energy" and 1 < caught.value.frame < 60

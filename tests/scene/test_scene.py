@@ -210,12 +210,15 @@ def test_all_problems_at_once_each_with_its_line(tmp_path):
         "time.step = 0.01", "time.setp = 0.01"
     )
     assert problems(tmp_path, text + "colour = 'red'\n") == [
-        "scene.toml: cages: must give exactly one of count, cell_size; has count and cell_size (line 2)",
+        "scene.toml: cages: must give exactly one of count, cell_size; has count and cell_size "
+        "(line 2)",
         "scene.toml: cages.count: must be > 0, got 0 (line 2)",
         "scene.toml: cages.cell_size: must be > 0, got -1 (line 3)",
         "scene.toml: time.setp: unknown key, did you mean 'step'? (line 6)",
-        "scene.toml: colour: unknown key, valid: title, mesh, cages, material, time, body, part, start, "
-        "gravity, obstacle, self_contact, pin, anchor, force, solver, safety, output, picture (line 8)",
+        "scene.toml: colour: unknown key, valid: title, mesh, cages, material, time, body, part, "
+        "start, "
+        "gravity, obstacle, self_contact, pin, anchor, force, solver, safety, output, picture "
+        "(line 8)",
     ]
 
 
@@ -310,7 +313,8 @@ def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):
         ("cages.count=-3", "scene.toml: cages.count: must be > 0, got -3 (--set cages.count=-3)"),
         (
             "gravity=-9.81",
-            "got -9.81; for example gravity = { acceleration = [0, 0, -9.81] } (--set gravity=-9.81)",
+            "got -9.81; for example gravity = { acceleration = [0, 0, -9.81] } (--set "
+            "gravity=-9.81)",
         ),
         ("cages.cout=3", "scene.toml: cages.cout: unknown key, did you mean 'count'?"),
         ("cages.cell_size=1", "in place of all keys there: --set 'cages={cell_size=1}')"),
@@ -364,7 +368,8 @@ def test_statics_that_stay_the_same_want_no_step_and_no_duration(tmp_path):
         "force.0.start=1.0",
         "force.0.total={times = [0, 1], values = [[0, 0, 0], [1, 0, 0]]}",
         "anchor=[{region = {box = [[0, 0, 0], [1, 1, 1]]}, path = [{time = 1, by = [0, 0, 1]}]}]",
-        'obstacle=[{shape = "sphere", center = [0, 0, 0], radius = 1, response = "penalty", stop = 2.0}]',
+        'obstacle=[{shape = "sphere", center = [0, 0, 0], radius = 1, response = "penalty", stop '
+        "= 2.0}]",
     ],
 )
 def test_what_changes_in_time_wants_both(tmp_path, change):

@@ -61,7 +61,8 @@ def program(folder: Path, name: str, text: str) -> None:
 PYTHON = """case "$*" in
 "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
 *sysconfig*) echo .venv ;;
-"-m pip"*) echo pip >>pip.log; echo "Collecting packages"; echo "a warning" >&2; exit "${PIP_STATUS:-0}" ;;
+"-m pip"*)
+    echo pip >>pip.log; echo "Collecting packages"; echo "a warning" >&2; exit "${PIP_STATUS:-0}" ;;
 *) cat >/dev/null ;;
 esac
 """

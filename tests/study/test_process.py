@@ -100,7 +100,8 @@ import subprocess, sys
 from mpi4py import MPI
 from msmpetsc.study.process import environment
 for alone, launcher in ((True, []), (False, ["mpiexec", "-n", "2"])):
-    command = [*launcher, sys.executable, "-c", "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"]
+    program = "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"
+    command = [*launcher, sys.executable, "-c", program]
     subprocess.run(command, env=environment(alone), check=True)
 """
 

@@ -534,7 +534,8 @@ BEFORE = {
     "bare": "time = { step = 0.02, duration = 1.0 }",
     "implicit": "time = { step = 0.02, duration = 1.0, integrator = 'implicit-euler' }\n"
     "solver = { preset = 'anderson', max_iterations = 5 }",
-    "verlet": "time = { step = 0.02, duration = 1.0, integrator = 'verlet', substep = 1e-4 }\nsolver.error = 0.1",
+    "verlet": "time = { step = 0.02, duration = 1.0, integrator = 'verlet', substep = 1e-4 }\n"
+    "solver.error = 0.1",
 }
 
 
@@ -548,7 +549,10 @@ def test_the_command_of_a_plan_says_what_its_lines_say(
     tmp_path: Path, given: str, method: Candidate
 ):
     """Run with these changes the scene is the same as with the answer written into it."""
-    mesh = 'mesh.source = "beam.obj"\ncages.count = 10\nmaterial = { density = 1, young_modulus = 1 }\n'
+    mesh = (
+        'mesh.source = "beam.obj"\ncages.count = 10\n'
+        "material = { density = 1, young_modulus = 1 }\n"
+    )
     path = tmp_path / "scene.toml"
     path.write_text(mesh + BEFORE[given])
     changed = load_scene(path, overrides(path, tables(method)))

@@ -15,8 +15,10 @@ SCENE = {
     "solver": {"preset": "newton-multigrid", "error": 1e-4},
 }
 OBEYED = {  # those that go together, and what they show
-    "-pc_mg_levels 2 -mg_levels_ksp_max_it 2 -mg_coarse_pc_type cholesky -ksp_view": "MULTIPLICATIVE, levels=2",
-    "-pc_mg_levels 3 -pc_mg_cycle_type w -matptap_via scalable -pc_mg_log -log_view": "MGSmooth Level 1",
+    "-pc_mg_levels 2 -mg_levels_ksp_max_it 2 -mg_coarse_pc_type cholesky "
+    "-ksp_view": "MULTIPLICATIVE, levels=2",
+    "-pc_mg_levels 3 -pc_mg_cycle_type w -matptap_via scalable -pc_mg_log "
+    "-log_view": "MGSmooth Level 1",
     "-pc_mg_type additive -mg_coarse_redundant_pc_type lu": "",
     "-pc_mg_type full -mg_levels_ksp_type richardson": "",
 }

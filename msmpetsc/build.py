@@ -13,7 +13,7 @@ from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.holders import Holders, Regions, clamped, taken
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, shares_by_mass, total_of
 from msmpetsc.contact.obstacles.distance import DistanceSolid
-from msmpetsc.contact.obstacles.friction import STICK, smallest
+from msmpetsc.contact.obstacles.friction import smallest
 from msmpetsc.contact.obstacles.moving_solid import Obstacle, build_obstacles
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
@@ -45,8 +45,6 @@ from msmpetsc.scene.schema import OfBody, held_by
 
 # range of a body's longest side [m]; its fourth power stays within a double
 SIDE_LIMITS = 1e-60, 1e60
-# default stiffness of an obstacle [stiffest spring]; so that nodes sink in by little
-PENALTY = 10.0
 # largest coordinate of a body [its longest side]; seven digits of the shape remain
 MAX_OFFSET = 1e9
 # usual range of a body's longest side [m]; a mesh beyond it is probably not in metres
@@ -387,17 +385,12 @@ def _contacts(
     bounds : bounding boxes (b, 2, 3) of the bodies at rest [m]
     """
     exchanges, penalties = [], []
-    default_stiffness = PENALTY * lattice.stiffest(comm)
-    default_speed = STICK * smallest(bounds)
+    stiffest = lattice.stiffest(comm)
     for obstacle, table in zip(obstacles, tables, strict=True):
         if table.response == "exchange":
             exchanges.append(
                 Exchange(obstacle, 1.0 if table.restitution is None else table.restitution)
             )
         elif table.response != BARRIER:
-            stiffness = table.stiffness or default_stiffness
-            friction = table.friction or 0.0
-            friction_speed = table.friction_speed or default_speed
-            restitution = None if table.restitution == 1 else table.restitution
-            penalties.append(Penalty(obstacle, stiffness, friction, friction_speed, restitution))
+            penalties.append(Penalty.of_table(obstacle, table, stiffest, smallest(bounds)))
     return exchanges, penalties

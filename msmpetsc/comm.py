@@ -169,6 +169,15 @@ class SortedKeys:
         route = Route(self.comm, self.owner(keys))
         return route.answer(rows[self._index(route.send(keys)) - self.first])
 
+    def with_ghosts(self, ghosts: Indices, rows: Array) -> Array:
+        """Return rows (owned + g, ...) from rows (owned, ...) on the CPU (collective).
+
+        ghosts : indices (g,) of keys of other ranks, whose rows follow this rank's own
+        """
+        to_owner = Route(self.comm, self.owner_of_index(ghosts))
+        wanted = to_owner.send(ghosts) - self.first
+        return np.concatenate([rows, to_owner.answer(rows[wanted])])
+
     def _index(self, keys: Indices) -> Indices:
         if len(self.keys) == 0:
             return np.full(len(keys), -1, np.int64)

@@ -13,10 +13,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc import __version__
-from msmpetsc.app.checkpointing import Checkpoints, Signals
+from msmpetsc.app.checkpointing import Checkpoints
 from msmpetsc.app.ending import ending_together
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
+from msmpetsc.app.signals import Signals
 from msmpetsc.app.summary import (
     Cost,
     log_end,

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from tqdm import tqdm
 
 from msmpetsc import __version__
-from msmpetsc.app.checkpointing import STATUS
+from msmpetsc.app.signals import STATUS
 from msmpetsc.backend.arrays import on_host
 from msmpetsc.backend.machine import machine, peak_memory
 from msmpetsc.build import Model

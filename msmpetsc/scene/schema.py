@@ -117,6 +117,10 @@ def regions_of_no_body(scene: Any) -> Iterator[Broken]:
                 yield kind, rule(words, "body")
 
 
+# relative error of a step if neither scene nor preset gives another [-]
+DEFAULT_STEP_ERROR = 1e-3
+
+
 class Solver(Table):
     """Solver of a time step."""
 

@@ -13,10 +13,11 @@ from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
 
 from msmpetsc.build import Geometry, build_model, fill_cages, read_bodies
-from msmpetsc.cli.commands.inspect import BYTES, MOST_BUILT, Partition, count_partition
+from msmpetsc.cli.commands.inspect import BYTES, MOST_BUILT
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import assemble, assembly_bytes
 from msmpetsc.solve.linear.unknowns import Ghosted, Unknowns

@@ -17,10 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
-from msmpetsc.contact.obstacles.friction import NodeFriction, Pressed, squares
+from msmpetsc.contact.obstacles.friction import STICK, NodeFriction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
+from msmpetsc.scene.obstacles import ObstacleTable
 
+# default stiffness [stiffest spring]; so that nodes sink in by little
+STIFFNESS = 10.0
 # depth at which nodes are stopped [fraction]; above 0, so that the Hessian has contact
 STOP_DEPTH = 1e-3
 # duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
@@ -43,6 +46,20 @@ class Penalty:
     friction: float
     stick: float
     restitution: float | None = None
+
+    @classmethod
+    def of_table(
+        cls, obstacle: Obstacle, table: ObstacleTable, stiffest: float, side: float
+    ) -> "Penalty":
+        """Return the penalty of an obstacle's table.
+
+        stiffest : stiffness of the stiffest spring [N/m]
+        side     : longest side of the smallest body [m]
+        """
+        stiffness = table.stiffness or STIFFNESS * stiffest
+        stick = table.friction_speed or STICK * side
+        restitution = None if table.restitution == 1 else table.restitution
+        return cls(obstacle, stiffness, table.friction or 0.0, stick, restitution)
 
     def state_at(self, time: float, sides: Indices | None = None) -> "ContactState":
         """Return the contact at a time [s] without friction, for ``sides`` (owned or more,)."""

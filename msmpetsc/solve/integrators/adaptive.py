@@ -34,7 +34,6 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.integrator import Integrator, State
-from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
@@ -89,7 +88,7 @@ class NeighbourMean:
         """Return the averages (owned, 3) of vectors (owned, 3)."""
         means = to_host(vectors)
         for _ in range(SWEEPS):
-            means = self.weights @ with_ghosts(self.comm, self.lattice, means)
+            means = self.weights @ self.lattice.table.with_ghosts(self.lattice.ghosts, means)
         return like(vectors, means)
 
 

@@ -9,7 +9,6 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Indices, Positions, Rows, like
 from msmpetsc.checkpoint import FINITE, Checkpoint
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
 
 HISTORY, SIDES = ("history_q", "history_v"), "sides"
@@ -87,12 +86,14 @@ class State:
         names = ["q", "q_previous"]
         if checkpoint.number("history", 0, 0, 1):
             names += HISTORY
-        rows = [with_ghosts(comm, lattice, checkpoint.row(name)) for name in names]
+        rows = [lattice.table.with_ghosts(lattice.ghosts, checkpoint.row(name)) for name in names]
         q, q_previous, *last = (like(lattice.nodes, each) for each in rows)
         history = (last[0], last[1]) if last else None
         sides = None
         if SIDES in checkpoint.rows:
-            sides = with_ghosts(comm, lattice, checkpoint.rows[SIDES].astype(np.int8))
+            sides = lattice.table.with_ghosts(
+                lattice.ghosts, checkpoint.rows[SIDES].astype(np.int8)
+            )
             sides = like(lattice.nodes, np.ascontiguousarray(sides.T))
         numbers = {name: checkpoint.number(name, 0.0, *FINITE) for name in vars(EnergyBudget())}
         return State(q, q_previous, history, sides, EnergyBudget(**numbers))

@@ -14,7 +14,6 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.comm import Route
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.device import memory_of
@@ -56,13 +55,13 @@ class Unknowns:
         refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)
         own[to_host(self.free)] = first + np.arange(self.size)
-        self.numbers = with_ghosts(comm, lattice, own)
+        self.numbers = lattice.table.with_ghosts(lattice.ghosts, own)
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         # whether any rank has ghosts
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0
-        sources = with_ghosts(comm, lattice, index)[free_ghosts].ravel()
+        sources = lattice.table.with_ghosts(lattice.ghosts, index)[free_ghosts].ravel()
         self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
         vector = self.create_vector()
         index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)
@@ -172,13 +171,6 @@ class Ghosted:
         """Destroy all PETSc objects (collective)."""
         for owner in (self.scatter, self.owned, self.ghosts):
             owner.destroy()
-
-
-def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
-    """Return rows (l, ...) of all local nodes from rows (owned, ...) on the CPU (collective)."""
-    to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
-    asked = to_owner.send(lattice.ghosts) - lattice.table.first
-    return np.concatenate([rows, to_owner.answer(rows[asked])])
 
 
 def refuse_unknowns(nodes: int) -> None:

@@ -26,7 +26,6 @@ from msmpetsc.backend.arrays import Positions, Rows, greatest
 from msmpetsc.comm import Stop
 from msmpetsc.contact.surface.pairs import Contacts
 from msmpetsc.errors import StepFailed, StepStopped
-from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 
@@ -96,10 +95,8 @@ class CarriedStart:
         """
         functional, q = self.functional, self.functional.problem.q
         owned = contacts.points.distances(q, contacts.begin) - contacts.law.distance
-        distances, times = (
-            with_ghosts(functional.comm, functional.lattice, owned),
-            (contacts.begin, contacts.time),
-        )
+        distances = functional.lattice.table.with_ghosts(functional.lattice.ghosts, owned)
+        times = contacts.begin, contacts.time
         return contacts.obstacles.carried(q, moved, times, distances, functional.lattice.cell_size)
 
     def _cushion(self, contacts: Contacts) -> float:

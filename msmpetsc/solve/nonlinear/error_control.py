@@ -26,8 +26,6 @@ from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvatu
 from msmpetsc.solve.nonlinear.error_estimate import FEW, LOWER, ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
-# Relative error of a step if the user names none
-DEFAULT_ERROR = 1e-3
 # Relative error below which g, which is quadratic in the error, has no digits left
 FULL_STEP_ERROR = 1e-5
 # Share of the acceptable error; an error known to be below it needs no closer estimate

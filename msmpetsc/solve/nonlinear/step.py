@@ -12,11 +12,11 @@ from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.scene.schema import DEFAULT_STEP_ERROR
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.carried_start import CarriedStart
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import (
-    DEFAULT_ERROR,
     ErrorControl,
     Outcome,
     no_minimum,
@@ -185,7 +185,7 @@ class Stepper:
         minimum = Minimum(functional, estimate, curvature, rounding)
         error = self.error
         if error is None and not self.budget:
-            error = DEFAULT_ERROR
+            error = DEFAULT_STEP_ERROR
         tightest = self.ksp.getTolerances()[0]
         return ErrorControl(
             functional, estimate, curvature, rounding, error or 0.0, tightest
@@ -305,7 +305,7 @@ class Stepper:
         while solid and 2 * ratio < self.stiffest:
             with solid.softened(ratio):
                 self.forget(modes=False)
-                goal = Outcome(max(self.control.target, DEFAULT_ERROR))
+                goal = Outcome(max(self.control.target, DEFAULT_STEP_ERROR))
                 now, _ = newton.minimise(self.functional.at(now.q), goal)
                 newton.slopes = solid.hessian_at(now.q, False).slopes
             ratio *= SOFTER

@@ -6,8 +6,10 @@ Exit with status 1 if a sentence is too long or begins badly, if a comment stand
 too wide, or if a folder has more of the vague words than a reader bears.
 """
 
+import argparse
 import ast
 import io
+import itertools
 import re
 import sys
 import tokenize
@@ -16,8 +18,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-LONGEST = 25  # words in a sentence
-WIDEST = 88  # columns of a comment
+# limits: words of a sentence, columns of a comment
+LONGEST = 25
+WIDEST = 88
+# words of a folder from which its rates count
+LEAST_WORDS = 200
 # most of these words in 1,000, as counted in the models of good style (PyFR, scikit-fem, lineax)
 VAGUE = {"what": 0.5, "one, ones, those, others, such": 3.6}
 MARKS = ("type:", "noqa", "fmt:", "!", "pragma", "%%")
@@ -86,27 +91,29 @@ def offences(path: Path, counts: Counter[str]) -> Iterator[tuple[int, str]]:
                 yield line, f"sentence begins with {sentence.split()[0]}: {sentence[:60]}"
 
 
-def main(names: list[str]) -> int:
-    """Print the offences in these files; return the exit status."""
-    quiet = "--quiet" in names
-    names = [name for name in names if name != "--quiet"]
-    paths = [Path(name) for name in names] or [ROOT / "msmpetsc"]
-    files = [file for path in paths for file in (sorted(path.rglob("*.py")) or [path])]
+def main() -> int:
+    """Print the offences in the files; return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition(":")[0])
+    parser.add_argument("paths", nargs="*", type=Path, default=[ROOT / "msmpetsc"])
+    parser.add_argument("--quiet", action="store_true", help="print faults alone, no counts")
+    options = parser.parse_args()
+    found = [sorted(path.rglob("*.py")) or [path] for path in options.paths]
     failed, folders = False, defaultdict[Path, Counter[str]](Counter)
-    for file in files:
+    for file in itertools.chain.from_iterable(found):
         for line, fault in sorted(offences(file, folders[file.parent])):
-            failed |= not fault.startswith("(")
-            if not (quiet and fault.startswith("(")):
+            is_count = fault.startswith("(")
+            failed |= not is_count
+            if not (options.quiet and is_count):
                 print(f"{file}:{line}: {fault}")
     for folder, counts in folders.items():
         rates = {vague: 1000 * counts[vague] / max(counts["words"], 1) for vague in VAGUE}
         over = any(rate > VAGUE[vague] for vague, rate in rates.items())
-        failed |= over and counts["words"] > 200
+        failed |= over and counts["words"] > LEAST_WORDS
         shown = ", ".join(f"{rate:.1f} of {vague!r}" for vague, rate in rates.items())
-        if not quiet or over:
+        if not options.quiet or over:
             print(f"{folder}: {counts['words']} words; in 1,000: {shown}{' - too many' * over}")
     return int(failed)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -2,10 +2,12 @@
 Incremental Potential Contact): all that is computed of points on one rank.
 
 A pair of triangles' parts that are nearer than dhat has the energy  kappa a b(d),  a an area of the surface, d their
-distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begins and without bound at d = 0. A place
-of contact that many pairs have in common counts once (contact.surface.places), so that the energy is continuous and
-yet as large over a vertex as beside it. With all pairs, aligned meshes push each other aside; with the nearest pairs
-alone (Chen et al. 2025, Offset Geometric Contact) the energy jumps as the nearest part changes, and line searches end.
+distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begins and without bound at d = 0.
+
+A place of contact that several pairs have in common counts once (contact.surface.places). The energy
+is then continuous, and as large over a vertex as beside it. If all pairs counted, aligned meshes would
+push each other aside. If the nearest pairs alone counted (Chen et al. 2025, Offset Geometric Contact),
+the energy would jump as the nearest part changes, and line searches would fail.
 
 Pairs that are near at rest for being neighbours push each other from smaller distances, each set of
 them from its own (contact.surface.creases); so contacts are one set for each distance.

@@ -1,7 +1,8 @@
-"""Parts of candidate pairs that are nearer than a distance: the nearest place of each pair, and the places that link pairs.
+"""Nearest places of candidate pairs, and places that link pairs (contact.surface.places).
 
-A place is where two parts of the surface are nearest: two vertices, an edge and a vertex, a triangle and a vertex, or
-two edges. The number of a place holds its kind, its two parts and, of two edges, ipctk's type of their distance.
+A place is where two parts of the surface are nearest: two vertices, an edge and a vertex, a
+triangle and a vertex, or two edges. The number of a place holds its kind, the numbers of its two
+parts and ipctk's type of the distance of two edges.
 """
 
 import math
@@ -16,25 +17,28 @@ from msmpetsc.elasticity.springs import Vector, between, dot
 
 # Kinds of places.
 VERTICES, EDGE_VERTEX, FACE_VERTEX, EDGES = range(4)
-# ipctk's EdgeEdgeDistanceType of edges A and B. Rows: the vertex A0, A1, B0 or B1. Columns: the nearest point
-# on the other edge: its first end, its second end or between.
+# ipctk's EdgeEdgeDistanceType of edges A and B. Rows: the vertex A0, A1, B0 or B1. Columns:
+# the nearest point on the other edge is its first end, its second end or between.
 TYPES = np.array([[0, 1, 6], [2, 3, 7], [0, 2, 4], [1, 3, 5]])
 BETWEEN = 2
 # ipctk's type if both nearest points are between the ends.
 CROSSING = 8
-# Squared sine between edges of rest lengths, below which their barrier fades out; ipctk's value.
+# Squared sine between edges of rest lengths, below which their barrier fades out;
+# ipctk's value.
 PARALLEL = 1e-3
 # Squared sine below which rounding decides the common normal of two edges.
 NO_NORMAL = 1e-12
-TINY = np.finfo(float).tiny
+TINY = float(np.finfo(float).tiny)
 
 
 class Mesh(NamedTuple):
-    """Edges (e, 2), triangles (f, 3), their sides (f, 3), areas [m^2] and squared rest lengths (e,) [m^2].
+    """Mesh at rest. Areas are a quarter of ipctk's: both surfaces have vertices and edges.
 
-    Areas are a quarter of ipctk's, since both surfaces of a contact have vertices and edges.
-
-    size : more than any number of a vertex, an edge or a triangle
+    edges, faces : vertices (e, 2), (f, 3)
+    sides        : edges (f, 3) of triangles
+    areas        : of vertices and edges [m^2]
+    squares      : squared lengths (e,) of edges [m^2]
+    size         : more than any number of a vertex, an edge or a triangle
     """
 
     edges: Indices
@@ -47,11 +51,11 @@ class Mesh(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Parts (n,) of near pairs, written by kernels: nearest places of pairs, and places that link pairs.
+    """Parts (n,) of near pairs: nearest places of pairs, and places that may link pairs.
 
     place  : number of the place
     weight : area [m^2]
-    pair   : number of the pair, n of its first part, and n + 1 of its second edge's pairs; -1 of a nearest place
+    pair   : number of the pair, once for each edge of two; -1 of a nearest place
     shared : equal numbers link pairs
     value  : b
     """
@@ -61,6 +65,12 @@ class Parts(NamedTuple):
     pair: Indices
     shared: Indices
     value: Floats
+
+    @classmethod
+    def empty(cls, n: int) -> "Parts":
+        """Return room for n parts."""
+        numbers = np.empty((3, n), int)
+        return cls(numbers[0], np.empty(n), numbers[1], numbers[2], np.empty(n))
 
 
 @njit(inline="always")
@@ -87,9 +97,9 @@ def _add(
 
 @njit()
 def _to_edge(along: Vector, apart: Vector) -> tuple[float, int]:
-    """Return the squared distance [m^2] of a vertex from an edge, and where on the edge the nearest point is (0, 1:
-    its ends, 2: between).
+    """Return the squared distance [m^2] of a vertex from an edge, and where the nearest point is.
 
+    The nearest point is at an end of the edge (0, 1) or between the ends (2).
     Ericson 2005, Real-Time Collision Detection, 5.1.2.
 
     along : from the edge's first end to its second [m]
@@ -102,7 +112,7 @@ def _to_edge(along: Vector, apart: Vector) -> tuple[float, int]:
 
 @njit(inline="always")
 def _place_on_edge(mesh: Mesh, edge: int, where: int, vertex: int) -> int:
-    """Return the number of the place of a vertex and an edge, whose nearest point is where ``_to_edge`` says."""
+    """Return the number of the place of a vertex and an edge, by ``where`` of ``_to_edge``."""
     if where == BETWEEN:
         return _number(mesh, EDGE_VERTEX, edge, vertex, 0)
     end = mesh.edges[edge, where]
@@ -111,9 +121,9 @@ def _place_on_edge(mesh: Mesh, edge: int, where: int, vertex: int) -> int:
 
 @njit()
 def _over(a: Vector, b: Vector, c: Vector, normal: Vector) -> float:
-    """Return the squared distance [m^2] of a vertex from a triangle's plane; infinite if it is not over the inside.
+    """Return the squared distance [m^2] of a vertex from the plane of a triangle.
 
-    Ericson 2005, 5.1.5.
+    The distance is infinite unless the vertex is over the inside. Ericson 2005, 5.1.5.
 
     a, b, c : from the vertex to the corners [m]
     """
@@ -125,10 +135,9 @@ def _over(a: Vector, b: Vector, c: Vector, normal: Vector) -> float:
 
 @njit()
 def _crossing(first: Vector, second: Vector, apart: Vector) -> tuple[float, float]:
-    """Return the squared distance [m^2] of the lines of two edges, infinite unless both nearest points are between
-    the ends, and the square [m^4] of the edges' cross product.
+    """Return the squared distance [m^2] of the lines of two edges, and |first x second|^2 [m^4].
 
-    Ericson 2005, 5.1.9.
+    The distance is infinite unless both nearest points are between the ends. Ericson 2005, 5.1.9.
 
     apart : from the first edge's first end to the second edge's [m]
     """
@@ -143,9 +152,9 @@ def _crossing(first: Vector, second: Vector, apart: Vector) -> tuple[float, floa
 
 @njit(error_model="numpy")
 def add_faces(pairs: Indices, mesh: Mesh, points: Positions, limit: float, parts: Parts) -> int:
-    """Write the parts of pairs (2, k) of triangles and vertices whose squared distance is below ``limit`` [m^2].
+    """Write the parts of pairs (2, k) of a triangle and a vertex. Return the number of parts.
 
-    Return the number of parts.
+    limit : squared distance [m^2] from which on a pair has no parts
     """
     n = 0
     for i in range(pairs.shape[1]):
@@ -173,7 +182,10 @@ def add_faces(pairs: Indices, mesh: Mesh, points: Positions, limit: float, parts
 def add_edges(
     pairs: Indices, mesh: Mesh, points: Positions, limit: float, parts: Parts, n: int
 ) -> int:
-    """Write the parts of pairs (2, k) of edges likewise, from part n on. Return the number of parts."""
+    """Write the parts of pairs (2, k) of edges, from part n on. Return the number of all parts.
+
+    limit : squared distance [m^2] from which on a pair has no parts
+    """
     for i in range(pairs.shape[1]):
         one, other, pair = pairs[0, i], pairs[1, i], n
         a, b = mesh.edges[one, 0], mesh.edges[one, 1]

@@ -272,8 +272,9 @@ class Contacts:
         self.near.forget()
 
     def after_way(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
-        """Return whether the way of a narrow step from q to x is free, and x right: with all pairs the energy is
-        within ``left_out`` [J] of the known pairs'.
+        """Return whether the way of a narrow step from q to x is free, and whether x is right.
+
+        At a right x the energy of all pairs is within ``left_out`` [J] of the known pairs' energy.
 
         From then on all pairs are asked for; where the way is free and x is not right, still those around contacts.
         """

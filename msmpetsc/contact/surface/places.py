@@ -1,21 +1,22 @@
 """Places of contact between triangles, each of which counts once in the barrier.
 
-IPC's barrier of a vertex v is the sum of b(v, f) over candidate triangles f. Over a flat patch this sum counts
-a place several times: the triangles beside the nearest triangle have their nearest points on shared edges. The
-energy of v is therefore
+IPC's barrier of a vertex v is the sum of b(v, f) over candidate triangles f. Over a flat patch this
+sum counts a place several times: triangles beside the nearest triangle have their nearest points
+on shared edges. The energy of v is therefore
 
     a_v / 4 (sum_f b(v, f) - sum_e b(v, e)),
 
-where a_v is the area of v and e runs over the links, the edges shared by two candidate triangles, of a maximum
-spanning forest of the triangles. A link's b is at most the b of either triangle. The energy is thus
+where a_v is the area of v. The second sum is over links, which are edges shared by two candidate
+triangles, in a maximum spanning forest of these triangles. A link's b is at most the b of either
+triangle. The energy is thus
 
 - at least the energy of the nearest triangle: never negative, and unbounded at distance 0;
 - continuous, because it is the minimum of smooth sums, one sum for each forest;
 - the energy of the nearest triangle alone if v is over a flat or convex patch.
 
-An edge has the energy of its candidate edges likewise; its links are shared vertices. Links join candidates
-alone. If links came from the mesh, they would subtract triangles that are no candidates, as in creases, and the
-energy could be negative.
+An edge has the energy of its candidate edges likewise; its links are shared vertices. Links join
+candidates alone. Links from the mesh would also subtract triangles that are no candidates, as in
+creases. The energy could then be negative.
 """
 
 from dataclasses import dataclass
@@ -44,9 +45,10 @@ if TYPE_CHECKING:
 
 # Share of the sum of absolute weights at a place; a smaller sum is rounding.
 ROUNDING = 1e-9
-# Collisions kept for later positions; making an object of ipctk takes longer than finding its distance.
+# Number of collisions kept for later positions; to make one takes 9 us in Python.
 KEPT = 1 << 15
-# Odd multiplier of a hash, 2^64 over the golden ratio, less 2^64 (Knuth, The Art of Computer Programming, 6.4).
+# Multiplier of a hash: 2^64 over the golden ratio, as a signed number (Knuth, The Art
+# of Computer Programming, 6.4).
 GOLDEN = -7046029254386353131
 
 
@@ -75,14 +77,15 @@ def _numbers(pairs: list[Any], *names: str) -> Indices:
 
 
 class Places:
-    """Places of contact on a mesh. The number of a place holds its kind, its two parts and ipctk's type."""
+    """Places of contact on a mesh."""
 
     def __init__(self, mesh: "ipctk.CollisionMesh"):
         ends = mesh.rest_positions[mesh.edges]
-        parts = mesh.edges, mesh.faces, mesh.faces_to_edges
         edge_areas = np.array([mesh.edge_area(i) for i in range(mesh.num_edges)])
         self.mesh = Mesh(
-            *(np.ascontiguousarray(part, int) for part in parts),
+            np.ascontiguousarray(mesh.edges, int),
+            np.ascontiguousarray(mesh.faces, int),
+            np.ascontiguousarray(mesh.faces_to_edges, int),
             0.25 * mesh.vertex_areas,
             0.25 * edge_areas,
             ((ends[:, 1] - ends[:, 0]) ** 2).sum(axis=1),
@@ -95,16 +98,16 @@ class Places:
         """Return the places of pairs nearer than ``distance`` [m] at points (p, 3) [m]."""
         import ipctk
 
-        most = 4 * pairs.faces.shape[1] + 5 * pairs.edges.shape[1]
-        parts = Parts(*(np.empty(most, kind) for kind in (int, float, int, int, float)))
+        parts = Parts.empty(4 * pairs.faces.shape[1] + 5 * pairs.edges.shape[1])
         at, square = np.ascontiguousarray(points), distance**2
         count = add_faces(pairs.faces, self.mesh, at, square, parts)
         count = add_edges(pairs.edges, self.mesh, at, square, parts, count)
-        place, weight, pair, shared, value = (part[:count] for part in parts)
+        weight, pair = parts.weight[:count], parts.pair[:count]
         links = np.flatnonzero(pair >= 0)
-        order = links[np.argsort(-value[links], kind="stable")]
-        _keep_forest(order, pair, _numbered(shared)[0], weight)
-        place, weight = place[weight != 0], weight[weight != 0]
+        order = links[np.argsort(-parts.value[links], kind="stable")]
+        _keep_forest(order, pair, _numbered(parts.shared[:count])[0], weight)
+        counted = np.flatnonzero(weight)
+        place, weight = parts.place[counted], weight[counted]
         of, first = _numbered(place)
         sums, sizes = (np.bincount(of, some, len(first)) for some in (weight, np.abs(weight)))
         kept = np.flatnonzero(np.abs(sums) > ROUNDING * sizes)
@@ -137,9 +140,9 @@ class Places:
 
 
 def without_fading_links(pairs: "ipctk.NormalCollisions") -> "ipctk.NormalCollisions":
-    """Return the pairs but for links of nearly parallel edges, whose Hessians ipctk does not project.
+    """Return the pairs without links of nearly parallel edges.
 
-    The projections of other links are nearly 0.
+    ipctk does not project the Hessians of such links. The projections of other links are nearly 0.
     """
     kept = type(pairs)()
     kept.vv_collisions, kept.ev_collisions = pairs.vv_collisions, pairs.ev_collisions
@@ -150,8 +153,9 @@ def without_fading_links(pairs: "ipctk.NormalCollisions") -> "ipctk.NormalCollis
 
 @njit()
 def _keep_forest(order: Indices, pair: Indices, shared: Indices, weight: Floats) -> None:
-    """Negate the weights of the maximum spanning forest's links, and set those of the other parts to 0; weights of
-    nearest places stay (Kruskal's algorithm).
+    """Negate the weights of links in the maximum spanning forest, and set other weights to 0.
+
+    This is Kruskal's algorithm. Weights of nearest places stay.
 
     order  : parts that may be links, the greatest b first; a link of two parts has the lesser b
     shared : numbers from 0 on
@@ -177,9 +181,9 @@ def _root(parent: Indices, pair: int) -> int:
 
 @njit()
 def _numbered(keys: Indices) -> tuple[Indices, Indices]:
-    """Return the number of each key (n,), equal for equal keys and counted from 0 on, and where each is found first.
+    """Return a number (n,) for each key, counted from 0 on, and where (k,) each number is first.
 
-    An open hash table takes a quarter of the time of ``np.unique``.
+    Equal keys have equal numbers. The open hash table takes a quarter of the time of ``np.unique``.
     """
     numbers, firsts, count = np.empty_like(keys), np.empty_like(keys), 0
     bits = 2

@@ -93,9 +93,9 @@ class SurfaceFriction(Friction):
 def rubbing_pairs(
     found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
 ) -> RubbingPairs:
-    """Return the pairs of some sets that push; links between these, whose weights are below 0, lessen their pushes.
+    """Return the pairs of some sets that push, their pushes lessened by links of negative weight.
 
-    The vertex or edge of the lesser first number stands first, since ipctk has the parts as they were found.
+    The vertex or edge with the lesser first number is first, since ipctk has no order of its own.
     """
     point, edge, face = np.arange(mesh.num_vertices)[:, None], mesh.edges, mesh.faces
     numbers, shares, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]
@@ -135,7 +135,10 @@ def rubbing_pairs(
 
 
 def _less_links(numbers: Indices, push: Floats, points: int) -> Floats:
-    """Return pushes (a,) [N], those above 0 lessened so that each patch of pairs (a, 4) has its sum of pushes."""
+    """Return pushes (a,) [N] whose positive part has, in each patch, the sum of all pushes.
+
+    numbers : (a, 4) points of each pair, -1 for none; pairs that share points are a patch
+    """
     pair, corner = np.nonzero(numbers >= 0)
     touching = csr_array(
         (np.ones(len(pair)), (pair, numbers[pair, corner])), shape=(len(push), points)

@@ -309,7 +309,8 @@ class SurfaceContact:
         return bound
 
     def _negative_part(self, moment: ContactsAt) -> tuple[Indices, Floats] | None:
-        """Return on rank 0 the points (k,) at which the Hessian has a negative part, and its row sums (k,) [N/m]."""
+        """Return on rank 0 the points (k,) whose Hessian has a negative part, and its row sums (k,)
+        [N/m]."""
         whole, kept = (self._whole_hessian(moment, projected, None) for projected in (False, True))
         if whole is None or kept is None:
             return None

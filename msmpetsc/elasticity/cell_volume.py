@@ -21,14 +21,14 @@ class Shapes(NamedTuple):
 
 
 @njit(inline="always")
-def _cross(a: Vector, b: Vector) -> Vector:
+def cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit()
 def _volume(a: Vector, b: Vector, c: Vector) -> float:
     """Return a . (b x c)."""
-    return dot(a, _cross(b, c))
+    return dot(a, cross(b, c))
 
 
 @njit()

@@ -2,9 +2,12 @@
 Incremental Potential Contact): all that is computed of points on one rank.
 
 A pair of triangles' parts that are nearer than dhat has the energy  kappa a b(d),  a an area of the surface, d their
-distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begins and without bound at d = 0. All such
-pairs count, so that the energy is continuous: with fewer (Chen et al. 2025, Offset Geometric Contact) it jumps where
-one comes to count or ceases to, and line searches end there.
+distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begins and without bound at d = 0.
+
+A place of contact that several pairs have in common counts once (contact.surface.places). The energy
+is then continuous, and as large over a vertex as beside it. If all pairs counted, aligned meshes would
+push each other aside. If the nearest pairs alone counted (Chen et al. 2025, Offset Geometric Contact),
+the energy would jump as the nearest part changes, and line searches would fail.
 
 Pairs that are near at rest for being neighbours push each other from smaller distances, each set of
 them from its own (contact.surface.creases); so contacts are one set for each distance.
@@ -21,6 +24,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.surface.creases import creases, neighbours
+from msmpetsc.contact.surface.places import PairSet, Places, without_fading_links
 from msmpetsc.contact.surface.surface_friction import RubbingPairs, SurfaceFriction, rubbing_pairs
 from msmpetsc.geometry.surface import Surface
 
@@ -28,7 +32,7 @@ if TYPE_CHECKING:
     import ipctk
     from scipy.sparse import csc_matrix
 
-PairSets: TypeAlias = "tuple[ipctk.Candidates, ...]"  # one for each distance that pairs push from
+PairSets: TypeAlias = tuple[PairSet, ...]  # one for each distance that pairs push from
 ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # likewise
 
 KEPT = 0.9  # of the way to where surfaces meet
@@ -79,11 +83,12 @@ class Barrier:
             )
         elif obstacles:
             self.mesh.can_collide = ipctk.make_static_obstacle_filter(bodies)
+        self.places = Places(self.mesh)
         ends = surface.points[edges[edges.max(axis=1) < bodies]]
         self.edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
-        self.creases: PairSets = (ipctk.Candidates(),)  # no pairs of the first distance
+        self.creases: PairSets = (PairSet(ipctk.Candidates()),)  # no pairs of the first distance
         self._creased: list[
             list[tuple[list[Any], Indices]]
         ] = []  # these by kind, each kind with its points (k, 4)
@@ -99,13 +104,15 @@ class Barrier:
     def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
         """Let pairs that are near at rest for being neighbours on the surface push from smaller distances only, points
         (p, 3) [m] at rest; how many these are, and how many do not push at all."""
-        pairs = neighbours(self.candidates(points, 0.0)[0], self.mesh, points, self.law.distance)
+        pairs = neighbours(
+            self.candidates(points, 0.0)[0].candidates, self.mesh, points, self.law.distance
+        )
         if pairs:
             self.mesh.can_collide = self.mesh.can_collide & self.ipctk.make_sparse_filter(
                 pairs, True
             )
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
-        self.creases += tuple(sets.values())
+        self.creases += tuple(map(PairSet, sets.values()))
         for crease in sets.values():
             kinds, parts = (
                 (crease.fv_candidates, crease.ee_candidates),
@@ -142,7 +149,7 @@ class Barrier:
     def touching(self, owner: Indices) -> list[tuple[int, int]]:
         """Return the pairs of bodies, by the body of each point (p,), that are nearer than dhat at rest."""
         mesh, points, found = self.mesh, self.mesh.rest_positions, set()
-        near = self.candidates(points, 0.0)[0]
+        near = self.candidates(points, 0.0)[0].candidates
         for pair in (*near.fv_candidates, *near.ee_candidates):
             first, _, second, _ = owner[pair.vertex_ids(mesh.edges, mesh.faces)]
             far = pair.compute_distance(points, mesh.edges, mesh.faces) >= self.law.distance**2
@@ -172,7 +179,7 @@ class Barrier:
             self._cushion(points, distance + 2 * reach)
             for distance in self.distances[len(self.creases) :]
         )
-        return candidates, *self.creases[1:], *cushions
+        return PairSet(candidates), *self.creases[1:], *cushions
 
     @contextmanager
     def cushioned(self, distance: float) -> Iterator[None]:
@@ -185,14 +192,14 @@ class Barrier:
             self.distances.pop()
             self.potentials.pop()
 
-    def _cushion(self, points: Positions, distance: float) -> "ipctk.Candidates":
+    def _cushion(self, points: Positions, distance: float) -> PairSet:
         """Return the pairs of a body and an obstacle that may be nearer than this [m] at points (p, 3) [m]."""
         mesh, pairs, usual = self.mesh, self.ipctk.Candidates(), self.mesh.can_collide
         sides = np.repeat([0, 1], [self._bodies, len(points) - self._bodies])
         mesh.can_collide = self.ipctk.make_vertex_patches_filter(sides)
         pairs.build(mesh, np.asfortranarray(points), 0.5 * distance, self.ipctk.LBVH())
         mesh.can_collide = usual
-        return pairs
+        return PairSet(pairs)
 
     def around(self, touched: Mask, points: Positions, reach: float) -> PairSets:
         """Return, of points that have moved by no more than ``reach`` [m] from S (p, 3), the pairs whose edges and
@@ -217,13 +224,14 @@ class Barrier:
             sets[-1].fv_candidates, sets[-1].ee_candidates = (
                 [pairs[i] for i in np.flatnonzero(near[of].any(axis=1))] for pairs, of in kinds
             )
-        return tuple(sets)
+        return tuple(map(PairSet, sets))
 
     def clear_reach(self, sets: PairSets, points: Positions, reach: float) -> float:
         """Return how far [m], up to ``reach``, each point may move until one of these pairs comes as near as it pushes
         from; 0 where one is."""
         for pairs, distance in zip(sets, self.distances, strict=True):
-            near = self._pairs(pairs, points, distance + 2 * reach)
+            near = self.ipctk.NormalCollisions()
+            near.build(pairs.candidates, self.mesh, np.asfortranarray(points), distance + 2 * reach)
             if not near.empty():
                 reach = min(reach, max(0.5 * (self._least(near, points) - distance), 0.0))
         return reach
@@ -231,15 +239,7 @@ class Barrier:
     def contacts(self, sets: PairSets, points: Positions) -> ContactSets:
         """Return the pairs nearer than they push from."""
         kinds = zip(sets, self.distances, strict=True)
-        return tuple(self._pairs(pairs, points, distance) for pairs, distance in kinds)
-
-    def _pairs(
-        self, candidates: Any, points: Positions, distance: float
-    ) -> "ipctk.NormalCollisions":
-        pairs = self.ipctk.NormalCollisions()
-        pairs.use_area_weighting = True
-        pairs.build(candidates, self.mesh, np.asfortranarray(points), distance)
-        return pairs
+        return tuple(self.places.build(pairs, points, distance) for pairs, distance in kinds)
 
     def _pushing(
         self, contacts: ContactSets
@@ -267,10 +267,16 @@ class Barrier:
     ) -> "list[csc_matrix]":
         """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
         kinds, at = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
-        kind = kinds.CLAMP if projected else kinds.NONE
+        if not projected:
+            return [
+                potential.hessian(pairs, self.mesh, at, kinds.NONE)
+                for potential, pairs in self._pushing(contacts)
+            ]
+        pushing = [
+            (potential, without_fading_links(pairs)) for potential, pairs in self._pushing(contacts)
+        ]
         return [
-            potential.hessian(pairs, self.mesh, at, kind)
-            for potential, pairs in self._pushing(contacts)
+            potential.hessian(pairs, self.mesh, at, kinds.CLAMP) for potential, pairs in pushing
         ]
 
     def friction(
@@ -352,8 +358,12 @@ class Barrier:
 
     def _share(self, start: Positions, end: Positions, sets: PairSets) -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
-        usual = [pairs for pairs in sets[: len(self.creases)] if not pairs.empty()]
-        return min((pairs.compute_collision_free_stepsize(*ways) for pairs in usual), default=1.0)
+        shares = (
+            pairs.candidates.compute_collision_free_stepsize(*ways)
+            for pairs in sets[: len(self.creases)]
+            if len(pairs)
+        )
+        return min(shares, default=1.0)
 
 
 def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:

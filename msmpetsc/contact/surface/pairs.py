@@ -143,7 +143,8 @@ class NearPairs:
             self.points(q, time),
             min(max(reach, LEAST * self.edge), FARTHEST * self.edge),
         )
-        sets, clear = (), 0.0
+        sets: PairSets = ()
+        clear = 0.0
         if self.barrier:
             sets = self.barrier.candidates(points, reach, moved)
             clear = self.barrier.clear_reach(sets, points, reach) if moved is None else 0.0
@@ -271,8 +272,9 @@ class Contacts:
         self.near.forget()
 
     def after_way(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
-        """Return whether the way of a narrow step from q to x is free, and x right: other pairs store no more than
-        ``left_out`` [J] there.
+        """Return whether the way of a narrow step from q to x is free, and whether x is right.
+
+        At a right x the energy of all pairs is within ``left_out`` [J] of the known pairs' energy.
 
         From then on all pairs are asked for; where the way is free and x is not right, still those around contacts.
         """
@@ -286,7 +288,7 @@ class Contacts:
             self.near.look(x, self.time, ahead)
         self.find(x, base=q)
         found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
-        is_right = free and found.energy <= (1 + SAME) * known.energy + left_out
+        is_right = free and abs(found.energy - known.energy) <= SAME * known.energy + left_out
         if free and not is_right:
             self.narrow(x, self.time)
         return free, is_right

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
+from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.contact.obstacles.friction import Friction, squares
@@ -92,9 +93,9 @@ class SurfaceFriction(Friction):
 def rubbing_pairs(
     found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
 ) -> RubbingPairs:
-    """Return the pairs of some sets.
+    """Return the pairs of some sets that push, their pushes lessened by links of negative weight.
 
-    Of two points or edges that one stands first whose first number is less, for ipctk has them as they were found.
+    The vertex or edge with the lesser first number is first, since ipctk has no order of its own.
     """
     point, edge, face = np.arange(mesh.num_vertices)[:, None], mesh.edges, mesh.faces
     numbers, shares, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]
@@ -127,4 +128,22 @@ def rubbing_pairs(
             numbers.append(np.pad(np.hstack([of_first, of_second]), missing, constant_values=-1))
             shares.append(np.pad(np.hstack([one, -other]), missing))
             push.append(np.array([pair.weight * pair.normal_force_magnitude for pair in pairs]))
-    return RubbingPairs(np.concatenate(numbers), np.concatenate(shares), np.concatenate(push))
+    every, pushes = np.concatenate(numbers), np.concatenate(push)
+    kept = pushes > 0
+    lessened = _less_links(every, pushes, mesh.num_vertices)
+    return RubbingPairs(every[kept], np.concatenate(shares)[kept], lessened[kept])
+
+
+def _less_links(numbers: Indices, push: Floats, points: int) -> Floats:
+    """Return pushes (a,) [N] whose positive part has, in each patch, the sum of all pushes.
+
+    numbers : (a, 4) points of each pair, -1 for none; pairs that share points are a patch
+    """
+    pair, corner = np.nonzero(numbers >= 0)
+    touching = csr_array(
+        (np.ones(len(pair)), (pair, numbers[pair, corner])), shape=(len(push), points)
+    )
+    patch = connected_components(touching @ touching.T)[1]
+    given, taken = (np.bincount(patch, np.maximum(part, 0)) for part in (push, -push))
+    lessened: Floats = push * np.maximum(1 - taken / np.where(given > 0, given, 1), 0)[patch]
+    return lessened

@@ -299,12 +299,25 @@ class SurfaceContact:
         With r the row sums of it on the points it is no more there than a diagonal of r, and (sum w
         v)^2 is no more than sum |w| times sum |w| v^2.
         """
-        whole, kept = (self.hessian(q, projected) for projected in (False, True))
-        if whole is None or kept is None:
+        moment = self._acting(q)
+        if moment is None:
             return np.zeros(self.contacts.owned)
-        sums = np.asarray(np.abs(kept.points - whole.points).sum(axis=1)).reshape(-1, 3).max(axis=1)
-        bound: Floats = self.contacts.points.spread * (np.abs(kept.weights.copy()).T @ sums)
+        touched, sums = self.comm.bcast(self._negative_part(moment))
+        bound: Floats = self.contacts.points.spread * (
+            np.abs(self.contacts.points.carried(touched)).T @ sums
+        )
         return bound
+
+    def _negative_part(self, moment: ContactsAt) -> tuple[Indices, Floats] | None:
+        """Return on rank 0 the points (k,) whose Hessian has a negative part, and its row sums (k,)
+        [N/m]."""
+        whole, kept = (self._whole_hessian(moment, projected, None) for projected in (False, True))
+        if whole is None or kept is None:
+            return None
+        own = 3 * self.contacts.points.bodies
+        sums = np.asarray(np.abs((kept - whole)[:own, :own]).sum(axis=1)).reshape(-1, 3).max(axis=1)
+        touched = np.flatnonzero(sums)
+        return touched, sums[touched]
 
     def _curvature(
         self, moment: ContactsAt, projected: bool, duals: Rows | None

@@ -1,0 +1,201 @@
+"""Places of contact between triangles, each of which counts once in the barrier.
+
+IPC's barrier of a vertex v is the sum of b(v, f) over candidate triangles f. Over a flat patch this
+sum counts a place several times: triangles beside the nearest triangle have their nearest points
+on shared edges. The energy of v is therefore
+
+    a_v / 4 (sum_f b(v, f) - sum_e b(v, e)),
+
+where a_v is the area of v. The second sum is over links, which are edges shared by two candidate
+triangles, in a maximum spanning forest of these triangles. A link's b is at most the b of either
+triangle. The energy is thus
+
+- at least the energy of the nearest triangle: never negative, and unbounded at distance 0;
+- continuous, because it is the minimum of smooth sums, one sum for each forest;
+- the energy of the nearest triangle alone if v is over a flat or convex patch.
+
+An edge has the energy of its candidate edges likewise; its links are shared vertices. Links join
+candidates alone. Links from the mesh would also subtract triangles that are no candidates, as in
+creases. The energy could then be negative.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Indices, Positions
+from msmpetsc.backend.kernel import njit
+from msmpetsc.contact.surface.near_parts import (
+    CROSSING,
+    EDGE_VERTEX,
+    EDGES,
+    FACE_VERTEX,
+    PARALLEL,
+    Mesh,
+    Parts,
+    add_edges,
+    add_faces,
+)
+
+if TYPE_CHECKING:
+    import ipctk
+
+# Share of the sum of absolute weights at a place; a smaller sum is rounding.
+ROUNDING = 1e-9
+# Number of collisions kept for later positions; to make one takes 9 us in Python.
+KEPT = 1 << 15
+# Multiplier of a hash: 2^64 over the golden ratio, as a signed number (Knuth, The Art
+# of Computer Programming, 6.4).
+GOLDEN = -7046029254386353131
+
+
+@dataclass(frozen=True)
+class PairSet:
+    """Candidate pairs; their numbers (2, k) are read when contacts are first asked for."""
+
+    candidates: "ipctk.Candidates"
+
+    def __len__(self) -> int:
+        return len(self.candidates)
+
+    @cached_property
+    def faces(self) -> Indices:
+        """Numbers of triangles and vertices."""
+        return _numbers(self.candidates.fv_candidates, "face_id", "vertex_id")
+
+    @cached_property
+    def edges(self) -> Indices:
+        """Numbers of edges and edges."""
+        return _numbers(self.candidates.ee_candidates, "edge0_id", "edge1_id")
+
+
+def _numbers(pairs: list[Any], *names: str) -> Indices:
+    return np.array([np.fromiter(map(attrgetter(name), pairs), int, len(pairs)) for name in names])
+
+
+class Places:
+    """Places of contact on a mesh."""
+
+    def __init__(self, mesh: "ipctk.CollisionMesh"):
+        ends = mesh.rest_positions[mesh.edges]
+        edge_areas = np.array([mesh.edge_area(i) for i in range(mesh.num_edges)])
+        self.mesh = Mesh(
+            np.ascontiguousarray(mesh.edges, int),
+            np.ascontiguousarray(mesh.faces, int),
+            np.ascontiguousarray(mesh.faces_to_edges, int),
+            0.25 * mesh.vertex_areas,
+            0.25 * edge_areas,
+            ((ends[:, 1] - ends[:, 0]) ** 2).sum(axis=1),
+            mesh.num_vertices + mesh.num_edges + mesh.num_faces,
+        )
+        self._shape = EDGES + 1, self.mesh.size, self.mesh.size, CROSSING + 1
+        self._collision = lru_cache(KEPT)(self._new_collision)
+
+    def build(self, pairs: PairSet, points: Positions, distance: float) -> "ipctk.NormalCollisions":
+        """Return the places of pairs nearer than ``distance`` [m] at points (p, 3) [m]."""
+        import ipctk
+
+        parts = Parts.empty(4 * pairs.faces.shape[1] + 5 * pairs.edges.shape[1])
+        at, square = np.ascontiguousarray(points), distance**2
+        count = add_faces(pairs.faces, self.mesh, at, square, parts)
+        count = add_edges(pairs.edges, self.mesh, at, square, parts, count)
+        weight, pair = parts.weight[:count], parts.pair[:count]
+        links = np.flatnonzero(pair >= 0)
+        order = links[np.argsort(-parts.value[links], kind="stable")]
+        _keep_forest(order, pair, _numbered(parts.shared[:count])[0], weight)
+        counted = np.flatnonzero(weight)
+        place, weight = parts.place[counted], weight[counted]
+        of, first = _numbered(place)
+        sums, sizes = (np.bincount(of, some, len(first)) for some in (weight, np.abs(weight)))
+        kept = np.flatnonzero(np.abs(sums) > ROUNDING * sizes)
+        kinds = np.unravel_index(place[first[kept]], self._shape)[0]
+        kept = kept[np.argsort(kinds, kind="stable")]
+        every = list(map(self._collision, place[first[kept]].tolist(), sums[kept].tolist()))
+        first, second, third = np.cumsum(np.bincount(kinds, minlength=4))[:3]
+        found = ipctk.NormalCollisions()
+        found.vv_collisions, found.ev_collisions = every[:first], every[first:second]
+        found.fv_collisions, found.ee_collisions = every[second:third], every[third:]
+        return found
+
+    def _new_collision(self, place: int, weight: float) -> "ipctk.NormalCollision":
+        """Return a place by its number, in ipctk's form."""
+        import ipctk
+
+        kind, first, second, way = map(int, np.unravel_index(place, self._shape))
+        if kind == EDGES:
+            fades = PARALLEL * self.mesh.squares[first] * self.mesh.squares[second]
+            types = ipctk.EdgeEdgeDistanceType
+            pair = ipctk.EdgeEdgeNormalCollision(first, second, fades, types(way))
+        elif kind == FACE_VERTEX:
+            pair = ipctk.FaceVertexNormalCollision(first, second)
+        elif kind == EDGE_VERTEX:
+            pair = ipctk.EdgeVertexNormalCollision(first, second)
+        else:
+            pair = ipctk.VertexVertexNormalCollision(first, second)
+        pair.weight = weight
+        return pair
+
+
+def without_fading_links(pairs: "ipctk.NormalCollisions") -> "ipctk.NormalCollisions":
+    """Return the pairs without links of nearly parallel edges.
+
+    ipctk does not project the Hessians of such links. The projections of other links are nearly 0.
+    """
+    kept = type(pairs)()
+    kept.vv_collisions, kept.ev_collisions = pairs.vv_collisions, pairs.ev_collisions
+    kept.fv_collisions = pairs.fv_collisions
+    kept.ee_collisions = [pair for pair in pairs.ee_collisions if pair.weight > 0]
+    return kept
+
+
+@njit()
+def _keep_forest(order: Indices, pair: Indices, shared: Indices, weight: Floats) -> None:
+    """Negate the weights of links in the maximum spanning forest, and set other weights to 0.
+
+    This is Kruskal's algorithm. Weights of nearest places stay.
+
+    order  : parts that may be links, the greatest b first; a link of two parts has the lesser b
+    shared : numbers from 0 on
+    """
+    parent, last = np.arange(len(pair)), np.full(len(pair), -1)
+    for part in order:
+        linked = last[shared[part]]
+        first = second = _root(parent, pair[part])
+        if linked >= 0:
+            second = _root(parent, linked)
+        weight[part] *= 0.0 if first == second else -1.0
+        parent[first], last[shared[part]] = second, pair[part]
+
+
+@njit()
+def _root(parent: Indices, pair: int) -> int:
+    """Return the root of a pair's tree, and halve the path to the root."""
+    while parent[pair] != pair:
+        parent[pair] = parent[parent[pair]]
+        pair = parent[pair]
+    return pair
+
+
+@njit()
+def _numbered(keys: Indices) -> tuple[Indices, Indices]:
+    """Return a number (n,) for each key, counted from 0 on, and where (k,) each number is first.
+
+    Equal keys have equal numbers. The open hash table takes a quarter of the time of ``np.unique``.
+    """
+    numbers, firsts, count = np.empty_like(keys), np.empty_like(keys), 0
+    bits = 2
+    while 1 << bits < 2 * len(keys):
+        bits += 1
+    table = np.full(1 << bits, -1)
+    for i in range(len(keys)):
+        slot = (keys[i] * GOLDEN >> (63 - bits)) & (len(table) - 1)
+        while table[slot] >= 0 and keys[firsts[table[slot]]] != keys[i]:
+            slot = (slot + 1) & (len(table) - 1)
+        if table[slot] < 0:
+            table[slot], firsts[count] = count, i
+            count += 1
+        numbers[i] = table[slot]
+    return numbers, firsts[:count]

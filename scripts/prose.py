@@ -2,8 +2,8 @@
 """Check the English of docstrings and comments:  scripts/prose.py [--quiet] [files or folders]
 
 Print each offence with its place, then the rates of each folder. With --quiet print faults alone.
-Exit with status 1 if a sentence is too long or begins badly, if a comment stands behind code or is
-too wide, or if a folder has more of the vague words than a reader bears.
+Exit with status 1 if a sentence is too long or begins badly, or if a comment stands behind code or
+is too wide. The same holds if a folder has too many of the vague words.
 """
 
 import argparse
@@ -23,7 +23,8 @@ LONGEST = 25
 WIDEST = 88
 # words of a folder from which its rates count
 LEAST_WORDS = 200
-# most of these words in 1,000, as counted in the models of good style (PyFR, scikit-fem, lineax)
+# most of these words in 1,000, as counted in models of good style: PyFR, scikit-fem,
+# lineax
 VAGUE = {"what": 0.5, "one, ones, those, others, such": 3.6}
 MARKS = ("type:", "noqa", "fmt:", "!", "pragma", "%%")
 CITATION = re.compile(r"\([^()]*\b(?:19|20)\d\d\b[^()]*\)")

@@ -1,18 +1,18 @@
-"""Barrier between the triangles of surfaces, and its friction, by ipctk (Li et al. 2020,
-Incremental Potential Contact): all that is computed of points on one rank.
+"""Barrier between the triangles of surfaces, and its friction, by ipctk on a single rank.
 
-A pair of triangles' parts that are nearer than dhat has the energy  kappa a b(d),  a an area of the surface, d their
-distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begins and without bound at d = 0.
+Two parts of triangles closer than dhat have the energy kappa a b(d) (Li et al. 2020, Incremental
+Potential Contact). Here a is an area of the surface and d the distance of the parts.
+b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat) is smooth at dhat and unbounded at d = 0.
 
-A place of contact that several pairs have in common counts once (contact.surface.places). The energy
-is then continuous, and as large over a vertex as beside it. If all pairs counted, aligned meshes would
-push each other aside. If the nearest pairs alone counted (Chen et al. 2025, Offset Geometric Contact),
-the energy would jump as the nearest part changes, and line searches would fail.
+A place of contact that several pairs have in common counts once (contact.surface.places). So the
+energy is continuous, and equal over a vertex and beside it. If all pairs counted, aligned meshes
+would push each other aside. If the nearest pairs alone counted (Chen et al. 2025, Offset Geometric
+Contact), the energy would jump as the nearest part changes, and line searches would fail.
 
-Pairs that are near at rest for being neighbours push each other from smaller distances, each set of
-them from its own (contact.surface.creases); so contacts are one set for each distance.
+Pairs in creases push from smaller distances (contact.surface.creases), so that contacts have a set
+for each distance.
 
-ipctk is used on one thread, so that sums are the same each time; its arrays are of Fortran's order.
+ipctk runs on a single thread, so that sums are reproducible. Its arrays are in Fortran's order.
 """
 
 from collections.abc import Iterator
@@ -32,15 +32,19 @@ if TYPE_CHECKING:
     import ipctk
     from scipy.sparse import csc_matrix
 
-PairSets: TypeAlias = tuple[PairSet, ...]  # one for each distance that pairs push from
-ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # likewise
+# A set of candidates, or of contacts, for each distance from which pairs push
+PairSets: TypeAlias = tuple[PairSet, ...]
+ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"
 
-KEPT = 0.9  # of the way to where surfaces meet
-PIECE = 2.0  # edges that points move in one piece of a way
-PIECES = 200  # of a way; what is longer is shortened
-STRETCHED = (
-    0.2  # what is linear in a way: with more, boxes were larger for what they must allow for it
-)
+# Share of the way to a crossing that a step takes
+KEPT = 0.9
+# Edges that points move in a piece of a long way
+PIECE = 2.0
+# Most pieces of a way; a longer way is shortened
+PIECES = 200
+# Greatest linear part of a way that boxes leave out; beyond, its allowance makes boxes
+# larger
+STRETCHED = 0.2
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class BarrierLaw:
     distance  : dhat [m]
     stiffness : kappa [J/m^2]
     friction  : Coulomb's mu
-    stick     : slip [m] a second below which friction is not whole
+    stick     : slip speed below which friction fades [m/s]
     """
 
     distance: float
@@ -60,15 +64,16 @@ class BarrierLaw:
 
 
 class Barrier:
-    """Barrier of a surface (p, 3), by the positions S (p, 3) [m] of its points.
+    """Barrier of a surface, by positions S (p, 3) [m] of its points.
 
-    bodies : number of its first points, those of bodies; obstacles have the others, and do not meet each other
+    bodies : number of points of bodies, which come first; obstacles do not meet each other
     edge   : mean length of the bodies' edges at rest [m]
-    rubbed : the points at which pairs that rub were asked for last, and these
+    rubbed : points (p, 3) at which friction's pairs were computed last, and these pairs
     """
 
     def __init__(self, surface: Surface, law: BarrierLaw, bodies: int, meets_itself: bool = True):
-        import ipctk  # of the extra "contact"
+        # From the extra "contact"
+        import ipctk
 
         ipctk.set_num_threads(1)
         ipctk.set_logger_level(ipctk.LoggerLevel.off)
@@ -88,22 +93,26 @@ class Barrier:
         self.edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
-        self.creases: PairSets = (PairSet(ipctk.Candidates()),)  # no pairs of the first distance
-        self._creased: list[
-            list[tuple[list[Any], Indices]]
-        ] = []  # these by kind, each kind with its points (k, 4)
+        # Pairs of creases by distance; the first distance has none
+        self.creases: PairSets = (PairSet(ipctk.Candidates()),)
+        # Pairs of creases by kind, with their points (k, 4)
+        self._creased: list[list[tuple[list[Any], Indices]]] = []
         self.rubbed: tuple[Positions, RubbingPairs] | None = None
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
-        """Return a barrier from ``distance`` [m] on, as stiff over a depth as the law's own."""
+        """Return the barrier of a distance [m], with the law's stiffness over a depth."""
         stiffness = self.law.stiffness * (distance / self.law.distance) ** 2
         return self.ipctk.BarrierPotential(
             self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness
         )
 
     def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
-        """Let pairs that are near at rest for being neighbours on the surface push from smaller distances only, points
-        (p, 3) [m] at rest; how many these are, and how many do not push at all."""
+        """Let pairs in creases push from smaller distances alone.
+
+        Return the number of these pairs, and of pairs too close to push at all.
+
+        points : (p, 3) at rest [m]
+        """
         pairs = neighbours(
             self.candidates(points, 0.0)[0].candidates, self.mesh, points, self.law.distance
         )
@@ -128,7 +137,7 @@ class Barrier:
         return sum(map(len, self.creases)), dropped
 
     def crossings(self) -> Indices:
-        """Return the triangles (k,) that edges of others cross at rest or that have such an edge, ascending."""
+        """Return the triangles (k,) that cross another triangle at rest, ascending."""
         ipctk, mesh, points = self.ipctk, self.mesh, self.mesh.rest_positions
         phase = ipctk.LBVH()
         phase.can_vertices_collide = mesh.can_collide
@@ -147,7 +156,7 @@ class Barrier:
         return np.array(sorted(cut), np.int64)
 
     def touching(self, owner: Indices) -> list[tuple[int, int]]:
-        """Return the pairs of bodies, by the body of each point (p,), that are nearer than dhat at rest."""
+        """Return the pairs of bodies closer than dhat at rest, by the body of each point (p,)."""
         mesh, points, found = self.mesh, self.mesh.rest_positions, set()
         near = self.candidates(points, 0.0)[0].candidates
         for pair in (*near.fv_candidates, *near.ee_candidates):
@@ -158,12 +167,16 @@ class Barrier:
         return sorted(found)
 
     def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> PairSets:
-        """Return all pairs that may be nearer than dhat once each point has moved by no more than
-        ``reach`` [m], or by that from its straight way ``moved`` (p, 3) [m]; and those in creases, wherever they are.
+        """Return the pairs that may be closer than dhat while points move, and all pairs of
+        creases.
 
-        Boxes around ways hold fewer pairs without what is linear in the points x of these, m = c + G x + r. Where a
-        pair is nearer than d on its way, |x - x' + t (r - r')| is less than d + |G| |x - x'|, and
-        |x - x'| less than (d + 2 max |r|) / (1 - |G|).
+        Each point x may move by ``reach`` [m], from its place or from its straight way ``moved``.
+        The linear part of the ways, m = c + G x + r, would enlarge the boxes around them. If a pair
+        is closer than d on its way, then |x - x' + t (r - r')| is below d + |G| |x - x'|. Hence
+        |x - x'| is below (d + 2 max |r|) / (1 - |G|), and boxes around r suffice.
+
+        points : (p, 3) [m]
+        moved  : (p, 3) [m]; None if points stay
         """
         candidates, ends, near = (
             self.ipctk.Candidates(),
@@ -183,7 +196,10 @@ class Barrier:
 
     @contextmanager
     def cushioned(self, distance: float) -> Iterator[None]:
-        """Let obstacles push bodies from a farther ``distance`` [m], too; pairs found before lack its pairs."""
+        """Let obstacles also push bodies from a larger ``distance`` [m].
+
+        older candidates lack its pairs.
+        """
         self.distances.append(distance)
         self.potentials.append(self._potential(distance))
         try:
@@ -193,7 +209,7 @@ class Barrier:
             self.potentials.pop()
 
     def _cushion(self, points: Positions, distance: float) -> PairSet:
-        """Return the pairs of a body and an obstacle that may be nearer than this [m] at points (p, 3) [m]."""
+        """Return the pairs of a body and an obstacle closer than this [m] at points (p, 3) [m]."""
         mesh, pairs, usual = self.mesh, self.ipctk.Candidates(), self.mesh.can_collide
         sides = np.repeat([0, 1], [self._bodies, len(points) - self._bodies])
         mesh.can_collide = self.ipctk.make_vertex_patches_filter(sides)
@@ -202,8 +218,10 @@ class Barrier:
         return PairSet(pairs)
 
     def around(self, touched: Mask, points: Positions, reach: float) -> PairSets:
-        """Return, of points that have moved by no more than ``reach`` [m] from S (p, 3), the pairs whose edges and
-        triangles have a point in ``touched`` (p,) or next to one."""
+        """Return the pairs of parts that have a point in ``touched`` (p,) or next to one.
+
+        The pairs hold while points move by ``reach`` [m] from S (p, 3) [m].
+        """
         ipctk, corners, near = self.ipctk, (self.mesh.edges, self.mesh.faces), touched.copy()
         near[corners[0][touched[corners[0]].any(axis=1)]] = True
         edges, faces = (np.flatnonzero(near[of].any(axis=1)) for of in corners)
@@ -227,8 +245,10 @@ class Barrier:
         return tuple(map(PairSet, sets))
 
     def clear_reach(self, sets: PairSets, points: Positions, reach: float) -> float:
-        """Return how far [m], up to ``reach``, each point may move until one of these pairs comes as near as it pushes
-        from; 0 where one is."""
+        """Return the displacement [m] of points, at most ``reach``, below which no pair pushes.
+
+        Return 0 if a pair pushes already.
+        """
         for pairs, distance in zip(sets, self.distances, strict=True):
             near = self.ipctk.NormalCollisions()
             near.build(pairs.candidates, self.mesh, np.asfortranarray(points), distance + 2 * reach)
@@ -237,15 +257,15 @@ class Barrier:
         return reach
 
     def contacts(self, sets: PairSets, points: Positions) -> ContactSets:
-        """Return the pairs nearer than they push from."""
+        """Return the pairs that push at points (p, 3) [m]."""
         kinds = zip(sets, self.distances, strict=True)
         return tuple(self.places.build(pairs, points, distance) for pairs, distance in kinds)
 
     def _pushing(
         self, contacts: ContactSets
     ) -> "list[tuple[ipctk.BarrierPotential, ipctk.NormalCollisions]]":
-        """Return the sets that are not empty, each with its barrier."""
-        kinds = zip(self.potentials, contacts, strict=False)  # of none there are no sets
+        """Return the nonempty sets, each with its barrier."""
+        kinds = zip(self.potentials, contacts, strict=False)
         return [(potential, pairs) for potential, pairs in kinds if not pairs.empty()]
 
     def energy(self, contacts: ContactSets, points: Positions) -> float:
@@ -256,7 +276,7 @@ class Barrier:
         )
 
     def gradient(self, contacts: ContactSets, points: Positions) -> Rows:
-        """Return its gradient (p, 3) [N]."""
+        """Return the gradient (p, 3) [N] of the energy."""
         gradient, at = np.zeros(points.size), np.asfortranarray(points)
         for potential, pairs in self._pushing(contacts):
             gradient += potential.gradient(pairs, self.mesh, at)
@@ -265,7 +285,7 @@ class Barrier:
     def hessian(
         self, contacts: ContactSets, points: Positions, projected: bool
     ) -> "list[csc_matrix]":
-        """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
+        """Return the terms (3p, 3p) [N/m] of the Hessian, projected pair by pair or not."""
         kinds, at = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
         if not projected:
             return [
@@ -282,10 +302,11 @@ class Barrier:
     def friction(
         self, contacts: ContactSets, points: Positions, start: Positions, stick: float
     ) -> SurfaceFriction | None:
-        """Return Coulomb's friction of contacts, with their push at points (p, 3) [m]; None without any.
+        """Return Coulomb's friction with the normal forces at points (p, 3) [m]; None without
+        contact.
 
-        start : (p, 3) where the points are if nothing slips [m]
-        stick : slip below which it is not whole [m]
+        start : (p, 3) positions of points without slip [m]
+        stick : slip below which friction fades [m]
         """
         pairs = self._rubbing(contacts, points)
         if not len(pairs.push):
@@ -294,12 +315,15 @@ class Barrier:
         return SurfaceFriction(limit, stick, np.zeros((1, 3)), start, pairs.numbers, slips)
 
     def friction_limits(self, contacts: ContactSets, points: Positions) -> tuple[Indices, Floats]:
-        """Return the points (a, 4) of pairs, -1 for none, and their mu N (a,) [N] at points (p, 3) [m]."""
+        """Return points (a, 4) of pairs, -1 for none, and mu N (a,) [N] at points (p, 3) [m]."""
         pairs = self._rubbing(contacts, points)
         return pairs.numbers, self.law.friction * pairs.push
 
     def _rubbing(self, contacts: ContactSets, points: Positions) -> RubbingPairs:
-        """Return the pairs of contacts at points (p, 3) [m]; a step begins with those that the last one ended with."""
+        """Return friction's pairs at points (p, 3) [m].
+
+        a step begins with the last step's pairs.
+        """
         if self.rubbed is None or not np.array_equal(self.rubbed[0], points):
             found = []
             for potential, pairs in self._pushing(contacts):
@@ -311,7 +335,7 @@ class Barrier:
         return self.rubbed[1]
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
-        """Return the least distance [m]; infinite where there are no contacts."""
+        """Return the least distance [m]; infinite without contacts."""
         return min(
             (self._least(pairs, points) for _, pairs in self._pushing(contacts)), default=np.inf
         )
@@ -320,7 +344,7 @@ class Barrier:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
     def nearest(self, contacts: ContactSets, points: Positions) -> Indices:
-        """Return the points (k,) of the pair of least distance; none where there are no contacts."""
+        """Return the points (k,) of the closest pair; none without contacts."""
         parts, at = (self.mesh.edges, self.mesh.faces), np.asfortranarray(points)
         pairs = [near[i] for _, near in self._pushing(contacts) for i in range(len(near))]
         nearest = min(pairs, key=lambda pair: pair.compute_distance(at, *parts), default=None)
@@ -328,8 +352,9 @@ class Barrier:
         return np.array(numbers, np.int64)
 
     def clearance(self, contacts: ContactSets, sets: PairSets, points: Positions) -> float:
-        """Return no more than the least distance [m] of these pairs, of which contacts are all at points S (p, 3)."""
-        known = zip(contacts, sets, self.distances, strict=False)  # a cushion has the same pairs
+        """Return a lower bound of the candidates' distances [m], by their contacts at S (p, 3)."""
+        # A larger distance of obstacles has the same pairs
+        known = zip(contacts, sets, self.distances, strict=False)
         least = (
             self._least(near, points) if len(near) else far
             for near, pairs, far in known
@@ -338,13 +363,15 @@ class Barrier:
         return min(least, default=self.law.distance)
 
     def free_share(self, start: Positions, moved: Rows, sets: PairSets) -> float:
-        """Return the share, up to 1, of a straight way that points go from start (p, 3) by
-        ``moved`` (p, 3) [m] without any meeting, of pairs that may meet on it."""
+        """Return the free share of the straight ways from start (p, 3) by ``moved`` (p, 3) [m].
+
+        sets : candidate pairs of the ways
+        """
         share = self._share(start, start + moved - moved.mean(axis=0), sets)
         return share if share >= 1 else KEPT * share
 
     def sweep(self, start: Positions, moved: Rows) -> float:
-        """Return the free share of any way, as ``free_share`` does, from the pairs that it passes."""
+        """Return the free share of ways of any length, with candidates of each piece."""
         moved = moved - moved.mean(axis=0)
         whole = max(
             int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * self.edge))), 1
@@ -357,6 +384,7 @@ class Barrier:
         return 1.0 if whole <= PIECES else PIECES / whole
 
     def _share(self, start: Positions, end: Positions, sets: PairSets) -> float:
+        """Return the share of ways up to the first crossing of candidates."""
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
         shares = (
             pairs.candidates.compute_collision_free_stepsize(*ways)
@@ -367,7 +395,10 @@ class Barrier:
 
 
 def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
-    """Return what moves (p, 3) [m] of points (p, 3) [m] are beside what is linear in these, and the size of that."""
+    """Return displacements (p, 3) [m] without their linear part, and the norm of that part.
+
+    A linear part above STRETCHED stays, and its norm counts as 0.
+    """
     x, rest = points - points.mean(axis=0), moved - moved.mean(axis=0)
     linear = np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ rest)
     size = float(np.linalg.norm(linear, 2))

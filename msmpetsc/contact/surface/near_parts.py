@@ -18,8 +18,9 @@ from msmpetsc.elasticity.springs import edge as between
 
 # Kinds of places.
 VERTICES, EDGE_VERTEX, FACE_VERTEX, EDGES = range(4)
-# ipctk's EdgeEdgeDistanceType of edges A and B. Rows: the vertex A0, A1, B0 or B1. Columns:
-# the nearest point on the other edge is its first end, its second end or between.
+# ipctk's EdgeEdgeDistanceType of edges A and B. Rows: the vertex A0, A1, B0 or B1.
+# Columns: the nearest point on the other edge is its first end, its second end or
+# between.
 TYPES = np.array([[0, 1, 6], [2, 3, 7], [0, 2, 4], [1, 3, 5]])
 BETWEEN = 2
 # ipctk's type if both nearest points are between the ends.

@@ -1,10 +1,13 @@
-"""Contacts of a surface with itself and with obstacles, wherever they are: looked for as rarely as can be.
+"""Contacts of a surface with itself and with obstacles, with candidate pairs cached.
 
-Pairs of its parts that may meet are looked for around positions, and again where a point has moved farther than was
-allowed for then; a common translation is no such move. Where none of them can come near, positions of nodes tell that
-without a single point's being computed; elsewhere points tell, for light nodes around a body swing much farther. Pairs
-outlive a step (``NearPairs``); contacts at positions are known for as long as it lasts (``Contacts``). Where few points
-touch, a step asks for the pairs around these alone, and for all of them once, where it has come to.
+The broad phase finds candidate pairs around given positions. They serve until a point leaves the
+region around its place there; a common translation does not count. If no candidate can come near,
+displacements of nodes tell, and no point is computed. Otherwise points tell, since light nodes
+around a body swing much farther than its points.
+
+Candidate pairs outlive a step (``NearPairs``). Contacts at positions are kept during a step
+(``Contacts``). If few points touch, a step is narrow: it uses the candidates around these points,
+and all candidates once, at its end.
 """
 
 from collections.abc import Iterator
@@ -21,23 +24,30 @@ from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
 
-REMEMBERED = 3  # positions whose contacts are kept, and pairs: where a line search starts, and where it tries
-FARTHEST = 0.05  # edges that a point may move before pairs are looked for anew: with 0.25 there are 4 times the pairs
-LEAST = 0.02  # edges that it may always move: fewer pairs are no faster
-AHEAD = 2.0  # times the move of a step in which nothing touched
-FEW = 0.01  # of all points: where more touch, to solve once more costs as much as to look for all pairs each time
-SAME = 1e-9  # of the energy of contacts, that two sums of it may differ by
+# Positions whose contacts and candidates are kept: the base of a line search and its
+# trials
+REMEMBERED = 3
+# Edges that a point may move before a new broad phase; 0.25 has four times the pairs
+FARTHEST = 0.05
+# Edges that a point may always move; with fewer the pairs are not fewer
+LEAST = 0.02
+# Moves of the last step that a broad phase allows for, if nothing touched
+AHEAD = 2.0
+# Share of points in contact from which a second solve costs more than narrow steps save
+FEW = 0.01
+# Relative difference of two sums of contact energy by rounding
+SAME = 1e-9
 TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
 class CollisionSurface:
-    """The surface that meets itself or obstacles.
+    """Surface that meets itself or obstacles.
 
-    surface      : on rank 0, triangles that cut others taken out, and the obstacles'; None on the others
-    points       : its points as the nodes carry them
-    meets_itself : or obstacles alone
-    parts        : name of each body and obstacle as a scene has it, and the number of its points; on rank 0
+    surface      : of bodies without crossing triangles, then of obstacles; on rank 0, else None
+    points       : of the surface, by nodes
+    meets_itself : whether the surface meets itself, or obstacles alone
+    parts        : name and number of points of each body and obstacle, on rank 0
     """
 
     surface: Surface | None
@@ -47,14 +57,14 @@ class CollisionSurface:
     parts: list[tuple[str, int]]
 
     def name_of(self, point: int) -> str:
-        """Return the name of the body or the obstacle that has the point of this number."""
+        """Return the name of the body or obstacle of a point."""
         ends = np.cumsum([count for _, count in self.parts])
         return self.parts[int(np.searchsorted(ends, point, side="right"))][0]
 
 
 @dataclass(frozen=True)
 class Touch:
-    """Contacts of one moment: their number, the least distance [m], NaN where there are none, and the energy [J]."""
+    """Number of contacts, least distance [m], NaN without contact, and energy [J]."""
 
     contacts: int = 0
     distance: float = np.nan
@@ -63,13 +73,17 @@ class Touch:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs that may meet while no point is farther than ``reach`` [m] from where it is at q (owned, 3), or from its
-    straight way from there, but for a translation.
+    """Candidate pairs that serve while points stay within ``reach`` of their places or ways.
 
-    time         : [s], at which obstacles are there as they are
-    clear        : no more than reach [m]; no pair comes near enough to count while no point moves farther
-    points, sets : S there (p, 3) [m] and the pairs, on rank 0
-    moved        : the ways (p, 3) [m], on rank 0; None where there are none
+    A common translation of all points does not count.
+
+    q      : positions (owned, 3) [m] of the broad phase
+    time   : of the places of obstacles [s]
+    reach  : [m]
+    clear  : displacement [m], at most reach, below which no pair comes near enough to push
+    points : S (p, 3) [m] at q, on rank 0
+    sets   : candidate pairs, on rank 0
+    moved  : straight ways (p, 3) [m] of the points, on rank 0; None without ways
     """
 
     q: Positions
@@ -81,7 +95,7 @@ class Pairs:
     moved: Rows | None = None
 
     def serve(self, points: Positions) -> bool:
-        """Return whether points S (p, 3) are within reach, on rank 0."""
+        """Return whether points S (p, 3) [m] are within reach, on rank 0."""
         gone = points - self.points
         if self.moved is not None:
             gone, way = gone - gone.mean(axis=0), self.moved - self.moved.mean(axis=0)
@@ -91,11 +105,13 @@ class Pairs:
 
 @dataclass(frozen=True)
 class ContactsAt:
-    """Contacts at positions q (owned, 3) [m] and a time [s] of obstacles.
+    """Contacts at positions and a time of obstacles.
 
-    count    : their number
-    points   : S (p, 3) [m], on rank 0; none where nothing was near
-    contacts : on rank 0; none where nothing was near
+    q        : (owned, 3) [m]
+    time     : [s]
+    count    : number of contacts
+    points   : S (p, 3) [m], on rank 0; empty if nothing was near
+    contacts : on rank 0; empty if nothing was near
     """
 
     q: Positions
@@ -106,7 +122,9 @@ class ContactsAt:
 
 
 class NearPairs:
-    """Pairs that may meet, as a run knows them. All methods are collective; positions are (owned or more, 3) [m].
+    """Cache of candidate pairs of a run.
+
+    All methods are collective. Positions are (owned or more, 3) [m].
 
     barrier : on rank 0
     edge    : mean length of the surface's edges at rest [m]
@@ -120,14 +138,18 @@ class NearPairs:
             comm, lambda: _barrier(surface, collision) if surface else None
         )
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
-        self._known: list[Pairs] = []  # the newest first
+        # The newest first
+        self._known: list[Pairs] = []
 
     def around(self, q: Positions, time: float) -> Pairs:
-        """Return the newest pairs; those at q if there are none yet."""
+        """Return the newest candidates, or those at q if there are none yet."""
         return self._known[0] if self._known else self.look(q, time, self.law.distance)
 
     def serving(self, *places: Positions) -> Pairs | None:
-        """Return the newest pairs within whose reach all of these places of points S (p, 3) are, by their own moves."""
+        """Return the newest candidates that serve all these places (p, 3) [m] of points.
+
+        None without.
+        """
         known = enumerate(self._known if self.barrier else ())
         number: int | None = self.comm.bcast(
             next((i for i, pairs in known if all(map(pairs.serve, places))), None)
@@ -138,7 +160,7 @@ class NearPairs:
         return self._known[0]
 
     def look(self, q: Positions, time: float, reach: float, moved: Rows | None = None) -> Pairs:
-        """Look for pairs at q, or on the way of the points from there by ``moved`` (p, 3) [m]."""
+        """Find candidates at q, or on the ways of points from there by ``moved`` (p, 3) [m]."""
         points, reach = (
             self.points(q, time),
             min(max(reach, LEAST * self.edge), FARTHEST * self.edge),
@@ -155,25 +177,23 @@ class NearPairs:
         return newest
 
     def farthest(self, end: Positions, start: Positions, time: float, begin: float) -> float:
-        """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
+        """Return a bound [m] of points' displacements from start to end, without a translation."""
         moved = end[: self.owned] - start[: self.owned]
         if self.points.obstacles.total:
             moved = np.vstack([moved, self.points.obstacles.way(begin, time)])
-        along = np.ascontiguousarray(
-            moved.T
-        )  # along the last axis numpy takes a twentieth of the time
+        # numpy reduces along the last axis twenty times as fast
+        along = np.ascontiguousarray(moved.T)
         ends = [
             np.fmax.reduce(along, axis=1, initial=-np.inf),
             -np.fmin.reduce(along, axis=1, initial=np.inf),
         ]
         ends = np.concatenate(ends)
-        self.comm.Allreduce(
-            MPI.IN_PLACE, ends, MPI.MAX
-        )  # the greatest along the axes and against them
+        # The greatest along the axes and against them
+        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
-        """Forget what earlier steps showed."""
+        """Forget all candidates, so that the next step does not depend on earlier steps."""
         self._known = []
         if self.barrier:
             self.barrier.rubbed = None
@@ -182,12 +202,12 @@ class NearPairs:
 class Contacts:
     """Contacts in a step from ``begin`` to ``time`` [s]. All methods are collective.
 
-    Positions are (owned or more, 3) [m]. Obstacles are where they are at the step's end if nothing else is said: they
-    get there first.
+    Positions are (owned or more, 3) [m]. Obstacles have their places at the end of the step unless
+    another time is given.
 
-    before    : contacts of the step before, whose end is known
-    is_narrow : those pairs alone are asked for that are around some contacts
-    apart     : and there are no contacts: the surface need not be asked for
+    before    : contacts of the last step, whose end is known
+    is_narrow : whether only candidates around some contacts are used
+    apart     : whether the step is narrow without contacts, so that the surface is left out
     """
 
     def __init__(
@@ -197,10 +217,12 @@ class Contacts:
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
         self.is_narrow = self.apart = False
-        self._around: PairSets = ()  # on rank 0
-        self._touched: Mask | None = None  # (p,) the points that these are around
+        # Candidates of a narrow step, and whether they are around each point (p,), on
+        # rank 0
+        self._around: PairSets = ()
+        self._touched: Mask | None = None
         self._moments: list[ContactsAt] = before._moments if before and not before.is_narrow else []
-        # q, time and points of some positions
+        # q, time and points of the last positions
         self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
 
     def find(
@@ -210,10 +232,11 @@ class Contacts:
         with_points: bool = False,
         base: Positions | None = None,
     ) -> ContactsAt:
-        """Return the contacts at positions q, and a time [s] if not that of the step's end.
+        """Return the contacts at positions q.
 
-        with_points : these are there, even if nothing is near
-        base        : where a way to q begins, of which it is then asked how much of it is free
+        time        : of obstacles [s]; None for the end of the step
+        with_points : compute the points even if nothing is near
+        base        : start of a way to q whose free share will be asked for next
         """
         q, time = q[: self.owned], self.time if time is None else time
         for moment in self._moments:
@@ -236,8 +259,11 @@ class Contacts:
         return self._moments[0]
 
     def narrow(self, q: Positions, time: float) -> bool:
-        """Ask from now on for the pairs alone that are around contacts at q and a time [s], and around those before, or
-        for all if these touch at too many points; return which."""
+        """Use candidates around the contacts at q and a time [s], and around earlier contacts,
+        alone.
+
+        If too many points touch, use all candidates. Return whether the step is narrow.
+        """
         moment, touched = self.find(q, time), None
         if self.barrier and moment.count:
             touched = self.barrier.gradient(moment.contacts, moment.points).any(axis=1)
@@ -254,12 +280,12 @@ class Contacts:
         return self.is_narrow
 
     def widen(self) -> None:
-        """Ask for all pairs."""
+        """Use all candidates."""
         self.is_narrow, self.apart, self._moments = False, False, []
 
     @contextmanager
     def cushioned(self, distance: float) -> Iterator[None]:
-        """Let obstacles push bodies from a farther ``distance`` [m], too; all pairs are asked for from now on."""
+        """Let obstacles also push from a larger ``distance`` [m] in the context."""
         with self.barrier.cushioned(distance) if self.barrier else nullcontext():
             self._look_anew()
             try:
@@ -268,6 +294,7 @@ class Contacts:
                 self._look_anew()
 
     def _look_anew(self) -> None:
+        """Use all candidates, of a new broad phase."""
         self.widen()
         self.near.forget()
 
@@ -275,16 +302,15 @@ class Contacts:
         """Return whether the way of a narrow step from q to x is free, and whether x is right.
 
         At a right x the energy of all pairs is within ``left_out`` [J] of the known pairs' energy.
-
-        From then on all pairs are asked for; where the way is free and x is not right, still those around contacts.
+        From then on all candidates are used. If the way is free and x is not right, the step stays
+        narrow, with the candidates around all contacts at x.
         """
         known = Touch() if self.apart else self.touch(x, self.time)
         self.widen()
         pairs, bound = self._bound(q, self.begin, x)
         ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
-        if (
-            bound > pairs.reach and ahead <= FARTHEST * self.near.edge
-        ):  # so that the next steps need no look
+        # The next steps then need no broad phase
+        if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:
             self.near.look(x, self.time, ahead)
         self.find(x, base=q)
         found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
@@ -294,7 +320,7 @@ class Contacts:
         return free, is_right
 
     def _look(self, q: Positions, time: float, points: Positions, base: Positions | None) -> Pairs:
-        """Look for pairs at q, whose points are S (p, 3) [m], and on the way there from base, if that is not long."""
+        """Find candidates at q, with points S (p, 3) [m], and on a short way there from base."""
         moved = None if base is None else self.points_at(base, time) - points
         if self.comm.bcast(
             moved is not None and len(moved) > 0 and farthest(moved) > PIECE * self.near.edge
@@ -303,7 +329,7 @@ class Contacts:
         return self.near.look(q, time, LEAST * self.near.edge, moved)
 
     def points_at(self, q: Positions, time: float) -> Positions:
-        """Return the points (p, 3) [m] of positions q at a time [s] on rank 0; (0, 3) on the others."""
+        """Return the points (p, 3) [m] at q and a time [s] on rank 0; (0, 3) elsewhere."""
         q = q[: self.owned]
         for known, at, points in self._points:
             if self._is_at(known, at, q, time):
@@ -312,15 +338,15 @@ class Contacts:
         return self._points[0][2]
 
     def _is_at(self, known: Positions, at: float, q: Positions, time: float) -> bool:
-        """Return whether positions and obstacles are those of another moment on all ranks."""
+        """Return whether positions and obstacles agree with known ones on all ranks."""
         return self.same(at, time) and self.comm.allreduce(bool(np.array_equal(q, known)), MPI.LAND)
 
     def same(self, begin: float, end: float) -> bool:
-        """Return whether obstacles are at one time [s] where they are at another."""
+        """Return whether obstacles have the same places at two times [s]."""
         return not self.obstacles.moves(begin, end)
 
     def touch(self, q: Positions, time: float) -> Touch:
-        """Return what there is of contacts at q and a time [s]."""
+        """Return number, least distance and energy of the contacts at q and a time [s]."""
         moment = self.find(q, time)
         touch = Touch()
         if self.barrier and moment.count:
@@ -330,7 +356,7 @@ class Contacts:
         return of_all
 
     def nearest(self, q: Positions) -> str:
-        """Return in words which two parts of the surface are nearest at q, and where."""
+        """Return in words which two parts of the surface are nearest at q, and their place."""
         moment, words = self.find(q, with_points=True), ""
         if self.barrier:
             points = self.barrier.nearest(moment.contacts, moment.points)
@@ -345,15 +371,18 @@ class Contacts:
         return in_words
 
     def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[Pairs, float]:
-        """Return the newest pairs, and no less than how far points are from them on a way from q at ``begin`` [s]."""
+        """Return the newest candidates and a bound [m] of points' distances from their places.
+
+        The bound holds on the way from q at ``begin`` [s] to ``end``.
+        """
         pairs = self.near.around(q, begin)
         places = (q, begin), (end, self.time)
         return pairs, max(self.near.farthest(at, pairs.q, time, pairs.time) for at, time in places)
 
     def free_share(self, q: Positions, end: Positions, begin: float | None = None) -> float:
-        """Return the share, up to 1, of the straight way from q to ``end`` on which no two triangles meet.
+        """Return the share of the straight way from q to ``end`` on which no two triangles meet.
 
-        begin : obstacles go from their place at this time [s] to their present place; None: they stay
+        begin : time [s] from which obstacles move to their present places; None if they stay
         """
         begin = self.time if begin is None else begin
         pairs, bound = self._bound(q, begin, end)
@@ -366,7 +395,7 @@ class Contacts:
             return 1.0
         sets = self._around
         if not self.is_narrow:
-            # pairs that serve at its end alone say nothing of what is passed on the way there
+            # Candidates must serve at both ends of the way
             serving = self.near.serving(start, start + moved)
             if not serving and way > PIECE * self.near.edge:
                 return float(
@@ -378,7 +407,7 @@ class Contacts:
         )
 
     def _clearance(self, q: Positions, time: float) -> float:
-        """Return the least distance [m] of any pair at q and a time [s], but no more than dhat."""
+        """Return the least distance [m] of pairs at q and a time [s], at most dhat."""
         moment, clearance = self.find(q, time, with_points=True), 0.0
         if self.barrier:
             sets = self._around if self.is_narrow else self.barrier.creases
@@ -387,25 +416,31 @@ class Contacts:
 
 
 def farthest(moved: Rows) -> float:
-    """Return no less than how far any of some points goes that move so (p, 3) [m], but for a common translation."""
+    """Return the greatest displacement [m] of ``moved`` (p, 3) [m] without a translation."""
     along = np.ascontiguousarray(moved.T)
     middle = 0.5 * (along.max(axis=1) + along.min(axis=1))
     return float(np.sqrt(((along - middle[:, None]) ** 2).sum(axis=0).max()))
 
 
 def _barrier(surface: Surface, collision: CollisionSurface) -> Barrier:
+    """Return the barrier of a surface, and log its creases."""
     law = collision.law
     barrier = Barrier(surface, law, collision.points.bodies, collision.meets_itself)
     folded, dropped = barrier.leave_out_neighbours(surface.points)
     if folded:
         log.info(
-            "self_contact: %d pairs of the surface's parts are in creases, nearer than self_contact.distance = %.3g m "
-            "at rest or next to such: they push each other from smaller distances, down to %.3g m",
-            folded, law.distance, barrier.distances[-1],
-        )  # fmt: skip
+            "self_contact: %d pairs of the surface's parts are in creases, nearer than "
+            "self_contact.distance = %.3g m at rest or next to such: they push each other from "
+            "smaller distances, down to %.3g m",
+            folded,
+            law.distance,
+            barrier.distances[-1],
+        )
     if dropped:
         log.warning(
-            "self_contact: %d pairs of the surface's parts in creases all but touch at rest, nearer than %.3g m: they "
-            "are left out, and may cross", dropped, NEAREST * law.distance,
-        )  # fmt: skip
+            "self_contact: %d pairs of the surface's parts in creases all but touch at rest, "
+            "nearer than %.3g m: they are left out, and may cross",
+            dropped,
+            NEAREST * law.distance,
+        )
     return barrier

@@ -1,7 +1,7 @@
-"""Friction between parts of surfaces in one step, of the same law as an obstacle's (contact.obstacles.friction).
+"""Friction between parts of surfaces in one step, by the law of contact.obstacles.friction.
 
-A pair of parts has its points of contact, its normal and its push from one moment (Li et al. 2020, Incremental
-Potential Contact, section 5.3); its slip is then linear in the points.
+Points of contact, normal and normal force of a pair are those of one moment (Li et al. 2020,
+Incremental Potential Contact, section 5.3). So the slip of a pair is linear in the points.
 """
 
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 class RubbingPairs:
     """Pairs of parts that press on each other.
 
-    numbers : (a, 4) of the points of each, -1 for none, those of its first part before those of its second
-    shares  : (a, 4) of these points in the way from the second part's nearest point to the first's
-    push    : (a,) N [N]
+    numbers : (a, 4) points of each pair, -1 for none, of its first part, then of its second
+    shares  : (a, 4) weights of these points in the vector from the second part to the first
+    push    : (a,) normal force N [N]
     """
 
     numbers: Indices
@@ -32,7 +32,7 @@ class RubbingPairs:
     push: Floats
 
     def slips(self, points: Positions) -> bsr_array:
-        """Return the slips (3a, 3p) of pairs, each along the plane of its contact at points (p, 3)."""
+        """Return the matrix (3a, 3p) from displacements to tangential slips at points (p, 3)."""
         apart = np.einsum("ai,aic->ac", self.shares, points[self.numbers])
         normal = apart / np.linalg.norm(apart, axis=1)[:, None]
         plane = np.eye(3) - squares(normal)
@@ -47,9 +47,9 @@ class RubbingPairs:
 class SurfaceFriction(Friction):
     """Friction of pairs of a surface's parts.
 
-    start : (p, 3) where points are if nothing slips [m]
-    pairs : (a, 4) points of each, -1 for none (``RubbingPairs``)
-    slips : (3a, 3p) of moves of all points the slip of each pair
+    start : (p, 3) positions of points without slip [m]
+    pairs : (a, 4) points of each pair, -1 for none (``RubbingPairs``)
+    slips : (3a, 3p) from displacements of all points to the slips of pairs
     """
 
     start: Positions
@@ -65,7 +65,7 @@ class SurfaceFriction(Friction):
         return u, np.linalg.norm(u, axis=1)
 
     def after(self, last: "SurfaceFriction | None", points: Positions) -> "SurfaceFriction":
-        """Return friction of a step from points (p, 3) [m] where ``last`` was that of the step before, if any."""
+        """Return friction that goes on from ``last``, of the last step, at points (p, 3) [m]."""
         return (
             replace(self, begin=self.values_of(last.pairs, last.held(points, self.stick)))
             if last
@@ -73,18 +73,18 @@ class SurfaceFriction(Friction):
         )
 
     def values_of(self, pairs: Indices, values: Rows) -> Rows:
-        """Return of values (k, 3) of other ``pairs`` (k, 4) those of these, (a, 3), 0 where there are none."""
+        """Return (a, ...) the values (k, ...) of ``pairs`` (k, 4) that are pairs here, else 0."""
         known = dict(zip(map(tuple, pairs.tolist()), values, strict=True))
         nothing = np.zeros(values.shape[1:])
         return np.array([known.get(tuple(pair), nothing) for pair in self.pairs.tolist()])
 
     def gradient(self, points: Positions) -> Rows:
-        """Return the gradient (p, 3) [N] at the points."""
+        """Return the gradient (p, 3) [N] at points (p, 3) [m]."""
         gradient: Rows = (self.slips.T @ self.force(points).ravel()).reshape(-1, 3)
         return gradient
 
     def hessian(self, points: Positions, duals: Rows | None = None) -> csr_array:
-        """Return the Hessian (3p, 3p) [N/m] at the points, as ``curvature`` has it of duals (a, 3)."""
+        """Return the Hessian (3p, 3p) [N/m] at points (p, 3), by ``curvature`` with duals (a, 3)."""
         blocks = self.curvature(points, np.eye(3)[None], duals)
         middle = bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
         return csr_array(self.slips.T @ (middle @ self.slips))
@@ -100,7 +100,7 @@ def rubbing_pairs(
     point, edge, face = np.arange(mesh.num_vertices)[:, None], mesh.edges, mesh.faces
     numbers, shares, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]
     for built in found:
-        # each kind in a copy: to go over ``built`` itself ends in a crash now and then (ipctk 1.6)
+        # Each kind is a copy: a loop over ``built`` itself may crash (ipctk 1.6)
         for pairs, *parts in (
             (built.vv_collisions, ("vertex0_id", point), ("vertex1_id", point)),
             (built.ev_collisions, ("vertex_id", point), ("edge_id", edge)),

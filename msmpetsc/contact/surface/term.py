@@ -1,7 +1,8 @@
-"""Self-contact as a term of the energy that a step minimises: the barrier between the surface's parts, and friction.
+"""Contact of surfaces as a term of the energy that a step minimises: barrier and friction.
 
-Rank 0 computes what is of points; ranks send it what their nodes make of S = W q, and get the rows of forces that are
-not zero. The Hessian is never formed on nodes: W^T (H_c (W v)) over the points in contact takes a hundredth of that.
+Rank 0 computes all that concerns points. The other ranks send contributions of their nodes to
+S = W q, and receive the nonzero rows of forces. The Hessian is never formed on nodes:
+W^T (H_c (W v)) over the points in contact takes a hundredth of the time.
 """
 
 from dataclasses import dataclass, replace
@@ -16,14 +17,16 @@ from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
 TINY = np.finfo(float).tiny
-SMALL = 1e-4  # of the barrier's distance: points that move less change the energy by their mean force times that
+# Displacement, over dhat, below which the change of energy is mean force times
+# displacement
+SMALL = 1e-4
 
 
 @dataclass(frozen=True)
 class SurfaceHessian:
-    """W^T H_c W over k points in contact.
+    """Hessian W^T H_c W over k points in contact.
 
-    weights : W (k, owned), by which this rank's nodes carry those points
+    weights : W (k, owned) of this rank's nodes
     points  : H_c (3k, 3k) [N/m], on all ranks
     """
 
@@ -33,7 +36,7 @@ class SurfaceHessian:
 
     @cached_property
     def _carrying(self) -> tuple[Indices, csr_array, csr_array]:
-        """This rank's nodes (c,) that carry points, these points' weights (k, c) and their transpose."""
+        """This rank's nodes (c,) that carry points, their weights (k, c) and the transpose."""
         nodes = np.unique(self.weights.indices)
         weights = csr_array(self.weights[:, nodes])
         return nodes, weights, csr_array(weights.T)
@@ -49,13 +52,13 @@ class SurfaceHessian:
     def split(
         self, compliance: Floats, most: int
     ) -> "tuple[SurfaceHessian | None, SurfaceHessian | None]":
-        """Return the part of the stiff points, of the stiffest so many, and that of the others; None for none.
+        """Return the Hessians of stiff points and of the remaining points; None for no points.
 
-        compliance : (n,) [m/N] of nodes of this rank: a point is stiff that gives way less than they let it
+        compliance : (n,) of this rank's nodes [m/N]; a point stiffer than its nodes is stiff
+        most       : most stiff points, the stiffest of them
         """
-        given = self.comm.allreduce(
-            self.weights.copy().power(2) @ compliance
-        )  # power sorts its matrix
+        # ``power`` sorts its matrix in place
+        given = self.comm.allreduce(self.weights.copy().power(2) @ compliance)
         stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * given
         order = np.argsort(-stiffness, kind="stable")
         stiff = min(most, int((stiffness > 1).sum()))
@@ -71,27 +74,26 @@ class SurfaceHessian:
 
     @cached_property
     def blocks(self) -> Rows:
-        """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
+        """Diagonal blocks (owned, 9) [N/m]."""
         nodes, weights, _ = self._carrying
         points, blocks = self.points.tobsr((3, 3)), np.zeros((self.weights.shape[1], 9))
-        first = np.repeat(
-            np.arange(len(points.indptr) - 1), np.diff(points.indptr)
-        )  # point of each block, and
-        both = weights[first].multiply(
-            weights[points.indices]
-        )  # second: w w' of all nodes that carry the two
+        # First point of each block; then w w' of all nodes that carry both points
+        first = np.repeat(np.arange(len(points.indptr) - 1), np.diff(points.indptr))
+        both = weights[first].multiply(weights[points.indices])
         blocks[nodes] = both.T @ points.data.reshape(-1, 9)
         return blocks
 
 
 class SurfaceContact:
-    """Self-contact in one step. All methods are collective; positions are (owned or more, 3) [m].
+    """Contact of surfaces in one step.
 
-    start    : where the step starts
-    last     : one step before that, of a step of BDF2, whose friction is that of the velocity that it ends with
-    end      : where an earlier solve of the step has ended, with the push there; None: with that of its start
-    before   : contact in the step before
-    rubs     : there is friction
+    All methods are collective. Positions are (owned or more, 3) [m].
+
+    start    : positions at the start of the step
+    last     : positions one step before in a step of BDF2, whose friction goes by the end velocity
+    end      : end of an earlier solve of the step, whose normal forces are taken; None: the start's
+    before   : contact in the last step
+    rubs     : whether there is friction
     friction : of the step, on rank 0
     """
 
@@ -107,9 +109,8 @@ class SurfaceContact:
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
         self.friction: SurfaceFriction | None = None
-        self._hessians: dict[
-            bool, tuple[ContactsAt, Rows | None, SurfaceHessian]
-        ] = {}  # with and without negatives
+        # The last Hessians, projected or not
+        self._hessians: dict[bool, tuple[ContactsAt, Rows | None, SurfaceHessian]] = {}
         if contacts.law.friction > 0:
             moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
             self.rubs = moment.count > 0
@@ -129,10 +130,11 @@ class SurfaceContact:
         time_step: float,
         extrapolates: bool,
     ) -> SurfaceFriction | None:
-        """Return friction with the push of a moment, on rank 0.
+        """Return friction with the normal forces of a moment, on rank 0.
 
-        points, came : where points (p, 3) are when the step begins [m], and how far they came in the one before, of a
-            step of BDF2, which ``extrapolates`` the push
+        points       : (p, 3) at the start of the step [m]
+        came         : (p, 3) displacements in the last step, of a step of BDF2 [m]
+        extrapolates : extrapolate the normal forces, in a step of BDF2
         """
         contacts, barrier, stick = (
             self.contacts,
@@ -153,7 +155,7 @@ class SurfaceContact:
         return replace(friction, limit=np.clip(2 * friction.limit - before, 0, 2 * friction.limit))
 
     def friction_limits(self, q: Positions) -> Floats:
-        """Return the sums (2,) of mu N [N] that friction goes by, and with the push at q, on rank 0."""
+        """Return the sum of mu N [N] that friction takes, and the sum at q, (2,), on rank 0."""
         moment, barrier = self.contacts.find(q), self.contacts.barrier
         if self.contacts.law.friction == 0 or not barrier:
             return np.zeros(2)
@@ -161,18 +163,22 @@ class SurfaceContact:
         return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
 
     def _acting(self, q: Positions, base: Positions | None = None) -> ContactsAt | None:
-        """Return the contacts at q, on a way from base, with the points for friction; None where nothing acts."""
+        """Return the contacts at q, with points for friction; None if nothing acts.
+
+        base : start of a way to q
+        """
         moment = self.contacts.find(q, with_points=self.rubs, base=base)
         return moment if moment.count or self.rubs else None
 
     def presses(self, q: Positions) -> bool:
-        """Return whether it acts at q."""
+        """Return whether contact acts at q."""
         return self._acting(q) is not None
 
     def change(self, q: Positions, base: Positions) -> float:
-        """Return this rank's part of the energy at q less that at base, friction included [J].
+        """Return this rank's part of the energy at q minus that at base, with friction [J].
 
-        Of a small move it is the mean of the forces at both times that: a difference of energies would lose its digits.
+        Over a small displacement it is the displacement times the mean force, since a difference
+        of energies would lose its digits.
         """
         before, after = self._acting(base), self._acting(q, base)
         if after is None and before is None:
@@ -188,17 +194,18 @@ class SurfaceContact:
         return rubbed + self._energy(after) - self._energy(before)
 
     def _is_small(self, q: Positions, base: Positions) -> bool:
-        """Return whether no point goes far from base to q, for a difference of energies to keep its digits."""
+        """Return whether points move too little from base to q for a difference of energies."""
         points, time = self.contacts.points_at, self.contacts.time
         gone = np.abs(points(q, time) - points(base, time)).max(initial=0.0)
         return bool(self.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
     def _energy(self, moment: ContactsAt | None) -> float:
+        """Return the energy [J] of the barrier on rank 0, else 0."""
         barrier = self.contacts.barrier
         return barrier.energy(moment.contacts, moment.points) if barrier and moment else 0.0
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
+        """Add the gradient [N] at q to ``gradient`` (owned or more, 3)."""
         moment = self._acting(q)
         if moment is not None:
             self._add_to_nodes(self._gradient(moment), gradient)
@@ -212,9 +219,11 @@ class SurfaceContact:
         gradient[: weights.shape[1]] += weights.T @ forces
 
     def add_change_of_gradient(self, q: Positions, way: Rows, gradient: Rows) -> None:
-        """Add the first-order change of its gradient [N] at q when obstacles' points move by ``way`` (o, 3) [m].
+        """Add the first-order change of the gradient [N] at q as obstacles move.
 
-        The Hessian is that without the negative part of each pair.
+        The Hessian is projected pair by pair.
+
+        way : (o, 3) displacements of the obstacles' points [m]
         """
         moment = self._acting(q)
         if moment is None:
@@ -227,11 +236,12 @@ class SurfaceContact:
         )
 
     def _gradient(self, moment: ContactsAt) -> Rows:
-        """Return the gradient (total, 3) [N] on rank 0, friction included; (0, 3) on the others."""
+        """Return the gradient (total, 3) [N] with friction on rank 0; (0, 3) elsewhere."""
         rubs = self.friction.gradient(moment.points) if self.friction else 0.0
         return self._pushes(moment) + rubs
 
     def _pushes(self, moment: ContactsAt) -> Rows:
+        """Return the gradient (total, 3) [N] of the barrier on rank 0; (0, 3) elsewhere."""
         barrier = self.contacts.barrier
         return (
             barrier.gradient(moment.contacts, moment.points)
@@ -240,11 +250,11 @@ class SurfaceContact:
         )
 
     def of_obstacles(self, q: Positions, frame: Floats | float = 0.0) -> tuple[Rows, float]:
-        """Return the pushes of obstacles (k, 3) [N] on the bodies, and their work [J] in the step that ends at q.
+        """Return obstacles' forces (k, 3) [N] on the bodies, and their work [J] in the step to q.
 
-        The push of the step's end does the work: where the energy is convex, the step adds no more to it.
+        The force at the end of the step does the work, an upper bound for a convex energy.
 
-        frame : (3,) how far the frame goes [m] in which the work is counted
+        frame : (3,) displacement of the frame [m] in which the work is counted
         """
         moment = self._acting(q)
         points, obstacles = self.contacts.points, self.contacts.obstacles
@@ -258,14 +268,17 @@ class SurfaceContact:
         return found
 
     def released(self, q: Positions) -> float:
-        """Return how much less energy [J] elastic slips store at q than where the step begins, on rank 0."""
+        """Return the energy [J] of elastic slips at the start minus that at q, on rank 0."""
         moment = self._acting(q)
         if self.friction is None or moment is None:
             return 0.0
         return self.friction.released(moment.points)
 
     def duals_after(self, q: Positions, base: Positions, duals: Rows | None) -> Rows | None:
-        """Return friction's duals (a, 3) that the full step from base to q leads to; None: its own forces."""
+        """Return friction's duals (a, 3) after the full step from base to q.
+
+        None for its own forces.
+        """
         after, before = self._acting(q), self._acting(base)
         if self.friction and after and before:
             duals = self.friction.duals_after(after.points, before.points, duals)
@@ -275,9 +288,9 @@ class SurfaceContact:
     def hessian(
         self, q: Positions, projected: bool, duals: Rows | None = None
     ) -> SurfaceHessian | None:
-        """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts.
+        """Return the Hessian at q, projected pair by pair or not; None if nothing acts.
 
-        duals : (a, 3) of friction; None: its true Hessian
+        duals : (a, 3) of friction; None for its true Hessian
         """
         moment = self._acting(q)
         if moment is None:
@@ -294,10 +307,10 @@ class SurfaceContact:
         return known[2]
 
     def concavity(self, q: Positions) -> Floats:
-        """Return c (owned,) [N/m]: the Hessian's negative part is no more than a diagonal of c on the nodes.
+        """Return a diagonal (owned,) [N/m] that bounds the Hessian's negative part on nodes.
 
-        With r the row sums of it on the points it is no more there than a diagonal of r, and (sum w
-        v)^2 is no more than sum |w| times sum |w| v^2.
+        The diagonal of row sums r bounds the negative part on points. The bound on nodes follows
+        from (sum w v)^2 <= (sum |w|) (sum |w| v^2).
         """
         moment = self._acting(q)
         if moment is None:
@@ -309,8 +322,10 @@ class SurfaceContact:
         return bound
 
     def _negative_part(self, moment: ContactsAt) -> tuple[Indices, Floats] | None:
-        """Return on rank 0 the points (k,) whose Hessian has a negative part, and its row sums (k,)
-        [N/m]."""
+        """Return points (k,) with a negative part of the Hessian and its row sums (k,) [N/m].
+
+        Return None on ranks but 0.
+        """
         whole, kept = (self._whole_hessian(moment, projected, None) for projected in (False, True))
         if whole is None or kept is None:
             return None
@@ -322,7 +337,7 @@ class SurfaceContact:
     def _curvature(
         self, moment: ContactsAt, projected: bool, duals: Rows | None
     ) -> tuple[Indices, csr_array] | None:
-        """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
+        """Return the points (k,) in contact and their Hessian (3k, 3k) [N/m], on rank 0."""
         whole = self._whole_hessian(moment, projected, duals)
         if whole is None:
             return None
@@ -334,7 +349,7 @@ class SurfaceContact:
     def _whole_hessian(
         self, moment: ContactsAt, projected: bool, duals: Rows | None
     ) -> csr_array | None:
-        """Return on rank 0 the Hessian (3 total, 3 total) [N/m] of all points, obstacles' among them."""
+        """Return the Hessian (3 total, 3 total) [N/m] of all points on rank 0, else None."""
         barrier = self.contacts.barrier
         if barrier is None:
             return None
@@ -344,7 +359,10 @@ class SurfaceContact:
         return csr_array(sum(parts)) if parts else csr_array((moment.points.size,) * 2)
 
     def bound(self, q: Positions) -> Floats:
-        """Return (owned,) [N/m] no less than each block of the projected Hessian: powers of 4, which change seldom."""
+        """Return bounds (owned,) [N/m] of the blocks of the projected Hessian.
+
+        They are powers of 4, which seldom change.
+        """
         hessian = self.hessian(q, True)
         if hessian is None:
             return np.zeros(self.contacts.owned)

@@ -37,8 +37,8 @@ class Jacobian:
     owned    : takes the objects to destroy, in the order of their creation
     diagonal : (m,) inertia plus t^2 times the stiffness at rest of this rank's free nodes [kg]
 
-    Raises InputError if A is too large for PETSc, if its type does not go with the arrays, or if
-    multigrid is asked of A (collective).
+    Raises InputError if A is too large for PETSc or of a type that does not go with the arrays.
+    The same holds if multigrid is asked of A (collective).
     """
 
     functional: StepFunctional

@@ -179,6 +179,16 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
     assert max(loose) > 0.1 and sorted(set(tight)) == [error_control.CLOSEST * rtol, rtol]
 
 
+def test_linear_solves_of_a_long_step_gain_digits():
+    """Loose solves may open and close a stiff gap for ever: two_bunnies took no end of its step."""
+    stepper = Stepper(COMM, beam(), T, find_preset("newton"), error=1e-3)
+    far = error_control.Outcome(goal=1e-3, bound=1e3, distance=1.0)
+    rtols = [stepper.control.tolerances(far, its)[0] for its in (0, 49, 50, 100, 1000)]
+    stepper.destroy()
+    assert rtols[0] == rtols[1]
+    np.testing.assert_allclose(np.array(rtols[2:]) / rtols[0], [0.1, 0.01, 1e-3])
+
+
 def test_a_short_solve_does_not_forget_the_least_eigenvalue_of_a_long_one():
     """A step said 0.004 of its error of 0.02 where 91 iterations had come to 5e-4, and the next
     five to 0.38."""

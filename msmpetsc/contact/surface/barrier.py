@@ -167,13 +167,12 @@ class Barrier:
         return sorted(found)
 
     def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> PairSets:
-        """Return the pairs that may be closer than dhat while points move, and all pairs of
-        creases.
+        """Return the pairs that may come closer than dhat, and all pairs of creases.
 
         Each point x may move by ``reach`` [m], from its place or from its straight way ``moved``.
         The linear part of the ways, m = c + G x + r, would enlarge the boxes around them. If a pair
-        is closer than d on its way, then |x - x' + t (r - r')| is below d + |G| |x - x'|. Hence
-        |x - x'| is below (d + 2 max |r|) / (1 - |G|), and boxes around r suffice.
+        is closer than d on its way, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
+        ``|x - x'| < (d + 2 max |r|) / (1 - |G|)``, and boxes around r suffice.
 
         points : (p, 3) [m]
         moved  : (p, 3) [m]; None if points stay

@@ -84,7 +84,7 @@ class SurfaceFriction(Friction):
         return gradient
 
     def hessian(self, points: Positions, duals: Rows | None = None) -> csr_array:
-        """Return the Hessian (3p, 3p) [N/m] at points (p, 3), by ``curvature`` with duals (a, 3)."""
+        """Return the Hessian (3p, 3p) [N/m] at points (p, 3), with ``curvature`` of duals."""
         blocks = self.curvature(points, np.eye(3)[None], duals)
         middle = bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
         return csr_array(self.slips.T @ (middle @ self.slips))

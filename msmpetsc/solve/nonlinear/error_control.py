@@ -39,6 +39,9 @@ LEAST_RATIO = 10.0
 EARLY = 2.0
 # Greatest ksp_rtol
 LOOSEST = 0.3
+# Iterations of a step after which its linear solves gain a digit. Loose solves may open
+# and close a stiff gap for ever
+LONG = 50
 # Share of the acceptable error that the linear solve may leave
 SHARE = 0.5
 # Ratio of |F|_(P^-1) to the residual of the linear solve up to which g counts as
@@ -288,23 +291,23 @@ class ErrorControl:
             self.error_per_residual = solved / residual
         return solved
 
-    def tolerances(self, now: Outcome) -> tuple[float, float]:
-        """Return ksp_rtol and ksp_atol of the next linear solve.
+    def tolerances(self, now: Outcome, its: int = 0) -> tuple[float, float]:
+        """Return ksp_rtol and ksp_atol of the linear solve after ``its`` iterations of a step.
 
-        it gains the missing digits and no more.
+        The solve gains the digits that the step lacks, and no more.
         """
         missing = now.bound / self.ratio
         is_last = missing <= FINAL * now.goal
-        rtol = CLOSEST * self.tightest if is_last else self.tightest
+        tightest = self.tightest * max(0.1 ** (its // LONG), CLOSEST)
+        rtol = CLOSEST * self.tightest if is_last else tightest
         if self._trusts_natural_norm(now):
             return rtol, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
         if is_last and self.error_per_residual and not self.estimate.preconditioner.is_uniform:
             return rtol, SHARE * now.goal * now.distance / self.error_per_residual
-        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST), NO_ATOL
+        return min(max(SHARE * now.goal / missing, tightest), LOOSEST), NO_ATOL
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
-        """Return the outcome from which a step goes on after a doubt; None if nothing is to be
-        gained.
+        """Return the outcome from which a step goes on after a doubt; None without any gain.
 
         The goal stays after a saddle. Otherwise the goal becomes closer until g has no digits left:
         a second correction has shown that g is not quadratic, so an error bound of the same size

@@ -77,10 +77,10 @@ class StepMethod(ABC):
             return int(REASON.DIVERGED_MAX_IT)
         return int(REASON.ITERATING)
 
-    def adapt(self, outcome: Outcome) -> None:
-        """Set the tolerances of the next linear solve by the step's error, if the user does not."""
+    def adapt(self, outcome: Outcome, its: int = 0) -> None:
+        """Set the tolerances of the linear solve after ``its`` iterations, if the user does not."""
         if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
-            rtol, atol = self.control.tolerances(outcome)
+            rtol, atol = self.control.tolerances(outcome, its)
             self.ksp.setTolerances(
                 rtol=rtol, atol=None if self.options.is_given("ksp_atol") else atol
             )

@@ -90,7 +90,7 @@ class Newton(StepMethod):
         projected, asks, its = self.preset.projected, False, 0
         while not (reason := self._reason(snes, its, now, outcome)):
             self._linearise(now, outcome, projected > 0)
-            if not self._solve(now, outcome):
+            if not self._solve(now, outcome, its):
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break
             outcome = self._after_solve(outcome, self._limit(now) or projected > 0)
@@ -142,9 +142,9 @@ class Newton(StepMethod):
                 self.control.estimate.correction.copy(self.y)
             self.ksp.setInitialGuessNonzero(known)
 
-    def _solve(self, now: Iterate, outcome: Outcome) -> bool:
+    def _solve(self, now: Iterate, outcome: Outcome, its: int) -> bool:
         """Solve H y = F; return whether y is usable."""
-        self.adapt(outcome)
+        self.adapt(outcome, its)
         rtol = self.ksp.getTolerances()[0]
         if not self.options.is_given("ksp_max_it"):
             most = self.jacobian.preconditioner.most_iterations(rtol)

@@ -192,7 +192,14 @@ def slope_gradient(e: Strains, m: float, lame: float, h4: float) -> Nine:
 
 @njit(inline="always")
 def slope_product(e: Strains, m: float, state: Floats, s: int) -> Nine:
-    """Return the derivative (9,) of ``slope_gradient`` along the strains of a displacement."""
+    """Return the product of the Hessian of E with a displacement (9,), by the mean slope.
+
+    It is the derivative of ``slope_gradient``, in terms of 4 h times the mean slope.
+
+    e        : strains of the displacement
+    m        : V mu / (16 h^2)
+    state, s : entries of ``write_state``, from index s on
+    """
     f, g = kept_gradient(state, s), _slope_of(e)
     n = cofactors(f)
     along = state[s + 80] * _inner(n, g)

@@ -70,10 +70,15 @@ def usual_speed(span: float) -> float:
 
 
 def playback_of(times: Floats, speed: float | None = None) -> Playback:
-    """Return the playback of frames at times (k,) [s], each picture with the nearest frame.
+    """Return which frame each picture shows, and the speed of the film.
 
-    Without a speed the film lasts 3 to 8 s. Raises InputError if a speed is given and the times do
-    not increase.
+    Pictures are at equal intervals and show the nearest frame. A single frame, or frames whose
+    times do not increase, are shown in turn, 10 pictures a second.
+
+    times : (k,) of the frames [s]
+    speed : simulated seconds per second; None for a round speed by which the film lasts 3 to 8 s
+
+    Raises InputError for a speed of frames that are shown in turn.
     """
     steps = np.diff(times)
     if len(times) == 1 or not (steps > 0).all():

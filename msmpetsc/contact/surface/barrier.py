@@ -197,7 +197,7 @@ class Barrier:
     def cushioned(self, distance: float) -> Iterator[None]:
         """Let obstacles also push bodies from a larger ``distance`` [m].
 
-        older candidates lack its pairs.
+        Candidates found before lack the pairs of this distance.
         """
         self.distances.append(distance)
         self.potentials.append(self._potential(distance))
@@ -319,9 +319,9 @@ class Barrier:
         return pairs.numbers, self.law.friction * pairs.push
 
     def _rubbing(self, contacts: ContactSets, points: Positions) -> RubbingPairs:
-        """Return friction's pairs at points (p, 3) [m].
+        """Return the pairs with friction at points (p, 3) [m].
 
-        a step begins with the last step's pairs.
+        A step begins with the pairs that the last step ended with.
         """
         if self.rubbed is None or not np.array_equal(self.rubbed[0], points):
             found = []

@@ -68,7 +68,7 @@ class ObstacleSurfaces:
     def way(self, begin: float, end: float) -> Rows:
         """Return displacements (o, 3) [m] of the points between two times [s].
 
-        (1, 3) zeros if at rest.
+        Return zeros (1, 3) if all are at rest.
         """
         return (
             self.points_at(end) - self.points_at(begin)

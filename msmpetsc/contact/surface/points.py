@@ -55,9 +55,9 @@ class SurfacePoints:
         return points
 
     def moved(self, v: Rows) -> Rows:
-        """Return W v (total, 3) of v (owned or more, 3), 0 for obstacles, on rank 0.
+        """Return W v (total, 3) of v (owned or more, 3) on rank 0, (0, 3) elsewhere.
 
-        else (0, 3).
+        Rows of obstacles are 0.
         """
         points: Rows = self.sums @ self.to_root.send(self.weights @ v[: self.weights.shape[1]])
         return points

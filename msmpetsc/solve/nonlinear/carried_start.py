@@ -91,7 +91,7 @@ class CarriedStart:
     def _moved_with_obstacles(self, contacts: Contacts, moved: Rows) -> Rows:
         """Return displacements (l, 3) [m] of nodes.
 
-        of obstacles that they touch, else ``moved``.
+        Nodes go with the obstacles that they touch, other nodes by ``moved``.
         """
         functional, q = self.functional, self.functional.problem.q
         owned = contacts.points.distances(q, contacts.begin) - contacts.law.distance

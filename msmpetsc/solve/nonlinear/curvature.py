@@ -56,10 +56,7 @@ Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
 
 
 class Alarm(IntEnum):
-    """Place where a solve has met a negative curvature.
-
-    at an earlier iterate or at the last one.
-    """
+    """Place of a negative curvature that a solve has met, if any."""
 
     NOWHERE = 0
     ON_THE_WAY = 1

@@ -157,9 +157,9 @@ class ErrorControl:
     error_per_residual: float = 0.0
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
-        """Return the outcome at an iterate.
+        """Return the outcome at an iterate, with its error.
 
-        its error, or the bound while the bound is far above the goal.
+        The error is the upper bound while the bound is far above the goal.
         """
         residual, distance = (
             self.functional.dual_norm(iterate.f),

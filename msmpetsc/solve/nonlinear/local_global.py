@@ -88,7 +88,10 @@ class LocalGlobal(StepMethod):
         return -1.0 if self.outcome.is_flat and distance > 0 else change
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Shorten y if the surface crosses itself from x to x - y; return whether y changed."""
+        """Shorten y so that the surface crosses nothing on the way from x to x - y.
+
+        Return whether y changed (SNESLineSearchPreCheck).
+        """
         if self.functional.surface is None:
             return False
         end = self.functional.vectors.take()

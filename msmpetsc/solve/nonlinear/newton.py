@@ -126,7 +126,12 @@ class Newton(StepMethod):
         )
 
     def _linearise(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
-        """Linearise H at an iterate; CG starts with the correction of an estimate there."""
+        """Linearise F at an iterate, and set the initial guess of CG.
+
+        If the error estimate there has found a correction, its H and the correction are reused.
+
+        projected : use H without its negative parts, which are not those of the estimate
+        """
         known = outcome.corrected and not projected
         with LOCAL:
             self.jacobian.linearise(
@@ -182,9 +187,9 @@ class Newton(StepMethod):
         return None
 
     def _limit(self, now: Iterate) -> bool:
-        """Shorten or bend y if it enters obstacles or causes a crossing.
+        """Shorten or bend y if the way to x - y enters obstacles or causes a crossing.
 
-        return whether y changed.
+        Return whether y changed.
         """
         if self.functional.problem.contact is None:
             return False

@@ -208,9 +208,9 @@ class LatticePreconditioner:
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """Return the Hessian of obstacles (owned, 9) at q, with friction's secant.
+        """Return the Hessian (owned, 9) of obstacles at q, with the secant of friction.
 
-        (0, 9) without.
+        Return (0, 9) without contact.
         """
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)

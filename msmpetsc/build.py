@@ -21,7 +21,8 @@ from msmpetsc.contact.surface.collision_surface import collision_surface
 from msmpetsc.contact.surface.pairs import CollisionSurface
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
-from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill, warn_of_thin_bodies
+from msmpetsc.geometry.cages import BodySurface, Cages, fill
+from msmpetsc.geometry.cell_size import choose_cell_size, warn_of_thin_bodies
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.prepare import prepare

@@ -17,10 +17,11 @@ from msmpetsc.cli.commands.inspect import BYTES, MOST_BUILT
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.lattice.partition import Partition, count_partition
+from msmpetsc.lattice.partition_counts import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.linear.ghosts import Ghosted
 from msmpetsc.solve.linear.operators import assemble, assembly_bytes
-from msmpetsc.solve.linear.unknowns import Ghosted, Unknowns
+from msmpetsc.solve.linear.unknowns import Unknowns
 
 WORKER = WORKERS / "shares_worker.py"
 SELF = MPI.COMM_SELF

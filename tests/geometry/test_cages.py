@@ -22,16 +22,8 @@ from hypothesis.extra.numpy import arrays
 from surfaces import body_of, surface_of
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import (
-    BOUNDARY,
-    INTERIOR,
-    BodySurface,
-    Cages,
-    choose_cell_size,
-    estimated_cells,
-    fill,
-    warn_of_thin_bodies,
-)
+from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, fill
+from msmpetsc.geometry.cell_size import choose_cell_size, estimated_cells, warn_of_thin_bodies
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface

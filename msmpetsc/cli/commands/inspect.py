@@ -19,17 +19,16 @@ from msmpetsc.backend.machine import peak_memory
 from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import (
-    BodySurface,
+from msmpetsc.geometry.cages import BodySurface, fill
+from msmpetsc.geometry.cell_size import (
     choose_cell_size,
     estimated_cells,
     estimated_size,
-    fill,
     warn_of_thin_bodies,
 )
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.lattice.lattice import topology_of
-from msmpetsc.lattice.partition import Partition, count_partition
+from msmpetsc.lattice.partition_counts import Partition, count_partition
 from msmpetsc.lattice.region import listed
 from msmpetsc.scene.body import CagesTable
 from msmpetsc.scene.reading import Scene, load_scene

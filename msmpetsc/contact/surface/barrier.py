@@ -21,12 +21,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.surface.creases import creases, neighbours
 from msmpetsc.contact.surface.places import PairSet, Places, without_fading_links
 from msmpetsc.contact.surface.surface_friction import RubbingPairs, SurfaceFriction, rubbing_pairs
 from msmpetsc.geometry.surface import Surface
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.scene.obstacles import SelfContactTable
 
 if TYPE_CHECKING:
     import ipctk
@@ -36,6 +40,8 @@ if TYPE_CHECKING:
 PairSets: TypeAlias = tuple[PairSet, ...]
 ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"
 
+# Young's modulus over k_1 / h (lattice.material)
+PER_EDGE = 7 / 4
 # Share of the way to a crossing that a step takes
 KEPT = 0.9
 # Edges that points move in a piece of a long way
@@ -61,6 +67,31 @@ class BarrierLaw:
     stiffness: float
     friction: float
     stick: float
+
+    @classmethod
+    def of_lattice(
+        cls,
+        distance: float,
+        table: SelfContactTable,
+        lattice: Lattice,
+        time_step: float,
+        side: float,
+    ) -> "BarrierLaw":
+        """Return the law of a lattice in steps of ``time_step`` [s] (collective).
+
+        kappa / dhat^2 is a stiffness per area: that of a layer of full cells, E / h, plus the share
+        of its inertia in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive
+        dynamic stiffness) takes both of each contact. Here both are of the stiffest cell, so that
+        the energy of a state never changes.
+
+        distance : dhat [m]
+        side     : longest side of the smallest body [m]
+        """
+        comm, h = lattice.table.comm, lattice.cell_size
+        mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
+        layer = (PER_EDGE * lattice.stiffest(comm) + mass / time_step**2) / h**2
+        stick = table.friction_speed or STICK * side
+        return cls(distance, float(distance**2 * layer), table.friction, stick)
 
 
 class Barrier:
@@ -362,7 +393,7 @@ class Barrier:
         return min(least, default=self.law.distance)
 
     def free_share(self, start: Positions, moved: Rows, sets: PairSets) -> float:
-        """Return the free share of the straight ways from start (p, 3) by ``moved`` (p, 3) [m].
+        """Return the free share, by CCD, of the ways from start (p, 3) by ``moved`` (p, 3) [m].
 
         sets : candidate pairs of the ways
         """

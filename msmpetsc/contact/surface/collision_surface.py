@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.obstacles.friction import STICK, smallest
+from msmpetsc.contact.obstacles.friction import smallest
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.creases import NEAREST
@@ -40,8 +40,6 @@ LONG = 2.0
 FEWEST = 20
 # Speed of the decimation; its default, 7, leaves two to four times the distance
 HASTE = 4
-# Young's modulus over k_1 / h (lattice.material)
-PER_EDGE = 7 / 4
 
 
 def collision_surface(
@@ -78,14 +76,8 @@ def collision_surface(
     distance = table.distance or max(
         least, off, _gap(comm, joint, widest, bodies_end, meets_itself)
     )
-    # kappa / dhat^2 is a stiffness per area: that of a layer of full cells, E / h, plus
-    # the share of its inertia in a step, rho h / t^2. Ando (2024, A cubic barrier with
-    # elasticity-inclusive dynamic stiffness) takes both of each contact. Here both are
-    # of the stiffest cell, so that the energy of a state never changes.
-    mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
-    layer = (PER_EDGE * lattice.stiffest(comm) + mass / scene.time.step**2) / lattice.cell_size**2
-    stick = table.friction_speed or STICK * smallest(np.array([body.bounds for body in bodies]))
-    law = BarrierLaw(distance, float(distance**2 * layer), table.friction, stick)
+    side = smallest(np.array([body.bounds for body in bodies]))
+    law = BarrierLaw.of_lattice(distance, table, lattice, scene.time.step, side)
     carried = SurfacePoints(comm, lattice, embedding, met)
     names = [f"body.{number}" if len(bodies) > 1 else "the body" for number in range(len(bodies))]
     names += [f"obstacle.{number}" for number in met.numbers]

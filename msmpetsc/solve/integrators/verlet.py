@@ -38,7 +38,7 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators.integrator import Integrator, State
-from msmpetsc.solve.linear.unknowns import Ghosted
+from msmpetsc.solve.linear.ghosts import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 

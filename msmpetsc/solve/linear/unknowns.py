@@ -149,30 +149,6 @@ class VectorPool:
             vector.destroy()
 
 
-class Ghosted:
-    """Nodal values (l, 3), first owned nodes, then ghosts, shared with two PETSc vectors."""
-
-    def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        refuse_unknowns(lattice.table.total)
-        self.values, memory = np.zeros_like(lattice.nodes), memory_of(lattice.nodes)
-        numbers = self.values.reshape(-1)
-        self.owned = memory.over(numbers[: 3 * lattice.owned], comm)
-        self.ghosts = memory.over(numbers[3 * lattice.owned :], PETSc.COMM_SELF)
-        index = PETSc.IS().createBlock(3, lattice.ghosts.astype(PETSc.IntType), comm=comm)
-        self.scatter = PETSc.Scatter().create(self.owned, index, self.ghosts, None)
-        index.destroy()
-
-    def update(self) -> None:
-        """Update the ghosts with their owners' values (collective)."""
-        with GHOSTS:
-            self.scatter.scatter(self.owned, self.ghosts)
-
-    def destroy(self) -> None:
-        """Destroy all PETSc objects (collective)."""
-        for owner in (self.scatter, self.owned, self.ghosts):
-            owner.destroy()
-
-
 def refuse_unknowns(nodes: int) -> None:
     """Raise InputError if PETSc cannot number the three coordinates of so many nodes."""
     if 3 * nodes > LARGEST:

@@ -8,7 +8,7 @@ CG with the true Hessian has a positive definite preconditioner. The finest leve
 by spring or cell by cell in single precision, with a block diagonal D in its smoother. The first
 coarse matrix is summed in the same way (solve.multigrid.galerkin). PETSc computes the coarser
 matrices as products P^T H P. All levels but the coarsest multiply in single precision
-(solve.multigrid.coarse_operator).
+(solve.multigrid.coarse_products).
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
+from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
 from msmpetsc.solve.multigrid.contact import CoarseContact, ContactSmoother
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import GalerkinSum, set_block_size

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hierarchies import COMM, LATTICES, SHAPES, Case, build, heavier, hierarchy
 
-from msmpetsc.solve.multigrid.coarse_operator import CoarseOperator
+from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
 
 CASES = {  # lattice, shape, contact, more
     "pinned": ("block", "twisted", False, {"pins": True}),

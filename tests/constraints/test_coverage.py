@@ -86,7 +86,7 @@ def test_a_force_on_no_free_node_is_refused(tmp_path, tables):
     ids=["partly pinned", "let go before it ends", "switched off"],
 )
 def test_a_force_that_finds_a_free_node_is_not(tmp_path, heard, tables, held):
-    words = build(tmp_path, **tables).taken[-1]
+    words = build(tmp_path, **tables).node_counts[-1]
     assert (
         words.startswith("force.0 pulls ")
         and (f"({held} of them held)" in words) == bool(held)

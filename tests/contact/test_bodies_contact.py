@@ -201,7 +201,7 @@ def test_the_best_guess_is_taken_though_not_all_are_weighed(
 
     def checked(self: FirstGuess, guesses: list[np.ndarray], without: list[float]) -> int:
         number = least(self, guesses, without)
-        values = [self.functional.value(self.held(guess), True) for guess in guesses]
+        values = [self.functional.value(self.with_fixed(guess), True) for guess in guesses]
         chosen.append((number, int(np.argmin(values)), int(np.argmin(without))))
         return number
 

@@ -81,7 +81,7 @@ def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
     region = "region = { half_space = { point = [0, 0, 1e-6], normal = [0, 0, -1] } }"
     path = CASES / "bunny_grazing_pin.toml"
     pinned = build(path).lattice.pinned.sum()
-    (words,) = build(path, "pin=[]", f"{kind}=[{{ {region}, {more} }}]").taken
+    (words,) = build(path, "pin=[]", f"{kind}=[{{ {region}, {more} }}]").node_counts
     assert f" {pinned} nodes" in words and pinned < 30
 
 

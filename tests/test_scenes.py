@@ -214,6 +214,7 @@ def error_of_lobes(run: Result) -> float:
     )
 
 
+@pytest.mark.slow
 def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trachea(result):
     run = result("lung_press")
     plate = run.scene.obstacle[1]

@@ -141,8 +141,12 @@ def positions(frames: list[Frame]) -> np.ndarray:
     return np.array([frame.position for frame in frames])
 
 
+# cases whose kernels take a minute to compile or run in the pretended GPU
+LONG = {"solid": pytest.mark.slow, "solid, static": pytest.mark.slow}
+
+
 @on_a_gpu
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=LONG.get(case, ())) for case in CASES])
 def test_frames_are_those_of_the_cpu(tmp_path: Path, case: str, on_gpu):
     path = block_scene(tmp_path, **CASES[case])
     here = play(path)

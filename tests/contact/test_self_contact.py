@@ -323,6 +323,7 @@ def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
     return np.diff(along)[50:] / 0.01, frames[51:]
 
 
+@pytest.mark.slow
 def test_a_block_holds_on_a_tilted_one(tmp_path):
     """It gives way once in the 20 steps for which that is remembered, as far as it would in each,
     were it not."""
@@ -365,6 +366,7 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
     )  # in the plane of contact
 
 
+@pytest.mark.slow
 def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Path, caplog):
     """What bulges between passes: the upper one sinks further. Split as finely as the cells they
     touch all over."""

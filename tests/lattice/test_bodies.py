@@ -212,7 +212,8 @@ def test_coarse_cells_join_no_bodies_until_they_are_as_large():
 
 def test_more_cells_than_can_be_numbered_are_refused():
     with pytest.raises(
-        InputError, match="too small to number the cells of 40000 bodies: at most 13 along a side"
+        InputError,
+        match="too small to number the cells of 40000 bodies: use at most 13 cells along a side",
     ):
         grids(*[(20, 20, 20)] * 40_000)
     assert grids(*[(13, 13, 13)] * 40_000).room * 40_000 <= LIMIT

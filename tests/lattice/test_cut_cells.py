@@ -66,6 +66,7 @@ def test_every_node_has_the_mass_that_its_springs_diagonal_says():
 # ---- against elasticity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BARS)
 def test_bars_across_the_grid_sag_as_timoshenkos(name: str):
     """A fifth of what whole cells are off, whose mass is a third too large; nearly as beams along

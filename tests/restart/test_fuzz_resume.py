@@ -71,6 +71,7 @@ edit = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(TRIALS, max_examples=40)
 @given(edits=st.lists(edit, min_size=1, max_size=2))
 @example(edits=[("attribute", "petsc_options", "-pc_type 'x")])  # what no shell would take apart

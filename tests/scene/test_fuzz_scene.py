@@ -106,7 +106,7 @@ def test_a_study_chooses_solvers_and_no_more(folder, options):
     if options == "evil.py":
         load_study(folder / "study.toml")  # a value of no option: nothing PETSc would load
     else:
-        assert "only options of solvers" in refusal(lambda: load_study(folder / "study.toml"))
+        assert "only solver options" in refusal(lambda: load_study(folder / "study.toml"))
 
 
 def test_a_study_names_no_mesh_outside(folder):

@@ -112,6 +112,7 @@ LANDING = {  # it falls by 5 mm, lands at 0.5 m/s, and slides under a force that
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [3e-2, pytest.param(1e-2, marks=pytest.mark.slow)])
 def test_the_error_reached_where_a_penalty_pushes_is_the_error_asked(tmp_path: Path, error: float):
     """Within a factor of three; without what pushes add to the estimate it is 4 and 7 times what

@@ -12,8 +12,8 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.holders import Holders, Regions, clamped, taken
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, shares_by_mass, total_of
+from msmpetsc.contact.friction import smallest
 from msmpetsc.contact.obstacles.distance import DistanceSolid
-from msmpetsc.contact.obstacles.friction import smallest
 from msmpetsc.contact.obstacles.moving_solid import Obstacle, build_obstacles
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
@@ -24,7 +24,7 @@ from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import BodySurface, Cages, fill
 from msmpetsc.geometry.cell_size import choose_cell_size, warn_of_thin_bodies
 from msmpetsc.geometry.embedding import embed
-from msmpetsc.geometry.grid import encode_morton
+from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import (

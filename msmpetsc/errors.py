@@ -4,6 +4,9 @@ import difflib
 from collections.abc import Iterable
 from errno import EDQUOT, EFBIG, ENOSPC
 
+# exit statuses of the command line; a run that a signal stops has that of app.signals
+STATUS_BUG, STATUS_REFUSED, STATUS_FAILED, STATUS_INTERRUPTED = 1, 2, 3, 130
+
 
 class MsmpetscError(Exception):
     """Base class of all expected errors.
@@ -12,14 +15,14 @@ class MsmpetscError(Exception):
     on_all_ranks : whether every rank is known to raise this error
     """
 
-    exit_status = 1
+    exit_status = STATUS_BUG
     on_all_ranks = False
 
 
 class InputError(MsmpetscError):
     """A scene, mesh, option or file that cannot be used."""
 
-    exit_status = 2
+    exit_status = STATUS_REFUSED
 
 
 class StepFailed(MsmpetscError):
@@ -30,7 +33,7 @@ class StepFailed(MsmpetscError):
     frame : number of the step; None until it is known
     """
 
-    exit_status = 3
+    exit_status = STATUS_FAILED
 
     def __init__(self, message: str, kind: str = "iterations", frame: int | None = None):
         super().__init__(message)

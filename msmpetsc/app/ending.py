@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from msmpetsc.errors import as_expected
+from msmpetsc.errors import STATUS_BUG, STATUS_INTERRUPTED, as_expected
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 # longest wait for a failure of the other ranks [s]; far above any load imbalance
 PATIENCE = 10.0
 LINE = "msmpetsc: %(levelname)s: %(message)s"

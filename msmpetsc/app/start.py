@@ -14,11 +14,11 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.ending import STATUS_INTERRUPTED, ending_together, logged_on_root
+from msmpetsc.app.ending import ending_together, logged_on_root
 from msmpetsc.app.request import OPTIONS, RunRequest
 from msmpetsc.app.resume import earlier_run, kept_options
 from msmpetsc.build import Geometry, Model, build_model
-from msmpetsc.errors import InputError
+from msmpetsc.errors import STATUS_INTERRUPTED, InputError
 from msmpetsc.fields import Frame
 from msmpetsc.results.restart import Earlier
 from msmpetsc.scene.reading import Scene

@@ -21,10 +21,17 @@ from typing import Any, NoReturn
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES
-from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
+from msmpetsc.app.ending import ending_together, logged_on_root
 from msmpetsc.app.ranks import world
 from msmpetsc.cli.command_table import COMMANDS, VERBOSITY, Shown
-from msmpetsc.errors import InputError, MsmpetscError, did_you_mean, printable
+from msmpetsc.errors import (
+    STATUS_BUG,
+    STATUS_INTERRUPTED,
+    InputError,
+    MsmpetscError,
+    did_you_mean,
+    printable,
+)
 
 # commands that need the packages of the extra "render" only
 READING = ("render", "export", "compare", "series")

@@ -16,15 +16,8 @@ from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
-from msmpetsc.geometry.grid import (
-    CHUNK,
-    BodyGrids,
-    Grid,
-    decode_morton,
-    encode_morton,
-    packed,
-    unpacked,
-)
+from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, packed, unpacked
+from msmpetsc.geometry.morton import decode_morton, encode_morton
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 from msmpetsc.geometry.valid_cells import (
     Slab,

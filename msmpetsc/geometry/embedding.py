@@ -74,7 +74,7 @@ from msmpetsc.geometry.block import (
     smoothstep,
 )
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.geometry.morton import decode_morton, encode_morton
 
 # largest distance of a point outside its cell [cells]; above rounding
 ROUNDING = 1e-9

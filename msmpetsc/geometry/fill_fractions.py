@@ -25,7 +25,8 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
-from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
+from msmpetsc.geometry.grid import CHUNK, Grid, packed
+from msmpetsc.geometry.morton import LIMIT
 from msmpetsc.geometry.surface import Surface, is_inside
 from msmpetsc.geometry.valid_cells import clip_between, extent, grown
 

@@ -19,7 +19,8 @@ from scipy.sparse.csgraph import connected_components
 from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import Route
-from msmpetsc.geometry.grid import LIMIT, packed
+from msmpetsc.geometry.grid import packed
+from msmpetsc.geometry.morton import LIMIT
 
 # rounding of an interpolated coordinate, relative to the largest [-]; an upper bound
 ROUNDING = 1e-12

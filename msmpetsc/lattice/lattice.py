@@ -14,7 +14,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Row
 from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.geometry.morton import decode_morton, encode_morton
 from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
 from msmpetsc.lattice.cut_cells import CORNERS as CORNERS
 from msmpetsc.lattice.cut_cells import shares_of_mass, shares_of_pairs

@@ -20,8 +20,8 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_h
 from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
-from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
+from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.geometry.surface import Surface, examine, is_inside
 from msmpetsc.geometry.valid_cells import Slab
 from msmpetsc.lattice.lattice import CORNERS, Lattice

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.backend.arrays import Floats
-from msmpetsc.errors import InputError
+from msmpetsc.errors import STATUS_FAILED, STATUS_REFUSED, InputError
 from msmpetsc.results.comparison import common_times, compare_surfaces, refuse_different_lattices
 from msmpetsc.results.reader import Result
 from msmpetsc.study.table import Row
@@ -34,8 +34,6 @@ MEANING = {
     "ok": "none of these",
 }
 OUTCOMES = tuple(MEANING)
-# exit statuses of msmpetsc
-STEP_FAILED, REFUSED = 3, 2
 # kinds of failure in the measure file that are outcomes under the same name
 NAMED_FAILURES = ("not finite", "energy", "refused")
 # largest shape error [-] of a body in its rest shape
@@ -158,9 +156,9 @@ def outcome(status: int | None, kind: str, row: Row, recovers: bool) -> str:
     """
     if status is None:
         return "timeout"
-    if status == REFUSED:
+    if status == STATUS_REFUSED:
         return "refused"
-    if status == STEP_FAILED:
+    if status == STATUS_FAILED:
         return kind if kind in NAMED_FAILURES else "diverged"
     if status != 0 or not row.get("frames"):
         return "crashed"

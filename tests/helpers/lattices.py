@@ -8,7 +8,8 @@ from mpi4py import MPI
 from msmpetsc.comm import SortedKeys
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
+from msmpetsc.geometry.grid import BodyGrids, Grid
+from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.scene.body import Material
 from msmpetsc.solve.nonlinear.functional import StepProblem

@@ -16,7 +16,8 @@ from one_process import input_error
 import msmpetsc as package
 from msmpetsc.build import build_model
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.grid import LIMIT, BodyGrids, encode_morton
+from msmpetsc.geometry.grid import BodyGrids
+from msmpetsc.geometry.morton import LIMIT, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.results.comparison import compare
 from msmpetsc.scene.reading import load_scene

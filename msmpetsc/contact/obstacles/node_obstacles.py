@@ -7,8 +7,8 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
-from msmpetsc.contact.obstacles.friction import Movers, apply_friction
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
+from msmpetsc.contact.obstacles.node_friction import Movers, apply_friction
 from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
 from msmpetsc.lattice.lattice import Lattice

@@ -1,7 +1,7 @@
 """Penalty contact with obstacles, as a term of the energy that a step minimises.
 
 A node at depth d > 0 has the energy 1/2 k d^2, which is convex for a single face. Coulomb friction
-(contact.obstacles.friction) acts on the nodes that were inside when the step began.
+(contact.friction) acts on the nodes that were inside when the step began.
 
 A step of BDF2 uses N_(n+1) = 2 N_n - N_(n-1) as the normal force of friction, and the slip
 u = tau v_(n+1) (README: BDF2).
@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
-from msmpetsc.contact.obstacles.friction import STICK, NodeFriction, Pressed, squares
+from msmpetsc.contact.friction import STICK, NodeFriction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.scene.obstacles import ObstacleTable

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.obstacles.friction import smallest
+from msmpetsc.contact.friction import smallest
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.creases import NEAREST

@@ -1,4 +1,4 @@
-"""Friction between parts of surfaces in one step, by the law of contact.obstacles.friction.
+"""Friction between parts of surfaces in one step, by the law of contact.obstacles.node_friction.
 
 Points of contact, normal and normal force of a pair are those of one moment (Li et al. 2020,
 Incremental Potential Contact, section 5.3). So the slip of a pair is linear in the points.
@@ -12,7 +12,7 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
-from msmpetsc.contact.obstacles.friction import Friction, squares
+from msmpetsc.contact.friction import Friction, squares
 
 if TYPE_CHECKING:
     import ipctk

@@ -29,7 +29,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, grea
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
-from msmpetsc.contact.obstacles.friction import Movers
+from msmpetsc.contact.obstacles.node_friction import Movers
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment

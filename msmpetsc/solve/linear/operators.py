@@ -122,7 +122,7 @@ class TrueHessian:
         """Linearise about positions q (l, 3) [m].
 
         projected : project out the negative curvature of each spring (elasticity.springs)
-        duals     : duals of friction, which replace its true curvature (contact.obstacles.friction)
+        duals     : duals of friction, which replace its true curvature (contact.friction)
         """
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)

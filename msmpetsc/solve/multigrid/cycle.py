@@ -24,7 +24,7 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.grid import decode_morton
+from msmpetsc.geometry.morton import decode_morton
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns

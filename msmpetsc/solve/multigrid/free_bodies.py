@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows, like, to_host
 from msmpetsc.comm import Route, SortedKeys
-from msmpetsc.geometry.grid import LIMIT
+from msmpetsc.geometry.morton import LIMIT
 from msmpetsc.solve.linear.unknowns import Unknowns
 
 

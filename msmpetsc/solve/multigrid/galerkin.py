@@ -23,7 +23,7 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
-from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.geometry.morton import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.multigrid.grids import CoarseGrid

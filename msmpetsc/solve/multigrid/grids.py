@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Indices, Mask, to_host
 from msmpetsc.comm import SortedKeys
-from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.geometry.morton import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 

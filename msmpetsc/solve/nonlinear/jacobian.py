@@ -142,7 +142,7 @@ class Jacobian:
 class FrictionDuals:
     """Forces of friction, which are unknowns of Newton's method beside positions.
 
-    See contact.obstacles.friction.
+    See contact.obstacles.node_friction.
 
     contact : of the step in progress; None without any
     duals   : of the next Hessian; None without contact. Nodes begin with their secants

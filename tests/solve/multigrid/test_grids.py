@@ -5,7 +5,7 @@ import pytest
 from conftest import WORKERS, run
 from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
 
-from msmpetsc.geometry.grid import decode_morton
+from msmpetsc.geometry.morton import decode_morton
 from msmpetsc.solve.multigrid.grids import grids
 
 

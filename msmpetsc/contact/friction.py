@@ -1,4 +1,4 @@
-"""Coulomb friction of nodes on obstacles, and its law for implicit steps.
+"""Law of Coulomb friction in implicit steps, for nodes on obstacles and for surfaces.
 
 The normal force N is known before the step is solved. Then friction has the convex potential
 mu N f(|u|) of the slip u (Li et al. 2020, Incremental Potential Contact, Eq. 12 to 15), with
@@ -14,26 +14,19 @@ slip and go much too far. Newton's method therefore has the friction force p, in
 dual unknown: p = (f'/u) u, linearised in both. The Hessian is the true one if p is the force of the
 present slip. Otherwise it is stiffer. Source: Chan, Golub and Mulet 1999, A nonlinear primal-dual
 method for total variation-based image restoration, SIAM J. Sci. Comput. 20.
-
-Explicit substeps apply friction as a change of velocity.
 """
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
-from msmpetsc.contact.obstacles.solids import TINY
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 
 # default of e over the time step [longest side of the smallest body / s]; below this
 # speed a contact sticks
 STICK = 1e-2
 # smallest f' to divide by [-]; the square of the quotient does not overflow
 TINY_SLOPE = 1e-100
-
-# rows (a,) of pressed nodes, their depths (a,) [m] and normals (a, 3)
-Pressed = tuple[Indices, Floats, Rows]
 
 
 @dataclass(frozen=True)
@@ -152,49 +145,6 @@ class Friction:
         return difference
 
 
-@dataclass(frozen=True)
-class NodeFriction(Friction):
-    """Friction of nodes on an obstacle.
-
-    nodes   : (a,) nodes in contact
-    normal  : (a, 3) unit normals of the faces
-    carried : (a, 3) positions of the nodes without slip [m]
-    """
-
-    nodes: Indices
-    normal: Rows
-    carried: Positions
-
-    def after(self, last: "NodeFriction | None", q: Positions) -> "NodeFriction":
-        """Return the friction with the elastic slips of the step before, at q (owned, 3) [m].
-
-        last : friction of the step before; None without it
-        """
-        slips = np.zeros_like(q)
-        if last:
-            slips[last.nodes] = last.held(q, self.stick)
-        return replace(self, begin=self._tangential(slips[self.nodes]))
-
-    def along(self, moved: Rows) -> Rows:
-        return self._tangential(moved[self.nodes])
-
-    def slip(self, q: Positions) -> tuple[Rows, Floats]:
-        u = self.begin + self._tangential(q[self.nodes] - self.carried)
-        return u, np.linalg.norm(u, axis=1)
-
-    def _tangential(self, moved: Rows) -> Rows:
-        tangential: Rows = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
-        return tangential
-
-    def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add the friction's gradient [N] at q to ``gradient`` (owned or more, 3)."""
-        gradient[self.nodes] += self.force(q)
-
-    def blocks(self, q: Positions, duals: Rows | None) -> Rows:
-        """Return the Hessian's blocks (a, 3, 3) [N/m] of the nodes (see ``curvature``)."""
-        return self.curvature(q, like(q, np.eye(3)) - squares(self.normal), duals)
-
-
 def squares(vectors: Rows) -> Rows:
     """Return v v^T (a, 3, 3) of vectors v (a, 3)."""
     return vectors[:, :, None] * vectors[:, None, :]
@@ -209,42 +159,3 @@ def shortened(vectors: Rows) -> Rows:
 def smallest(bounds: Rows) -> float:
     """Return the longest side [m] of the smallest body, from bounds (b, 2, 3) [m]."""
     return float((bounds[:, 1] - bounds[:, 0]).max(axis=1).min())
-
-
-class Movers(NamedTuple):
-    """The state of an explicit substep.
-
-    q        : (n, 3) positions [m]
-    v        : (n, 3) velocities [m/s], which a substep changes
-    rows     : nodes that move
-    per_mass : (n,) 1 / mass [1/kg]
-    gradient : (n or more, 3) grad E [N]
-    """
-
-    q: Positions
-    v: Rows
-    rows: Indices
-    per_mass: Floats
-    gradient: Rows
-
-
-def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: float) -> None:
-    """Apply Coulomb friction to nodes inside an obstacle, as a change of velocity.
-
-    The tangential velocity relative to the obstacle decreases by mu N dt / m, but not below zero.
-    So a sticking contact does not creep, for any length of the substep.
-
-    pressed : rows (a,) of the nodes inside, their depths (a,) [m] and the normals (a, 3)
-    carried : (3,) velocity of the obstacle [m/s]
-    impulse : mu k dt [kg/s], the friction's impulse over the depth
-    """
-    v = nodes.v
-    moves = np.zeros(len(v), bool, like=v)
-    moves[nodes.rows] = True
-    rows, depth, normal = pressed
-    moving = moves[rows]
-    rows, depth, normal = rows[moving], depth[moving], normal[moving]
-    slip = v[rows] - carried
-    slip -= (slip * normal).sum(axis=1)[:, None] * normal
-    speed = np.maximum(np.linalg.norm(slip, axis=1), TINY)
-    v[rows] -= np.minimum(1.0, impulse * depth * nodes.per_mass[rows] / speed)[:, None] * slip

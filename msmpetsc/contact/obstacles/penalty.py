@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
-from msmpetsc.contact.friction import STICK, NodeFriction, Pressed, squares
+from msmpetsc.contact.friction import STICK, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
+from msmpetsc.contact.obstacles.node_friction import NodeFriction, Pressed
 from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.scene.obstacles import ObstacleTable
 

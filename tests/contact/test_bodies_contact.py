@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tomli_w
 import trimesh
-from block_scene import play
+from block_scene import ROUGH_GROUND, play
 from conftest import result_on
 from crossings import count_crossings
 from mpi4py import MPI
@@ -32,13 +32,6 @@ from msmpetsc.solve.simulate import TimeLoop
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"}
-GROUND = {
-    "shape": "plane",
-    "point": [0, 0, 0],
-    "normal": [0, 0, 1],
-    "response": "penalty",
-    "friction": 0.5,
-}
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +103,7 @@ def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:
         "material": SOLID | {"law": "linear"},
         "gravity": {"acceleration": [0, 0, -G]},
     } | tables
-    return write(folder, name, body=bodies, obstacle=[GROUND], **tables)
+    return write(folder, name, body=bodies, obstacle=[ROUGH_GROUND], **tables)
 
 
 def test_a_solid_ball_lands_on_its_lowest_cells_which_are_slivers(folder: Path):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import CELL, DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
+from block_scene import CELL, DENSITY, GROUND, SIDES, STIFFEST, YOUNG, G, block_scene, play
 from mpi4py import MPI
 from obstacles import box, plane, sphere
 
@@ -238,7 +238,6 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_velocity_and_the_depth_that_it_e
 
 # ---- a block on the ground
 
-GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty"}
 MASS = DENSITY * SIDES.prod()
 
 

@@ -11,20 +11,13 @@ import numpy as np
 import pytest
 import tomli_w
 import trimesh
-from block_scene import play
+from block_scene import ROUGH_GROUND, play
 from crossings import count_crossings
 
 from msmpetsc.build import Model
 from msmpetsc.fields import Frame
 
 G, SIDE = 9.81, 0.1
-GROUND = {
-    "shape": "plane",
-    "point": [0, 0, 0],
-    "normal": [0, 0, 1],
-    "response": "penalty",
-    "friction": 0.5,
-}
 
 
 def write(folder: Path, **tables: Any) -> Path:
@@ -168,7 +161,7 @@ def stack(folder: Path, duration: float) -> tuple[Model, list[Frame], np.ndarray
         body=bodies,
         cages={"cell_size": SIDE / 2},
         material={"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean", "damping": 5.0},
-        obstacle=[GROUND],
+        obstacle=[ROUGH_GROUND],
         self_contact={"distance": 1e-3, "friction": 0.5},
         time={"step": 0.01, "duration": duration},
     )

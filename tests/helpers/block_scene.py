@@ -16,6 +16,8 @@ CELL = 1 / 8  # [m]: a binary fraction, so that the block is a whole number of c
 SIDES = np.array([0.5, 0.5, 0.25])
 YOUNG, DENSITY, G = 1e5, 1000.0, 9.81
 GRAVITY = {"acceleration": [0, 0, -G]}
+GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty"}
+ROUGH_GROUND = GROUND | {"friction": 0.5}
 STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (lattice.material)
 
 

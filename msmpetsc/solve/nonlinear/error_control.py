@@ -41,7 +41,7 @@ EARLY = 2.0
 LOOSEST = 0.3
 # Iterations of a step after which its linear solves gain a digit. Loose solves may open
 # and close a stiff gap for ever
-LONG = 50
+ITS_PER_DIGIT = 50
 # Share of the acceptable error that the linear solve may leave
 SHARE = 0.5
 # Ratio of |F|_(P^-1) to the residual of the linear solve up to which g counts as
@@ -298,7 +298,7 @@ class ErrorControl:
         """
         missing = now.bound / self.ratio
         is_last = missing <= FINAL * now.goal
-        tightest = self.tightest * max(0.1 ** (its // LONG), CLOSEST)
+        tightest = self.tightest * max(0.1 ** (its // ITS_PER_DIGIT), CLOSEST)
         rtol = CLOSEST * self.tightest if is_last else tightest
         if self._trusts_natural_norm(now):
             return rtol, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)

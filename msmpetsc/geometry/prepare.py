@@ -191,8 +191,8 @@ def _warn_of_change(before: Surface, after: Surface) -> None:
     added = _share_farther_than(after, before, near)
     if max(removed, added) > MOST_CHANGED:
         log.warning(
-            "prepare: 'repair' took %.0f%% of the surface's area away, and %.0f%% of the area is "
-            "new: msmpetsc render draws the scene",
+            "prepare: 'repair' removed %.0f%% and added %.0f%% of the surface's area: "
+            "msmpetsc render draws the scene",
             100 * removed,
             100 * added,
         )

@@ -96,7 +96,7 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
     """
     room = SUPERSAMPLING * round(width / letters)
     lines: list[list[Image.Image]] = []
-    for entry in map(_entry_picture, entries):
+    for entry in (_reduced(_entry_picture(entry), room) for entry in entries):
         if not lines or sum(each.width for each in (*lines[-1], entry)) > room:
             lines.append([])
         lines[-1].append(entry)
@@ -106,10 +106,20 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
     for number, line in enumerate(lines):
         left = (room - sum(each.width for each in line)) // 2
         for entry in line:
-            picture.paste(entry, (left, SUPERSAMPLING * LINE * number))
+            above = (SUPERSAMPLING * LINE - entry.height) // 2
+            picture.paste(entry, (left, SUPERSAMPLING * LINE * number + above))
             left += entry.width
     return np.array(
         picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS)
+    )
+
+
+def _reduced(picture: Image.Image, width: int) -> Image.Image:
+    """Return a picture that is at most this wide [px]."""
+    if picture.width <= width:
+        return picture
+    return picture.resize(
+        (width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS
     )
 
 

@@ -111,11 +111,7 @@ def test_repair_tells_how_much_of_the_surface_it_changed(caplog, folder):
     ):
         caplog.clear()
         prepare(surface, ["repair"])
-        said = (
-            [f"took {gone}% of the surface's area away, and {new}% of the area is new"]
-            if gone + new
-            else []
-        )
+        said = [f"removed {gone}% and added {new}% of the surface's area"] if gone + new else []
         assert [line for line in said if line in caplog.text] == said and len(
             caplog.messages
         ) == len(said)

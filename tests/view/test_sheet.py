@@ -19,7 +19,7 @@ from msmpetsc.scene.body import Region
 from msmpetsc.scene.motion import Pin
 from msmpetsc.scene.schema import OfBody
 from msmpetsc.view import renderer, sheet
-from msmpetsc.view.annotations import entries_of
+from msmpetsc.view.annotations import Entry, entries_of, legend_picture
 from msmpetsc.view.camera import YAW, camera_facing
 from msmpetsc.view.composition import Still, Style, composition_of, staying
 from msmpetsc.view.drawable import BodiesAtRest, drawable_of_result
@@ -373,3 +373,15 @@ def test_the_only_part_and_all_parts_that_go_together_stay_in_view(way):
     ]
     flies = np.concatenate([np.repeat(boxes, 5, axis=0), falls + np.array([2, 0, 0])], axis=1)
     assert staying(flies).tolist() == [True, way < 1]
+
+
+@pytest.mark.parametrize("width", [240, 400, 900])
+def test_a_legend_ends_inside_its_picture(width: int):
+    ticks = tuple((0.25 * i, f"{5 * i}") for i in range(5))
+    entries = [
+        Entry("bar", "von Mises' stress [Pa], clipped at 21, most 26.4", ticks=ticks),
+        Entry("swatch", "pinned"),
+    ]
+    picture = legend_picture(entries, width)
+    assert picture.shape[1] == width and (picture < 128).any()
+    assert (picture[:, [0, 1, -2, -1]] > 240).all()

@@ -61,14 +61,7 @@ SMALLER = {  # a command's words -> those of the test
     "scene.toml --resume": "scene.toml --set time.duration=0.03 --set cages.count=200 --resume",
     "--set time.duration=4": "--set time.duration=0.05",
 }
-RUN = (
-    ROOT / "scripts" / "README.md",
-    *(
-        START.parent / f"{name}.md"
-        for name in ("forces-and-stress", "pictures", "comparing", "resuming")
-    ),
-    *sorted((*START.glob("*.md"), *HOW_TO.glob("*.md"))),
-)
+RUN = (ROOT / "scripts" / "README.md", *sorted((*START.glob("*.md"), *HOW_TO.glob("*.md"))))
 DIFFER = {"compare": (0, 1), "plan": (0, 3)}  # exit statuses of commands that were carried out
 PROGRAM = ("-m", "msmpetsc.cli.main")
 LONG = ("study", "--device cuda")  # of RUN's commands, parsed only

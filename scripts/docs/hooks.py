@@ -22,6 +22,7 @@ PAGES = HERE / "pages"
 LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
 sys.path[:0] = [str(HERE), str(ROOT)]
 
+from formulas import Formulas  # noqa: E402
 from reference_tables import with_tables  # noqa: E402
 
 
@@ -69,6 +70,12 @@ def linked(path: Path, text: str) -> dict[str, Path]:
         if "://" not in target and ROOT in file.parents and file.is_file():
             found[target] = file
     return found
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Let Markdown know formulas."""
+    config.markdown_extensions.append(Formulas())
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

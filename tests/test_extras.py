@@ -133,7 +133,7 @@ BEAM = ROOT / "scenes" / "studies" / "atlas" / "beam.toml"
 NEEDED = {  # a package that is missing -> the extra that brings it, and a command that needs it
     **{
         name: ("run", ["run", BEAM, "-o", "y.h5"])
-        for name in ("mpi4py", "petsc4py", "numba", "trimesh")
+        for name in ("mpi4py", "petsc4py", "numba", "trimesh", "igl")
     },
     "pydantic": ("render", ["render", "x.h5"]),
     "scipy": ("render", ["series", "x.h5"]),

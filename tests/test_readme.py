@@ -14,11 +14,13 @@ from contextlib import chdir
 from functools import cache
 from pathlib import Path
 
+import markdown
 import pytest
 import small_result
 import tomli_w
 import trimesh
 from conftest import ROOT, python, run
+from formulas import Formulas
 from hooks import page_of_script
 from reference_tables import MARKER, TABLES, with_tables
 
@@ -61,14 +63,7 @@ SMALLER = {  # a command's words -> those of the test
     "scene.toml --resume": "scene.toml --set time.duration=0.03 --set cages.count=200 --resume",
     "--set time.duration=4": "--set time.duration=0.05",
 }
-RUN = (
-    ROOT / "scripts" / "README.md",
-    *(
-        START.parent / f"{name}.md"
-        for name in ("forces-and-stress", "pictures", "comparing", "resuming")
-    ),
-    *sorted((*START.glob("*.md"), *HOW_TO.glob("*.md"))),
-)
+RUN = (ROOT / "scripts" / "README.md", *sorted((*START.glob("*.md"), *HOW_TO.glob("*.md"))))
 DIFFER = {"compare": (0, 1), "plan": (0, 3)}  # exit statuses of commands that were carried out
 PROGRAM = ("-m", "msmpetsc.cli.main")
 LONG = ("study", "--device cuda")  # of RUN's commands, parsed only
@@ -318,6 +313,13 @@ def test_each_page_is_in_the_navigation():
 def test_a_script_of_cells_becomes_a_page():
     script = "# %% [markdown]\n# # Title\n#\n# Text\n\n# %%\nx = 1  # one\n"
     assert page_of_script(script) == "# Title\n\nText\n\n```python\nx = 1  # one\n```\n"
+
+
+def test_underscores_of_symbols_become_subscripts():
+    text = "q_n, |x|_M, a_long_name, `x_y`\n\n    v_(n+1) = |F|²_H\n"
+    html = markdown.markdown(text, extensions=[Formulas()])
+    assert "q<sub>n</sub>, |x|<sub>M</sub>, a_long_name, <code>x_y</code>" in html
+    assert '<div class="formula">v<sub>n+1</sub> = |F|²<sub>H</sub></div>' in html
 
 
 def test_the_tests_of_cases_are_there():

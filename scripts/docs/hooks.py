@@ -14,6 +14,7 @@ from pathlib import Path
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+from pygments.formatters import HtmlFormatter
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
@@ -21,6 +22,7 @@ PAGES = HERE / "pages"
 LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
 sys.path[:0] = [str(HERE), str(ROOT)]
 
+from formulas import Formulas  # noqa: E402
 from reference_tables import with_tables  # noqa: E402
 
 
@@ -70,8 +72,16 @@ def linked(path: Path, text: str) -> dict[str, Path]:
     return found
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Let Markdown know formulas."""
+    config.markdown_extensions.append(Formulas())
+    return config
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add README files, results, tutorials, and all files that these or pages link to."""
+    """Add README files, results, tutorials, all files that they or pages link to, and colours."""
+    colours = HtmlFormatter().get_style_defs(".highlight")
+    files.append(File.generated(config, "pygments.css", content=colours))
     texts = {path: path.read_text() for path in (*tracked(), *PAGES.rglob("*.md"))}
     for path in PAGES.glob("tutorials/*.py"):
         texts[path] = page_of_script(path.read_text())

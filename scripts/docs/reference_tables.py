@@ -157,8 +157,10 @@ def refused_options() -> str:
     """Return the table of PETSc's options that are refused, with the reason of each."""
     from msmpetsc.solve.refused_options import NO_USE
 
-    rows = [(code(f"-{pattern}"), reason) for pattern, reason in NO_USE.items()]
-    return table(("option and value, a regular expression", "reason"), rows)
+    # a long expression may wrap behind a bar
+    wrapping = {pattern.replace("|", "|\u200b"): reason for pattern, reason in NO_USE.items()}
+    rows = [(reason, code(f"-{pattern}")) for pattern, reason in wrapping.items()]
+    return table(("reason", "option and value, a regular expression"), rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {

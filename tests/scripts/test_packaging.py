@@ -12,9 +12,9 @@ import msmpetsc
 
 PACKAGING = ROOT / "scripts" / "packaging"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-# other names of packages; Spack has no Python package of libigl
+# other names of packages; Spack has no Python package of libigl, and no trimesh 4
 CONDA = {"libigl": "igl"}
-MISSING_IN_SPACK = {"libigl"}
+MISSING_IN_SPACK = {"libigl", "trimesh"}
 RUN = PROJECT["dependencies"] + PROJECT["optional-dependencies"]["run"]
 
 

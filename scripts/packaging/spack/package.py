@@ -3,6 +3,7 @@
 # mypy: disable-error-code="name-defined, call-arg"
 
 from spack.package import *
+from spack_repo.builtin.build_systems.python import PythonPackage
 
 
 class PyMsmpetsc(PythonPackage):
@@ -28,11 +29,12 @@ class PyMsmpetsc(PythonPackage):
         depends_on("py-numba@0.59:", type=("build", "run"))
         depends_on("py-pydantic@2.6:", type=("build", "run"))
         depends_on("py-tomli-w@1.0:", type=("build", "run"))
-        depends_on("py-trimesh@4.0:", type=("build", "run"))
         depends_on("py-pooch@1.7:", type=("build", "run"))
         depends_on("py-psutil@5.9:", type=("build", "run"))
         depends_on("py-tqdm@4.60:", type=("build", "run"))
-        # Spack has no py-libigl: python -m pip install "libigl>=2.5" into the view
+        # Spack has no py-libigl and no py-trimesh@4. No variant can leave them out, for
+        # nearly every scene needs both. Install them into the view:
+        # python -m pip install "libigl>=2.5" "trimesh>=4.0"
 
     def test_version(self):
         """The installed command names its version."""

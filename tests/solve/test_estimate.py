@@ -18,7 +18,6 @@ from petsc4py import PETSc
 from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import TrueErrors
-from msmpetsc.solve.linear.cg_bound import SolveBound
 from msmpetsc.solve.nonlinear import error_control, minimum
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -61,7 +60,7 @@ def test_the_estimate_is_within_three_of_the_true_error(
     never far below."""
     for module in (error_control, minimum):
         monkeypatch.setattr(module, "KNOWN", 0.0)
-    monkeypatch.setattr(SolveBound, "of", lambda *_: np.inf)
+    monkeypatch.setattr(error_control, "FEW", np.inf)
     scene = load_scene(
         block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]),
         [f"solver={{preset='{preset}', error=1e-3}}"],

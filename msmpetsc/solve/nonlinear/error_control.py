@@ -5,23 +5,19 @@ The relative error of x is |x - x*|_M / |x - y|_M. Three numbers stand for the e
 cheapest to the dearest:
 
 1. |F(x)|_(M^-1) is an upper bound if E is convex between x and x*.
-2. The linear solve that led to x bounds its own error in the norm of H (linear.cg_bound). The
-   nonlinear residual F - r, r the residual of the linear solve, bounds the rest of the error.
+2. The residual r of the linear solve that led to x bounds the error of this solve in the norm of
+   H, |r|_(P^-1) / sqrt(lambda). P is the preconditioner, lambda the least eigenvalue of P^(-1) H.
+   The nonlinear residual F - r bounds the rest of the error.
 3. An estimate solves for the Newton correction at x (error_estimate).
-
-With multigrid the natural norm |F|_(P^-1), P the preconditioner, tells when an estimate is worth
-its cost. The natural norm is trusted if F at the next iterate is about the residual that the linear
-solve has left: g is nearly quadratic there.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
-from msmpetsc.solve.linear.cg_bound import SolveBound
 from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_estimate import FEW, LOWER, ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
@@ -44,9 +40,6 @@ LOOSEST = 0.3
 ITS_PER_DIGIT = 50
 # Share of the acceptable error that the linear solve may leave
 SHARE = 0.5
-# Ratio of |F|_(P^-1) to the residual of the linear solve up to which g counts as
-# quadratic
-LINEAR = 2.0
 # Multiple of the acceptable error from which a linear solve should be the last
 FINAL = 60.0
 # Share of F that the nonlinear residual may have for the bound of the linear solve to
@@ -90,7 +83,6 @@ class Outcome:
     distance    : |x - y|_M of the iterate
     early       : multiple of the goal at which the error is estimated
     corrected   : whether the error was estimated, so that the Newton correction is known
-    left        : |r|_(P^-1) of the last linear solve; infinite if unknown
     solved      : bound on |e|_H that the last linear solve has left; infinite if unknown
     nonlinear   : |F - r|_(M^-1), r the residual of the last linear solve; infinite if unknown
     alarm       : place where a solve has met a negative curvature
@@ -106,7 +98,6 @@ class Outcome:
     distance: float = 0.0
     early: float = EARLY
     corrected: bool = False
-    left: float = np.inf
     solved: float = np.inf
     nonlinear: float = np.inf
     alarm: Alarm = Alarm.NOWHERE
@@ -142,7 +133,8 @@ class ErrorControl:
     tightest     : least ksp_rtol of a linear solve
     ratio        : ratio of bound to error in the last estimate
     has_residual : whether estimate.residual has the residual of the last linear solve
-    error_per_residual : ratio of the bound on |e|_H to |r|_(P^-1) in the last linear solve; 0: none
+    error_per_residual : ratio of the bound on |e|_H to |r|_(P^-1) in the last linear solve; 0 if
+                   no solve had a bound
     """
 
     functional: StepFunctional
@@ -152,7 +144,6 @@ class ErrorControl:
     target: float
     tightest: float
     ratio: float = FIRST_RATIO
-    solve_bound: SolveBound = field(default_factory=SolveBound)
     has_residual: bool = False
     error_per_residual: float = 0.0
 
@@ -185,10 +176,7 @@ class ErrorControl:
         if self._prefers_next_solve(now):
             return replace(now, error=now.bound)
         is_near = at_rounding or now.bound <= self._useful_bound(now)
-        seems_near = is_near
-        if self._trusts_natural_norm(now):
-            seems_near = now.left <= EARLY * now.goal * now.distance * np.sqrt(self.estimate.least)
-        if not seems_near and not at_rounding:
+        if not is_near:
             return replace(now, error=now.bound)
         if now.bound <= now.goal:
             now = self.with_compression(iterate, now)
@@ -196,11 +184,7 @@ class ErrorControl:
             lowest = now.compression.least_curvature
             if lowest > 0 and now.bound <= now.goal * lowest:
                 return replace(now, error=now.bound / lowest)
-        found = self.estimated(iterate, now, now.goal)
-        if is_near or self.estimate.is_trusted:
-            return found
-        # F is not the residual of the linear solve: g is not quadratic here
-        return replace(found, error=now.bound)
+        return self.estimated(iterate, now, now.goal)
 
     def _prefers_next_solve(self, now: Outcome) -> bool:
         """Return whether the next linear solve costs no more than an estimate."""
@@ -238,13 +222,10 @@ class ErrorControl:
         """
         distance = now.distance
         enough = EARLY * goal * distance if goal else np.inf
-        trusted = LINEAR * now.left if self._trusts_natural_norm(now) else 0.0
-        length = self.estimate(
-            iterate, now.residual, enough, KNOWN * goal * distance, trusted=trusted
-        )
+        length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance)
         if not np.isfinite(length):
             return replace(now, error=now.bound, alarm=Alarm.HERE)
-        is_known = now.bound <= self._useful_bound(now) or self.estimate.is_trusted
+        is_known = now.bound <= self._useful_bound(now)
         if self.estimate.missing is None and is_known:
             self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
         error = self.rounding.relative(
@@ -256,19 +237,12 @@ class ErrorControl:
         """Return the bound up to which an estimate is useful, by the last ratio."""
         return max(self.ratio, LEAST_RATIO) * now.early * now.goal
 
-    def _trusts_natural_norm(self, now: Outcome) -> bool:
-        """Return whether |F|_(P^-1) may bound errors.
-
-        P is close to H and H had no negative curvature.
-        """
-        return now.left < np.inf and not now.alarm and self.estimate.least >= NEAR
-
     def after_linear_solve(self, ksp: PETSc.KSP, now: Outcome) -> Outcome:
         """Return the outcome with the bounds that a linear solve with the true Hessian gives."""
         is_natural = (
             ksp.getType() == PETSc.KSP.Type.CG and ksp.getNormType() == PETSc.KSP.NormType.NATURAL
         )
-        now = replace(now, left=np.inf, solved=np.inf)
+        now = replace(now, solved=np.inf)
         if ksp.reason < 0 or not is_natural:
             return now
         self.estimate.learn(ksp)
@@ -278,18 +252,17 @@ class ErrorControl:
             self.estimate.residual = ksp.buildResidual(self.estimate.residual)
             if self.estimate.preconditioner.least_norm(self.estimate.residual) > solved:
                 self.has_residual, solved = False, np.inf
-        left = ksp.getResidualNorm() if self.estimate.preconditioner.is_uniform else np.inf
-        return replace(now, left=left, solved=solved)
+        return replace(now, solved=solved)
 
     def _solved(self, ksp: PETSc.KSP) -> float:
         """Return the bound on |e|_H that a linear solve has left; infinite if unknown."""
         is_far = self.estimate.preconditioner.is_uniform and self.estimate.least < NEAR
         if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.needs_probe or is_far:
             return np.inf
-        solved, residual = self.solve_bound.of(LOWER * self.estimate.least), ksp.getResidualNorm()
-        if np.isfinite(solved) and residual > 0:
-            self.error_per_residual = solved / residual
-        return solved
+        if not self.estimate.least > 0:
+            return np.inf
+        self.error_per_residual = float(1 / np.sqrt(LOWER * self.estimate.least))
+        return self.error_per_residual * float(ksp.getResidualNorm())
 
     def tolerances(self, now: Outcome, its: int = 0) -> tuple[float, float]:
         """Return ksp_rtol and ksp_atol of the linear solve after ``its`` iterations of a step.
@@ -300,8 +273,6 @@ class ErrorControl:
         is_last = missing <= FINAL * now.goal
         tightest = self.tightest * max(0.1 ** (its // ITS_PER_DIGIT), CLOSEST)
         rtol = CLOSEST * self.tightest if is_last else tightest
-        if self._trusts_natural_norm(now):
-            return rtol, SHARE * KNOWN * now.goal * now.distance * np.sqrt(self.estimate.least)
         if is_last and self.error_per_residual and not self.estimate.preconditioner.is_uniform:
             return rtol, SHARE * now.goal * now.distance / self.error_per_residual
         return min(max(SHARE * now.goal / missing, tightest), LOOSEST), NO_ATOL
@@ -325,7 +296,6 @@ class ErrorControl:
             goal=goal,
             doubts=now.doubts + 1,
             bound=np.inf,
-            left=np.inf,
             solved=np.inf,
             corrected=False,
         )

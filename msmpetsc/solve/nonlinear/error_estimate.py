@@ -2,19 +2,14 @@
 
 Terms of second order are left out. |F|_(M^-1) bounds |e|_M, but overestimates it a thousandfold on
 stiff bodies. Some iterations of CG on H, with the step's preconditioner P, tell more. Iteration k
-has found e_k with |e_k|_H^2 = e_k^T F. The missing part of e has at most the norm
-
-    |r_k|_(P^-1) / sqrt(lambda)   in H,   lambda the least eigenvalue of P^(-1) H,
-    |r_k|_(M^-1)                  in M,   if H is no less than M.
-
-CG's Ritz values bound lambda. The solve ends if
+has found e_k with |e_k|_H^2 = e_k^T F. The missing part of e has at most the norm |r_k|_(M^-1) in
+M, if H is no less than M. The solve ends if
 
 - |e_k|_M is above the error of interest, or
 - |e_k|_M and the missing part together are an acceptable error: their sum is the estimate, or
 - the missing part is a small share of |e_k|_H (CLOSE) and |e_k|_M hardly grows. This rule holds
   from iteration sqrt(|F|_(M^-1) / |e_k|_M) / 2 on: before, stiff modes hide soft modes.
 
-If F differs from the residual of the last linear solve, |e_k|_M must be more than half of the sum.
 Then g can be examined at x - e_k (minimum.Minimum). If a step has met an eigenvalue of M^(-1) H
 below 1, bounds are divided by it.
 """
@@ -31,8 +26,6 @@ from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 from msmpetsc.solve.petsc.events import ESTIMATE
 
-# Share of the trusted norm within which g counts as quadratic in all unresolved modes
-STRAIGHT = 0.6
 # Iterations between tests of convergence
 CHECK_EVERY = 4
 # Share of |e_k|_H that may be missing at the end
@@ -85,9 +78,6 @@ class ErrorEstimate:
         self.right_side: PETSc.Vec | None = None
         self.bound = self.enough = np.inf
         self.lowest, self.acceptable = 1.0, 0.0
-        self.trusted = 0.0
-        # |F|_(P^-1) at the start of the estimate in progress
-        self.begun = 0.0
         # Least eigenvalue of M^(-1) H that the step has met, at most 1
         self.convexity = 1.0
         # Bound on the missing part of an acceptable error; None if the estimate ended
@@ -120,7 +110,6 @@ class ErrorEstimate:
         enough: float,
         acceptable: float = 0.0,
         lowest: float = 1.0,
-        trusted: float = 0.0,
     ) -> float:
         """Return an estimate of |x - x*|_M at an iterate (collective).
 
@@ -130,11 +119,10 @@ class ErrorEstimate:
         enough     : error of interest; an estimate above it may be too low
         acceptable : error that need not be known better
         lowest     : least known eigenvalue of M^(-1) H
-        trusted    : |F|_(P^-1) up to which the natural norm may bound the error
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
         self.lowest, self.lengths = min(lowest, self.convexity), {}
-        self.acceptable, self.missing, self.trusted = acceptable, None, trusted
+        self.acceptable, self.missing = acceptable, None
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
             self.linearise(iterate.q)
@@ -175,10 +163,7 @@ class ErrorEstimate:
         if self.is_probe:
             return reasons.ITERATING if its < PROBED else reasons.CONVERGED_ITS
         every = 1 if self.preconditioner.is_uniform else CHECK_EVERY
-        if its == 0:
-            self.begun = residual
-        too_early = residual > self.trusted if its == 0 else bool(its % max(every // 2, 1))
-        if residual > 0 and too_early:
+        if residual > 0 and (its == 0 or its % max(every // 2, 1)):
             return reasons.ITERATING
         length = self.lengths[its] = self.functional.norm(ksp.getSolution())
         if (
@@ -199,33 +184,11 @@ class ErrorEstimate:
         # P is at most M, so |r_k|_(M^-1) is no less than the natural norm
         if length + residual > self.acceptable:
             return False
-        missing = self._missing(residual)
-        is_unknown = missing > length and self.trusted >= self.begun > STRAIGHT * self.trusted
-        if is_unknown or length + missing > self.acceptable:
+        missing = self._left()
+        if length + missing > self.acceptable:
             return False
         self.missing = missing
         return True
-
-    @property
-    def is_trusted(self) -> bool:
-        """Whether |F|_(P^-1) bounds the error of the iterate."""
-        return self.begun <= self.trusted
-
-    def _missing(self, residual: float) -> float:
-        """Return the bound on the missing part of |e|_M.
-
-        The norm of the residual in P^-1 weighs rough errors much less than the norm in M^-1. It is
-        a bound once CG has found the least eigenvalue of P^(-1) H.
-        """
-        missing = self._left()
-        if not self.is_trusted:
-            return missing
-        least = LOWER * self._least(self.ksp)
-        if not least > 0 or self.preconditioner.least_norm(self.residual) > residual / np.sqrt(
-            least
-        ):
-            return missing
-        return min(missing, float(residual / np.sqrt(least * self.lowest)))
 
     def _least(self, ksp: PETSc.KSP) -> float:
         """Return the least known eigenvalue of P^(-1) H, by a solve, too; 0 if there is none."""

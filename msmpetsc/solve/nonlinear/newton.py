@@ -156,15 +156,22 @@ class Newton(StepMethod):
             self.ksp.setTolerances(max_it=most or self.most_its)
         self.ksp.setOperators(self.jacobian.operator)
         self.ksp.solve(now.f, self.y)
-        self.jacobian.preconditioner.learn(self.ksp.its, rtol, self.control.solve_bound.reduction)
+        self.jacobian.preconditioner.learn(self.ksp.its, rtol, self._reduction())
         return self.ksp.reason not in USELESS
+
+    def _reduction(self) -> float:
+        """Return the reduction of the residual by the last linear solve, at least rounding."""
+        norms = self.ksp.getConvergenceHistory()
+        if not len(norms) or norms[-1] >= norms[0]:
+            return 1.0
+        return max(float(norms[-1] / norms[0]), float(np.finfo(float).eps))
 
     def _after_solve(self, outcome: Outcome, changed: bool) -> Outcome:
         """Return the outcome with the bounds of the linear solve, unless y has changed since."""
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
             outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
         if changed:
-            return replace(outcome, left=np.inf, solved=np.inf)
+            return replace(outcome, solved=np.inf)
         return self.control.after_linear_solve(self.ksp, outcome)
 
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:

@@ -199,7 +199,7 @@ class Stepper:
         if self.preset.true_hessian:
             method: Newton | LocalGlobal = Newton(*given)
             self.snes.setPythonContext(method)
-            self.ksp.setMonitor(self.control.solve_bound.watch)
+            self.ksp.setConvergenceHistory(reset=True)
         else:
             method = LocalGlobal(*given, self.prefix, self.options.is_given("npc_snes_type"))
         return method

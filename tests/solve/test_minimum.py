@@ -22,7 +22,6 @@ from msmpetsc.build import build_model
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.nonlinear import preconditioning
 from msmpetsc.solve.nonlinear.curvature import ALIKE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -121,12 +120,13 @@ def squashed(tmp_path: Path, share: float) -> tuple[Stepper, np.ndarray]:
 @pytest.mark.parametrize("multigrid", [False, True])
 @pytest.mark.parametrize("share", [0.2, 0.6, 0.97])
 def test_the_lowest_curvature_is_that_of_a_dense_matrix(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, multigrid: bool
+    tmp_path: Path, petsc_options, share: float, multigrid: bool
 ):
     """Of a squashed beam, free, so that its rigid motions are among the modes; after a search that
-    knows nothing, of a step with Jacobi's preconditioner, which has multigrid for the search where
-    there are many nodes."""
-    monkeypatch.setattr(preconditioning, "LARGE", 1 if multigrid else 10**9)
+    knows nothing, of a step with Jacobi's preconditioner, which has multigrid for the search unless
+    the user asks for Jacobi's."""
+    if not multigrid:
+        petsc_options(pc_type="jacobi")
     simulation, q = squashed(tmp_path, share)
     stepper = simulation.integrator.stepper
     functional, curvature = stepper.functional, stepper.minimum.curvature
@@ -156,10 +156,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     simulation.destroy()
 
 
-def test_a_load_factor_serves_until_the_body_is_pressed_much_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(preconditioning, "LARGE", 1)
+def test_a_load_factor_serves_until_the_body_is_pressed_much_more(tmp_path: Path):
     simulation, q = squashed(tmp_path, 0.97)
     stepper = simulation.integrator.stepper
     curvature = stepper.minimum.curvature

@@ -81,9 +81,7 @@ class Jacobian:
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
         is_held = self.unknowns.total < self.unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
-        self.preconditioner = StepPreconditioner(
-            self._of_matrix, of_lattice, kind, chooses, ratio, self.unknowns.total
-        )
+        self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio)
 
     @cached_property
     def matrix(self) -> PETSc.Mat:

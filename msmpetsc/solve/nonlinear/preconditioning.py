@@ -33,8 +33,6 @@ DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 LONG = 40
 # Usual ksp_rtol
 USUAL = 0.1
-# Free nodes from which a search is faster with multigrid
-LARGE = 1000
 # Iterations per digit with a hierarchy of the present positions
 USUAL_PACE = 2.5
 # Iterations that cost as much as a new hierarchy
@@ -260,7 +258,6 @@ class StepPreconditioner:
     kind    : -pc_type; multigrid is taken if it is mg
     chooses : choose between the two by ``ratio`` and by the iterations of solves
     ratio   : greatest t^2 k / m of a node
-    nodes   : number of free nodes on all ranks
     """
 
     make_of_matrix: Callable[[], Preconditioner]
@@ -268,7 +265,6 @@ class StepPreconditioner:
     kind: str
     chooses: bool
     ratio: float
-    nodes: int
 
     def __post_init__(self) -> None:
         self.is_searching = False
@@ -323,12 +319,12 @@ class StepPreconditioner:
 
     @contextmanager
     def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
-        """Switch to multigrid, built at positions q (l, 3) [m], for a long search in a large body.
+        """Switch to multigrid, built at positions q (l, 3) [m], for a long search.
 
         Smooth modes, which converge last with Jacobi's, then converge at once. The hierarchy is
         not that of the steps.
         """
-        if self.is_chosen or not self.chooses or self.nodes < LARGE:
+        if self.is_chosen or not self.chooses:
             yield
             return
         self.for_searches = self.for_searches or self.make_multigrid()

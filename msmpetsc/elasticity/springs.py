@@ -101,6 +101,12 @@ class Springs(NamedTuple):
         )
 
 
+def crushing_energy(lattice: Lattice) -> float:
+    """Return the energy [J] that compresses every spring of this rank to zero length."""
+    springs = slice(lattice.springs_owned)
+    return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
+
+
 class Displacement(NamedTuple):
     """Positions ``base`` of nodes (l, 3) [m], and the displacement ``moved`` (l, 3) [m].
 

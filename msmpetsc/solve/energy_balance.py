@@ -35,10 +35,10 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
+from msmpetsc.elasticity.springs import crushing_energy
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.integrators.integrator import EnergyBudget, Integrator, State
-from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 
 # spurious energy that fails a step, over all energy; Verlet may oscillate by nearly 2

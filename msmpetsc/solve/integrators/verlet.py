@@ -32,6 +32,7 @@ from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.node_friction import Movers
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.springs import crushing_energy
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.lattice.lattice import Lattice
@@ -430,12 +431,6 @@ class HighestMode:
     def destroy(self) -> None:
         """Destroy the PETSc objects of the mode (collective)."""
         self.mode.destroy()
-
-
-def crushing_energy(lattice: Lattice) -> float:
-    """Return the energy [J] that compresses every spring of this rank to zero length."""
-    springs = slice(lattice.springs_owned)
-    return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
 
 @kernel

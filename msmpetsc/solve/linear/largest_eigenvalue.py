@@ -13,10 +13,11 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosts import Ghosted
 
-# relative change of omega^2 that ends the power iteration; SAFETY covers its error
+# relative change of omega^2 that ends the power iteration; the safety factor of substeps
+# covers its error
 SETTLED = 1e-3
 # most power iterations; later steps continue from the mode
-MOST_ITERATIONS = 100
+MOST_POWER_ITERATIONS = 100
 
 
 class HighestMode:
@@ -52,7 +53,7 @@ class HighestMode:
         x, owned = self.mode.values, self.lattice.owned
         hessian = self.elasticity.hessian_at(q, projected=True)
         product = np.empty_like(q)
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(MOST_POWER_ITERATIONS):
             before = self.squared
             product[:] = 0
             hessian.add_product(x, product)
@@ -80,11 +81,12 @@ class HighestMode:
         self.mode.destroy()
 
 
-def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: object | None = None) -> float:
+def largest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: object | None = None) -> float:
     """Return an estimate of the largest eigenvalue of D^-1 H by ten CG iterations (collective).
 
     noise  : (n,) random numbers of this rank, from 0 to 1
-    blocks : D^-1 if H is not assembled; otherwise D is the 3 x 3 block diagonal of the matrix
+    blocks : a context of PCPYTHON that applies D^-1, if H is not assembled; otherwise D is the
+             3 x 3 block diagonal of the matrix
     """
     x, b = matrix.createVecs()
     b.array[:] = noise - 0.5

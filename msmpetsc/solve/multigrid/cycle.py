@@ -24,7 +24,7 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.morton import decode_morton
 from msmpetsc.lattice.initial_state import uniform
-from msmpetsc.solve.linear.largest_eigenvalue import greatest_eigenvalue
+from msmpetsc.solve.linear.largest_eigenvalue import largest_eigenvalue
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
@@ -150,7 +150,7 @@ class Multigrid:
         self.bounds[0] = self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
             noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
-            self.bounds[i] = SAFETY * greatest_eigenvalue(level.matrix, noise)
+            self.bounds[i] = SAFETY * largest_eigenvalue(level.matrix, noise)
         for i, bound in enumerate(self.bounds):
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), RANGE_START * bound, bound)
         if is_new:
@@ -190,7 +190,7 @@ class Multigrid:
         if bound is not None:
             return bound
         noise = uniform(unknowns.numbers[to_host(unknowns.free)]).T.ravel()
-        return SAFETY * greatest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
+        return SAFETY * largest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
 
     def _galerkin_product(self, finer: Level, level: Level) -> None:
         """Compute P^T H P of a level from the matrix of the next finer coarse level."""

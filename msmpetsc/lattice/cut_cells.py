@@ -20,7 +20,7 @@ CORNERS = np.array(
     [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
 )
 # kind (8, 8) of the spring between two corners [-]; 0 on the diagonal
-KIND = ((CORNERS[:, None] - CORNERS) ** 2).sum(axis=2)
+PAIR_KIND = ((CORNERS[:, None] - CORNERS) ** 2).sum(axis=2)
 # whether a corner's share counts for a spring (8, 8, 8) [-]; it must agree with both
 # ends in all coordinates in which the ends agree
 COUNTED = (
@@ -29,7 +29,9 @@ COUNTED = (
 # weight (8, 8, 8) of each corner's share in a spring's share [-]
 MEAN = COUNTED / COUNTED.sum(axis=2, keepdims=True)
 # stiffness (8, 8) of a cell's springs, relative to an edge inside a body [-]
-STRENGTH = np.where(KIND > 0, ISOTROPIC[KIND] / np.maximum(CELLS_AROUND[KIND], 1), 0.0)
+STRENGTH = np.where(
+    PAIR_KIND > 0, ISOTROPIC[PAIR_KIND] / np.maximum(CELLS_AROUND[PAIR_KIND], 1), 0.0
+)
 
 
 def shares_of_pairs(share: Rows) -> Rows:

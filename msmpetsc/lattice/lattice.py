@@ -30,7 +30,7 @@ from msmpetsc.scene.body import Material
 # direction (8, 8) from corner a to b [-]; an index into the 3 x 3 x 3 nodes around a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
 # kind (27,) of the spring in each direction [-]: its squared length in cells
-KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
+DIRECTION_KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3))) - 1) ** 2).sum(axis=0)
 NO_CELLS = np.empty((0, 8), np.int64)
 
 
@@ -156,7 +156,7 @@ def build_lattice(
         else cages.share.mean(axis=(1, 2, 3)),
         springs=net.springs,
         springs_owned=net.springs_owned,
-        rest_length=h * np.sqrt(KIND[net.direction]),
+        rest_length=h * np.sqrt(DIRECTION_KIND[net.direction]),
         stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
         pinned=np.zeros(len(net.ijk), bool),
         local_cells=net.cells[kept],
@@ -243,7 +243,7 @@ def _of_springs(
         law = LawConstants(mass, of_spring, share.mean(axis=1) * made_of.spring)
     if material.stiffness is not None:
         return law
-    springs = calibrated_stiffness(law.springs, h, KIND[net.direction], net.sharing)
+    springs = calibrated_stiffness(law.springs, h, DIRECTION_KIND[net.direction], net.sharing)
     return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
 
 

@@ -31,7 +31,7 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import OfBody, Probe
 
 # tolerance of a point's place in a cell [cell]; a point of a face lies in both cells
-SAME = 1e-9
+ON_FACE = 1e-9
 # names of groups in a message [-]; more fill the screen
 MOST_LISTED = 20
 
@@ -380,7 +380,7 @@ class ProbePoints:
         self.weights = np.zeros((len(points), 8))
         for row, point in enumerate(points):
             place = (np.array(point) - low) / lattice.cell_size
-            around = np.flatnonzero(((place >= -SAME) & (place <= 1 + SAME)).all(axis=1))
+            around = np.flatnonzero(((place >= -ON_FACE) & (place <= 1 + ON_FACE)).all(axis=1))
             own = int(numbers[around].min(initial=lattice.table.total))
             # A point on a face or in overlapping bodies has several cells.
             first = comm.allreduce(own, MPI.MIN)

@@ -24,7 +24,7 @@ NEAR = 0.01
 FARTHEST = 1e6
 # difference of equal lattices relative to the largest value [-]; the order of sums over
 # cells depends on the number of ranks
-SAME = 1e-9
+SAME_LATTICE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
             if same:
                 stored = _own_rows(comm, run, (name,), len(rows)).astype(float)
                 greatest = max(comm.allgather(np.abs(stored).max(initial=0)))
-                agree = rows_agree(np.asarray(rows, float), stored, SAME * greatest).all()
+                agree = rows_agree(np.asarray(rows, float), stored, SAME_LATTICE * greatest).all()
                 same = all(comm.allgather(bool(agree)))
             if not same:
                 raise InputError(

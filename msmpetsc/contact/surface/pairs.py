@@ -36,7 +36,7 @@ AHEAD = 2.0
 # Share of points in contact from which a second solve costs more than narrow steps save
 FEW = 0.01
 # Relative difference of two sums of contact energy by rounding
-SAME = 1e-9
+SAME_ENERGY = 1e-9
 TINY = np.finfo(float).tiny
 
 
@@ -314,7 +314,9 @@ class Contacts:
             self.near.look(x, self.time, ahead)
         self.find(x, base=q)
         found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
-        is_right = free and abs(found.energy - known.energy) <= SAME * known.energy + left_out
+        is_right = (
+            free and abs(found.energy - known.energy) <= SAME_ENERGY * known.energy + left_out
+        )
         if free and not is_right:
             self.narrow(x, self.time)
         return free, is_right

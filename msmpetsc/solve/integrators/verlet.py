@@ -50,7 +50,7 @@ RETRIES = 4
 # spurious energy that halves the substeps, over all energy; a fifth of NOTABLE_GAIN
 GAIN = 2e-3
 # energy that springs may regain after a loss, over all energy; as in the energy balance
-CREDIT = 0.1
+SPRINGS_CREDIT = 0.1
 # gain that doubles substeps, over the limit; doubled substeps gain 4 to 16 times more
 EASED = 1 / 32
 # most halvings of the substeps; 32 times the substeps bound the cost
@@ -215,7 +215,7 @@ class Verlet(Integrator):
         )
         total = energy + kinetic
         limit = GAIN * total + ROUNDING * self.unstable_energy
-        gained = max(self.gained + gain, -CREDIT * total)
+        gained = max(self.gained + gain, -SPRINGS_CREDIT * total)
         if (
             min(gain, gained) > limit
             and self.halvings < HALVINGS

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array
+from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.comm import on_root, together
 from msmpetsc.errors import InputError
 from msmpetsc.fields import CHECKPOINT
 from msmpetsc.results.comparison import rows_agree
 from msmpetsc.results.layout import scatter_rows
-from msmpetsc.results.reader import Result, as_python, newest_slot, plain_damage
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import as_python, plain_damage
 
 # median distance of a checkpoint from its frame, in longest sides [-]; most stay near
 NEAR = 0.01
@@ -90,6 +91,12 @@ def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
     numbers = dict(zip(names, values.tolist(), strict=True))
     rows = [name for name in stored if name not in ("step", "numbers")]
     return slot, Checkpoint(int(steps[slot]), numbers=numbers), rows
+
+
+def newest_slot(steps: Indices) -> int | None:
+    """Return the slot of the newest checkpoint, given the steps (2,) of both slots, or None."""
+    slot = int(np.argmax(steps))
+    return slot if steps[slot] >= 0 else None
 
 
 def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None:

@@ -45,10 +45,10 @@ from msmpetsc.results.layout import (
     open_to_write,
     write_bytes,
 )
-from msmpetsc.results.reader import (
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import (
     FORMAT,
     FORMAT_VERSION,
-    Result,
     checked_dataset,
     finished,
     open_result,

@@ -15,7 +15,7 @@ from msmpetsc.app.checks import RESULT_NAMES, refuse_other_format
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.geometry.registry import MODELS
-from msmpetsc.results.restart import (
+from msmpetsc.results.checkpoint_reader import (
     Earlier,
     read_checkpoint,
     refuse_changed_lattice,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import msmpetsc
 from msmpetsc.cli.commands import compare
 from msmpetsc.errors import InputError
-from msmpetsc.results.restart import Earlier
+from msmpetsc.results.checkpoint_reader import Earlier
 from msmpetsc.results.untrusted_file import refuse_deadly
 
 SECRET = 7.25

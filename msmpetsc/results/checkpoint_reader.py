@@ -1,4 +1,4 @@
-"""Restart from a result file: read its run and last checkpoint, and check its lattice."""
+"""Read a result file for a restart: its run and last checkpoint; check its frame and lattice."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext

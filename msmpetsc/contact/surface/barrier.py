@@ -25,6 +25,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.friction import STICK
+from msmpetsc.contact.surface.continuous_collision import candidates_on_ways
 from msmpetsc.contact.surface.creases import creases, neighbours
 from msmpetsc.contact.surface.places import PairSet, Places, without_fading_links
 from msmpetsc.contact.surface.surface_friction import RubbingPairs, SurfaceFriction, rubbing_pairs
@@ -42,15 +43,6 @@ ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"
 
 # Young's modulus over k_1 / h (lattice.material)
 PER_EDGE = 7 / 4
-# Share of the way to a crossing that a step takes
-KEPT = 0.9
-# Edges that points move in a piece of a long way
-PIECE = 2.0
-# Most pieces of a way; a longer way is shortened
-PIECES = 200
-# Greatest linear part of a way that boxes leave out; beyond, its allowance makes boxes
-# larger
-STRETCHED = 0.2
 
 
 @dataclass(frozen=True)
@@ -200,29 +192,18 @@ class Barrier:
     def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> PairSets:
         """Return the pairs that may come closer than dhat, and all pairs of creases.
 
-        Each point x may move by ``reach`` [m], from its place or from its straight way ``moved``.
-        The linear part of the ways, m = c + G x + r, would enlarge the boxes around them. If a pair
-        is closer than d on its way, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
-        ``|x - x'| < (d + 2 max |r|) / (1 - |G|)``, and boxes around r suffice.
+        Each point may move by ``reach`` [m], from its place or from its straight way ``moved``.
 
         points : (p, 3) [m]
         moved  : (p, 3) [m]; None if points stay
         """
-        candidates, ends, near = (
-            self.ipctk.Candidates(),
-            [np.asfortranarray(points)],
-            self.law.distance + 2 * reach,
-        )
-        if moved is not None:
-            rest, linear = _without_linear_part(points, moved)
-            ends += [np.asfortranarray(points + rest)]
-            near += linear / (1 - linear) * (near + 2 * float(np.linalg.norm(rest, axis=1).max()))
-        candidates.build(self.mesh, *ends, 0.5 * near, self.ipctk.LBVH())
+        near = self.law.distance + 2 * reach
+        pairs = PairSet(candidates_on_ways(self.mesh, points, near, moved))
         cushions = (
             self._cushion(points, distance + 2 * reach)
             for distance in self.distances[len(self.creases) :]
         )
-        return PairSet(candidates), *self.creases[1:], *cushions
+        return pairs, *self.creases[1:], *cushions
 
     @contextmanager
     def cushioned(self, distance: float) -> Iterator[None]:
@@ -391,45 +372,3 @@ class Barrier:
             if len(near) + len(pairs)
         )
         return min(least, default=self.law.distance)
-
-    def free_share(self, start: Positions, moved: Rows, sets: PairSets) -> float:
-        """Return the free share, by CCD, of the ways from start (p, 3) by ``moved`` (p, 3) [m].
-
-        sets : candidate pairs of the ways
-        """
-        share = self._share(start, start + moved - moved.mean(axis=0), sets)
-        return share if share >= 1 else KEPT * share
-
-    def sweep(self, start: Positions, moved: Rows) -> float:
-        """Return the free share of ways of any length, with candidates of each piece."""
-        moved = moved - moved.mean(axis=0)
-        whole = max(
-            int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * self.edge))), 1
-        )
-        for piece in range(min(whole, PIECES)):
-            begin, end = (start + i / whole * moved for i in (piece, piece + 1))
-            share = self._share(begin, end, self.candidates(begin, 0.0, end - begin))
-            if share < 1:
-                return KEPT * (piece + share) / whole
-        return 1.0 if whole <= PIECES else PIECES / whole
-
-    def _share(self, start: Positions, end: Positions, sets: PairSets) -> float:
-        """Return the share of ways up to the first crossing of candidates."""
-        ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
-        shares = (
-            pairs.candidates.compute_collision_free_stepsize(*ways)
-            for pairs in sets[: len(self.creases)]
-            if len(pairs)
-        )
-        return min(shares, default=1.0)
-
-
-def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
-    """Return displacements (p, 3) [m] without their linear part, and the norm of that part.
-
-    A linear part above STRETCHED stays, and its norm counts as 0.
-    """
-    x, rest = points - points.mean(axis=0), moved - moved.mean(axis=0)
-    linear = np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ rest)
-    size = float(np.linalg.norm(linear, 2))
-    return (rest - x @ linear, size) if size < STRETCHED else (rest, 0.0)

@@ -19,7 +19,8 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets, PairSets
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, PairSets
+from msmpetsc.contact.surface.continuous_collision import PIECE, free_share, sweep
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -401,11 +402,11 @@ class Contacts:
             serving = self.near.serving(start, start + moved)
             if not serving and way > PIECE * self.near.edge:
                 return float(
-                    self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0)
+                    self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
                 )
             sets = (serving or self.near.look(q, begin, LEAST * self.near.edge, moved)).sets
         return float(
-            self.comm.bcast(self.barrier.free_share(start, moved, sets) if self.barrier else 1.0)
+            self.comm.bcast(free_share(self.barrier, start, moved, sets) if self.barrier else 1.0)
         )
 
     def _clearance(self, q: Positions, time: float) -> float:

@@ -28,7 +28,7 @@ from msmpetsc.contact.friction import STICK
 from msmpetsc.contact.surface.continuous_collision import candidates_on_ways
 from msmpetsc.contact.surface.creases import creases, neighbours
 from msmpetsc.contact.surface.places import PairSet, Places, without_fading_links
-from msmpetsc.contact.surface.surface_friction import RubbingPairs, SurfaceFriction, rubbing_pairs
+from msmpetsc.contact.surface.surface_friction import FrictionPairs, SurfaceFriction, friction_pairs
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
@@ -89,9 +89,9 @@ class BarrierLaw:
 class Barrier:
     """Barrier of a surface, by positions S (p, 3) [m] of its points.
 
-    bodies : number of points of bodies, which come first; obstacles do not meet each other
-    edge   : mean length of the bodies' edges at rest [m]
-    rubbed : points (p, 3) at which friction's pairs were computed last, and these pairs
+    bodies        : number of points of bodies, which come first; obstacles do not meet each other
+    edge          : mean length of the bodies' edges at rest [m]
+    last_friction : points (p, 3) at which pairs with friction were computed last, and these pairs
     """
 
     def __init__(self, surface: Surface, law: BarrierLaw, bodies: int, meets_itself: bool = True):
@@ -120,7 +120,7 @@ class Barrier:
         self.creases: PairSets = (PairSet(ipctk.Candidates()),)
         # Pairs of creases by kind, with their points (k, 4)
         self._creased: list[list[tuple[list[Any], Indices]]] = []
-        self.rubbed: tuple[Positions, RubbingPairs] | None = None
+        self.last_friction: tuple[Positions, FrictionPairs] | None = None
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
         """Return the barrier of a distance [m], with the law's stiffness over a depth."""
@@ -319,7 +319,7 @@ class Barrier:
         start : (p, 3) positions of points without slip [m]
         stick : slip below which friction fades [m]
         """
-        pairs = self._rubbing(contacts, points)
+        pairs = self._friction_pairs(contacts, points)
         if not len(pairs.push):
             return None
         limit, slips = self.law.friction * pairs.push, pairs.slips(points)
@@ -327,23 +327,23 @@ class Barrier:
 
     def friction_limits(self, contacts: ContactSets, points: Positions) -> tuple[Indices, Floats]:
         """Return points (a, 4) of pairs, -1 for none, and mu N (a,) [N] at points (p, 3) [m]."""
-        pairs = self._rubbing(contacts, points)
+        pairs = self._friction_pairs(contacts, points)
         return pairs.numbers, self.law.friction * pairs.push
 
-    def _rubbing(self, contacts: ContactSets, points: Positions) -> RubbingPairs:
+    def _friction_pairs(self, contacts: ContactSets, points: Positions) -> FrictionPairs:
         """Return the pairs with friction at points (p, 3) [m].
 
         A step begins with the pairs that the last step ended with.
         """
-        if self.rubbed is None or not np.array_equal(self.rubbed[0], points):
+        if self.last_friction is None or not np.array_equal(self.last_friction[0], points):
             found = []
             for potential, pairs in self._pushing(contacts):
                 found.append(self.ipctk.TangentialCollisions())
                 found[-1].build(
                     self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction
                 )
-            self.rubbed = points, rubbing_pairs(found, self.mesh)
-        return self.rubbed[1]
+            self.last_friction = points, friction_pairs(found, self.mesh)
+        return self.last_friction[1]
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite without contacts."""

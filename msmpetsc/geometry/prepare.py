@@ -47,8 +47,8 @@ UNCHANGED_DISTANCE = 0.01
 LARGEST_COORDINATE = 1e12
 # least number of triangles for caching a step [-]; steps on smaller meshes are fast
 LEAST_CACHED = 20_000
-# version of the steps in the names of cached files [-]; raise it whenever a change of the
-# code changes a step's result, or old results stay in use
+# version of the steps in the names of cached files [-]; raise it whenever a step's
+# result changes, or old results stay in use
 VERSION = 1
 # files in the cache [-]; some megabytes each
 MOST_FILES = 32

@@ -13,8 +13,8 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosts import Ghosted
 
-# relative change of omega^2 that ends the power iteration; the safety factor of substeps
-# covers its error
+# relative change of omega^2 that ends the power iteration; the safety factor of
+# substeps covers its error
 SETTLED = 1e-3
 # most power iterations; later steps continue from the mode
 MOST_POWER_ITERATIONS = 100

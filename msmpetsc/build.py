@@ -37,8 +37,9 @@ from msmpetsc.geometry.surface import (
     joined,
 )
 from msmpetsc.lattice.initial_state import InitialState, initial_state
-from msmpetsc.lattice.lattice import Lattice, Topology, build_lattice, topology_of
+from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
+from msmpetsc.lattice.topology import Topology, topology_of
 from msmpetsc.scene.motion import Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene

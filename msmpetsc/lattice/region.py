@@ -24,7 +24,8 @@ from msmpetsc.geometry.inside import frame_of, inside_bodies
 from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.geometry.surface import Surface, examine, is_inside
 from msmpetsc.geometry.valid_cells import Slab
-from msmpetsc.lattice.lattice import CORNERS, Lattice
+from msmpetsc.lattice.cut_cells import CORNERS
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import CellMaterial, MaterialOfCells
 from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene

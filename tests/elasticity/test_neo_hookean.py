@@ -13,7 +13,8 @@ from msmpetsc.elasticity.neo_hookean import ONSET
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes
-from msmpetsc.lattice.lattice import Lattice, SolidCells, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.mass_and_stiffness import SolidCells
 from msmpetsc.lattice.material import lame_constants
 from msmpetsc.scene.body import Material
 

@@ -29,7 +29,7 @@ from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.geometry.valid_cells import touched_cells
-from msmpetsc.lattice.lattice import topology_of
+from msmpetsc.lattice.topology import topology_of
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))

@@ -15,7 +15,7 @@ from surfaces import body_of
 from msmpetsc.build import nearest_of_body
 from msmpetsc.geometry.cages import fill
 from msmpetsc.lattice.cut_cells import CORNERS, shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.lattice import topology_of
+from msmpetsc.lattice.topology import topology_of
 
 DENSITY = study.DENSITY
 bar_errors = cache(lambda name, size: study.bar_errors(*BARS[name], size * study.RADIUS, "fill")[1])

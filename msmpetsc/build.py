@@ -162,7 +162,7 @@ class Geometry:
 
         Collective.
         """
-        return None if self.cages.share is None else np.linalg.norm(nodes - self.nearest, axis=1)
+        return None if self.cages.fills is None else np.linalg.norm(nodes - self.nearest, axis=1)
 
 
 def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topology) -> Positions:
@@ -177,7 +177,7 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topol
     owned, ghosts = np.split(topology.ijk, [len(topology.octants)])
     body = cages.grids.body_of(owned)
     # a node shared by eight valid cells is inside, or in a narrow fold of the surface
-    rows = np.flatnonzero(~topology.octants.all(axis=1) & np.array(cages.fills)[body])
+    rows = np.flatnonzero(~topology.octants.all(axis=1) & np.array(cages.is_weighted)[body])
     nearest = cages.grids.node_positions(owned)
     nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
     return np.concatenate([nearest, topology.table.rows_of(encode_morton(ghosts), nearest)])

@@ -38,7 +38,7 @@ class Lattice:
     local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
                   first corner this rank owns. For a solid all cells around owned nodes follow.
     cell_stiffness : (d,) stiffness of an edge inside a body of the cell's material [N/m]
-    cell_share  : (c,) fraction of each of ``cells`` that lies inside the surface [-]
+    cell_fill   : (c,) fraction of each of ``cells`` that lies inside the surface [-]
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
     solid       : constants of a neo-Hookean solid; None if the law is springs
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
@@ -59,7 +59,7 @@ class Lattice:
     local_cells: Indices = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
     cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
-    cell_share: Floats = field(default_factory=lambda: np.empty(0))
+    cell_fill: Floats = field(default_factory=lambda: np.empty(0))
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
     solid: SolidCells | None = None
     viscous: float = 0.0
@@ -123,9 +123,9 @@ def build_lattice(
         mass=law.mass,
         cells=net.corners,
         cell_kind=cages.kind,
-        cell_share=np.ones(len(cages.kind))
-        if cages.share is None
-        else cages.share.mean(axis=(1, 2, 3)),
+        cell_fill=np.ones(len(cages.kind))
+        if cages.fills is None
+        else cages.fills.mean(axis=(1, 2, 3)),
         springs=net.springs,
         springs_owned=net.springs_owned,
         rest_length=h * np.sqrt(DIRECTION_KIND[net.direction]),

@@ -10,7 +10,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
-from msmpetsc.lattice.cut_cells import shares_of_mass, shares_of_pairs
+from msmpetsc.lattice.cut_cells import mass_fractions, spring_fractions
 from msmpetsc.lattice.material import (
     CellMaterial,
     MaterialOfCells,
@@ -55,18 +55,18 @@ def law_of_springs(
     net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
 ) -> LawConstants:
     """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
-    if of_cells is None and net.share is None:
+    if of_cells is None and net.fills is None:
         mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
         law = LawConstants(mass, material.spring, material.spring)
     else:
         owned = len(net.octants)
         made_of = _made_of(net, material, of_cells)
-        share = np.ones((len(net.cells), 8)) if net.share is None else net.share
-        of_pairs = shares_of_pairs(share)
-        of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
+        fills = np.ones((len(net.cells), 8)) if net.fills is None else net.fills
+        of_pairs = spring_fractions(fills)
+        of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
         mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
         of_spring = _sums_of_springs(net, made_of.spring, of_pairs) / net.sharing
-        law = LawConstants(mass, of_spring, share.mean(axis=1) * made_of.spring)
+        law = LawConstants(mass, of_spring, fills.mean(axis=1) * made_of.spring)
     if material.stiffness is not None:
         return law
     springs = calibrated_stiffness(law.springs, h, DIRECTION_KIND[net.direction], net.sharing)
@@ -94,11 +94,11 @@ def law_of_solid(
     forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
     volume = np.ones(count)
     pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
-    if net.share is not None and net.squares is not None:
+    if net.fills is not None and net.moments is not None:
         forms, pairs = forms.copy(), pairs.copy()
-        cut = np.flatnonzero(net.share.min(axis=1) < 1)
-        volume[cut] = net.share[cut].mean(axis=1)
-        forms[cut] = forms_of(net.share[cut], net.squares[cut])
+        cut = np.flatnonzero(net.fills.min(axis=1) < 1)
+        volume[cut] = net.fills[cut].mean(axis=1)
+        forms[cut] = forms_of(net.fills[cut], net.moments[cut])
         pairs[cut] = laplacians(forms[cut], volume[cut])
     diagonal = np.diagonal(pairs, axis1=1, axis2=2)
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
@@ -110,24 +110,24 @@ def law_of_solid(
     return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
 
 
-def _sums_of_springs(net: Topology, values: Floats, share: Rows) -> Floats:
+def _sums_of_springs(net: Topology, values: Floats, weights: Rows) -> Floats:
     """Return the weighted sum (s,) of cell ``values`` (d,) over the cells that share each spring.
 
     The order of summation does not depend on the rank.
 
-    share : (d, 8, 8) weight of a cell's value for the spring between two of its corners
+    weights : (d, 8, 8) weight of a cell's value for the spring between two of its corners
     """
-    of_nodes = _sums_by_direction(net.cells, values, share, len(net.octants))
+    of_nodes = _sums_by_direction(net.cells, values, weights, len(net.octants))
     sums: Floats = of_nodes[net.springs[:, 0], net.direction]
     return sums
 
 
 @njit()
-def _sums_by_direction(cells: Indices, values: Floats, share: Rows, owned: int) -> Rows:
+def _sums_by_direction(cells: Indices, values: Floats, weights: Rows, owned: int) -> Rows:
     sums = np.zeros((owned, 27))
     for i in range(len(cells)):
         for a in range(8):
             if cells[i, a] < owned:
                 for b in range(8):
-                    sums[cells[i, a], DIRECTION[a, b]] += values[i] * share[i, a, b]
+                    sums[cells[i, a], DIRECTION[a, b]] += values[i] * weights[i, a, b]
     return sums

@@ -142,8 +142,8 @@ class Finder:
         Raises InputError on all ranks if the region has no cell.
         """
         grids = self.cages.grids
-        share = self.cages.of_cells(ijk, self.cages.share)
-        middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
+        fills = self.cages.of_cells(ijk, self.cages.fills)
+        middles = grids.node_positions(ijk + (0.5 if fills is None else _middles(fills)))
         if table.table.region.is_of_mesh:
             where = self._of_mesh(table, ijk, middles, grids.body_of(ijk), are_nodes=False)
         else:
@@ -297,13 +297,13 @@ def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list
     return points
 
 
-def _middles(share: Rows) -> Rows:
-    """Return the centroid (c, 3) of the part of cells inside the surface, from corner shares.
+def _middles(fills: Rows) -> Rows:
+    """Return the centroid (c, 3) of the part of cells inside the surface, from corner fills.
 
-    It is in cells from the low corner. ``share`` is (c, 2, 2, 2).
+    It is in cells from the low corner. ``fills`` are (c, 2, 2, 2).
     """
-    whole = share.sum(axis=(1, 2, 3))
-    return np.stack([share.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
+    whole = fills.sum(axis=(1, 2, 3))
+    return np.stack([fills.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
 
 
 def _box_text(low: Floats, high: Floats) -> str:

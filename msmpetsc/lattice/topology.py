@@ -24,8 +24,8 @@ class Topology(NamedTuple):
     ijk     : (l, 3) grid index of the nodes, ghosts included
     octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
     cells   : (d, 8) local corner nodes of all cells around the owned nodes
-    share   : (d, 8) shares of their corners (geometry.fill_fractions); None if all cells are whole
-    squares : (d, 3) their second moments (geometry.fill_fractions); None if all cells are whole
+    fills   : (d, 8) fills of their corners (geometry.fill_fractions); None if all cells are whole
+    moments : (d, 3) second moments (geometry.fill_fractions); None if all cells are whole
     direction : (s,) direction of each spring from its first end, as in DIRECTION
     sharing : (s,) number of cells that share each spring
     """
@@ -36,8 +36,8 @@ class Topology(NamedTuple):
     octants: Mask
     ghosts: Indices
     cells: Indices
-    share: Rows | None
-    squares: Rows | None
+    fills: Rows | None
+    moments: Rows | None
     springs: Indices
     springs_owned: int
     direction: Indices
@@ -52,12 +52,12 @@ def topology_of(cages: Cages) -> Topology:
     owned = len(table.keys)
     ijk, cells, octants = _local_cells(cages, table)
     ghosts = table.find(encode_morton(ijk[owned:]))
-    share = cages.of_cells(ijk[cells[:, 0]], cages.share)
-    share = None if share is None else share[:, *CORNERS.T]
-    squares = cages.of_cells(ijk[cells[:, 0]], cages.squares)
+    fills = cages.of_cells(ijk[cells[:, 0]], cages.fills)
+    fills = None if fills is None else fills[:, *CORNERS.T]
+    moments = cages.of_cells(ijk[cells[:, 0]], cages.moments)
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
     springs = _springs(cells, numbers, owned)
-    return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *springs)
+    return Topology(table, corners, ijk, octants, ghosts, cells, fills, moments, *springs)
 
 
 def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mask]:

@@ -26,7 +26,7 @@ from msmpetsc.solve.nonlinear.load_factor import LIGHT, MORE, LoadFactor
 from msmpetsc.solve.nonlinear.lobpcg import (
     DEPENDENT,
     EFFORT,
-    MOST,
+    LONGEST_SEARCH,
     TINY,
     UNIFORM_EFFORT,
     Lobpcg,
@@ -219,11 +219,11 @@ class LowestCurvature:
         rigid = self._rigid_motions(q)
         # Nothing hides a mode, and all modes converge fast
         if rigid is None and is_uniform:
-            return search.lowest(np.concatenate([start, *known]), block, MOST, least)
+            return search.lowest(np.concatenate([start, *known]), block, LONGEST_SEARCH, least)
         start = search.without(rigid, start)
-        _, modes = search.lowest(start, block, MOST, least, left_out=rigid)
+        _, modes = search.lowest(start, block, LONGEST_SEARCH, least, left_out=rigid)
         begin = [modes, *known, *([] if rigid is None else [rigid])]
-        return search.lowest(np.concatenate(begin), block, MOST, least // 2)
+        return search.lowest(np.concatenate(begin), block, LONGEST_SEARCH, least // 2)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Floats, Positions, greatest, like
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.solve.linear.operators import TrueHessian
-from msmpetsc.solve.nonlinear.lobpcg import DEPENDENT, MOST, UNIFORM_EFFORT, Lobpcg
+from msmpetsc.solve.nonlinear.lobpcg import DEPENDENT, LONGEST_SEARCH, UNIFORM_EFFORT, Lobpcg
 
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
 # be the lowest
@@ -24,7 +24,7 @@ UNSEEN = 1.2
 GROWN = 4.0
 # Share of the greatest compression below which a node does not tell how the load has
 # grown
-NEGLIGIBLE = 0.3
+UNLOADED = 0.3
 # Name of the load factor in a checkpoint, which older versions read
 STORED = "LowestCurvature.load"
 
@@ -50,7 +50,7 @@ class LoadFactor:
         ratios : compression (m,) of this rank's free nodes
         """
         comm, preconditioner = self.search.comm, self.search.preconditioner
-        floor = NEGLIGIBLE * max(comm.allreduce(greatest(self.loads), MPI.MAX), DEPENDENT)
+        floor = UNLOADED * max(comm.allreduce(greatest(self.loads), MPI.MAX), DEPENDENT)
         growth = comm.allreduce(greatest(ratios / np.maximum(self.loads, floor)), MPI.MAX)
         bound: float = UNSEEN * self.value * growth
         # So near the limit that the next growth would need another search
@@ -71,7 +71,7 @@ class LoadFactor:
         known = [] if self._mode is None else [self._mode[None]]
         start = np.concatenate([*known, self.search.random(2 - len(known))])
         values, modes = self.search.lowest(
-            start, 2, MOST, UNIFORM_EFFORT.least - len(known), projected.mult
+            start, 2, LONGEST_SEARCH, UNIFORM_EFFORT.least - len(known), projected.mult
         )
         self._mode = modes[0].copy()
         hessian.products += projected.products

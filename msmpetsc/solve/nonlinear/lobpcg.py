@@ -17,7 +17,7 @@ from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Most iterations of a long search
-MOST = 100
+LONGEST_SEARCH = 100
 # A long search ends if the curvature is above this share of its value half as many
 # iterations ago
 SETTLED = 0.95

@@ -37,8 +37,9 @@ from msmpetsc.geometry.surface import (
     joined,
 )
 from msmpetsc.lattice.initial_state import InitialState, initial_state
-from msmpetsc.lattice.lattice import Lattice, Topology, build_lattice, topology_of
+from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
+from msmpetsc.lattice.topology import Topology, topology_of
 from msmpetsc.scene.motion import Gravity
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
@@ -161,7 +162,7 @@ class Geometry:
 
         Collective.
         """
-        return None if self.cages.share is None else np.linalg.norm(nodes - self.nearest, axis=1)
+        return None if self.cages.fills is None else np.linalg.norm(nodes - self.nearest, axis=1)
 
 
 def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topology) -> Positions:
@@ -176,7 +177,7 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topol
     owned, ghosts = np.split(topology.ijk, [len(topology.octants)])
     body = cages.grids.body_of(owned)
     # a node shared by eight valid cells is inside, or in a narrow fold of the surface
-    rows = np.flatnonzero(~topology.octants.all(axis=1) & np.array(cages.fills)[body])
+    rows = np.flatnonzero(~topology.octants.all(axis=1) & np.array(cages.is_weighted)[body])
     nearest = cages.grids.node_positions(owned)
     nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
     return np.concatenate([nearest, topology.table.rows_of(encode_morton(ghosts), nearest)])

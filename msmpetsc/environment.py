@@ -85,7 +85,7 @@ class Environment:
         previous = self._previous_contact(q)
         surface = None
         states = self.obstacles.during(q, last, end, (time, time_step), sides, previous)
-        if self.contacts and not self.contacts.apart:
+        if self.contacts and not self.contacts.is_left_out:
             surface = SurfaceContact(
                 self.contacts, q, time_step, last, end, previous.surface if previous else None
             )

@@ -15,13 +15,13 @@ from msmpetsc.app.checks import RESULT_NAMES, refuse_other_format
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.geometry.registry import MODELS
-from msmpetsc.results.reader import refuse_deadly
-from msmpetsc.results.restart import (
+from msmpetsc.results.checkpoint_reader import (
     Earlier,
     read_checkpoint,
     refuse_changed_lattice,
     refuse_unlike_frame,
 )
+from msmpetsc.results.untrusted_file import refuse_deadly
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.scene.problems import as_given
 from msmpetsc.scene.reading import Scene, load_scene, scene_of

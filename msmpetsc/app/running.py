@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc import __version__
-from msmpetsc.app.checkpointing import Checkpoints
+from msmpetsc.app.checkpoint_writer import Checkpoints
 from msmpetsc.app.ending import ending_together
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
@@ -31,8 +31,8 @@ from msmpetsc.backend import kernel_cache
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.results.checkpoint_reader import Earlier
 from msmpetsc.results.progress_bar import Progress
-from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import GrowingXdmf, write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene

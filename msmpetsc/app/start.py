@@ -20,7 +20,7 @@ from msmpetsc.app.resume import earlier_run, kept_options
 from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import STATUS_INTERRUPTED, InputError
 from msmpetsc.fields import Frame
-from msmpetsc.results.restart import Earlier
+from msmpetsc.results.checkpoint_reader import Earlier
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.petsc.initialise import lent_options, start_for_runs
 from msmpetsc.solve.petsc.words import words_of

@@ -39,10 +39,8 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
     """Log size, volume and mass of each body, and the counts of cells and nodes (collective)."""
     lattice = model.lattice
     masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(model.bodies))
-    shares = np.bincount(
-        lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(model.bodies)
-    )
-    sums = comm.allreduce(np.array([masses, shares * lattice.cell_size**3]))
+    filled = np.bincount(lattice.body_of(lattice.cells[:, 0]), lattice.cell_fill, len(model.bodies))
+    sums = comm.allreduce(np.array([masses, filled * lattice.cell_size**3]))
     for number, (body, (mass, volume)) in enumerate(zip(model.bodies, sums.T, strict=True)):
         mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
         if body.report.closed:

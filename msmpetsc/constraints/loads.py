@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 # relative tolerance of times [-]; a multiple of the time step may be rounded down
-SAME = 1e-12
+SAME_TIME = 1e-12
 
 
 def within(time: float, start: float, stop: float | None) -> bool:
     """Return whether start <= time < stop [s], up to rounding; a stop of None is infinite."""
-    return time >= start * (1 - SAME) and (stop is None or time < stop * (1 - SAME))
+    return time >= start * (1 - SAME_TIME) and (stop is None or time < stop * (1 - SAME_TIME))
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def _write_states(
 def _write_changes(
     first: int, count: int, step: int, parts: Floats, cells: CellRows, displacement: Displacement
 ) -> None:
-    base, _, moved = displacement
+    base, moved = displacement
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
         j_base, j_change = determinant_and_change(

@@ -101,20 +101,25 @@ class Springs(NamedTuple):
         )
 
 
+def crushing_energy(lattice: Lattice) -> float:
+    """Return the energy [J] that compresses every spring of this rank to zero length."""
+    springs = slice(lattice.springs_owned)
+    return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
+
+
 class Displacement(NamedTuple):
-    """Positions ``base`` and ``end`` of nodes (l, 3) [m], and the displacement ``moved`` [m].
+    """Positions ``base`` of nodes (l, 3) [m], and the displacement ``moved`` (l, 3) [m].
 
     Energy changes are computed from ``moved``, because it keeps the digits of a small displacement.
     """
 
     base: Positions
-    end: Positions
     moved: Rows
 
     @classmethod
     def to(cls, end: Positions, base: Positions) -> "Displacement":
         """Return the displacement from ``base`` to ``end``."""
-        return cls(base, end, end - base)
+        return cls(base, end - base)
 
 
 @njit(inline="always")
@@ -128,7 +133,7 @@ def _elastic_change(
     first: int, count: int, step: int, sums: Floats, springs: Springs, displacement: Displacement
 ) -> None:
     ends, rest_length, stiffness = springs
-    base, _, moved = displacement
+    base, moved = displacement
     change = 0.0
     for s in range(first, count, step):
         before = edge(base, ends[s, 1], ends[s, 0])

@@ -29,7 +29,7 @@ from msmpetsc.geometry.valid_cells import (
 
 BOUNDARY, INTERIOR = 1, 2
 # least fill of a corner [-]; keeps a corner far from the inside from having no mass
-LEAST_SHARE = 1e-3
+LEAST_FILL = 1e-3
 # fill above which a corner counts as full [-]; the difference from 1 is rounding
 FULL = 1 - 1e-9
 # lattice memory a cell [byte]; a lower bound, as a whole run takes four times as much
@@ -55,21 +55,21 @@ class BodySurface:
 class Cages:
     """Valid cells of bodies, distributed over the ranks in Morton order.
 
-    table   : keys of the cells (geometry.grid)
-    kind    : (n_local,) uint8, BOUNDARY or INTERIOR
-    share   : (n_local, 2, 2, 2) fill of the cells' corners, from LEAST_SHARE to 1 [-]
-              (geometry.fill_fractions); None if all cells count as full
-    squares : (n_local, 3) second moments of the material about the cells' middles [cells^5];
-              None if all cells count as full
-    fills   : for each body, whether its boundary cells are weighted by their fill
+    table       : keys of the cells (geometry.grid)
+    kind        : (n_local,) uint8, BOUNDARY or INTERIOR
+    fills       : (n_local, 2, 2, 2) fill of the cells' corners, from LEAST_FILL to 1 [-]
+                  (geometry.fill_fractions); None if all cells count as full
+    moments     : (n_local, 3) second moments of the material about the cells' middles [cells^5];
+                  None if all cells count as full
+    is_weighted : for each body, whether its boundary cells are weighted by their fill
     """
 
     grids: BodyGrids
     table: SortedKeys
     kind: Array
-    share: Rows | None = None
-    squares: Rows | None = None
-    fills: tuple[bool, ...] = (False,)
+    fills: Rows | None = None
+    moments: Rows | None = None
+    is_weighted: tuple[bool, ...] = (False,)
 
     @property
     def ijk(self) -> Indices:
@@ -77,7 +77,7 @@ class Cages:
         return decode_morton(self.table.keys)
 
     def of_cells(self, ijk: Indices, rows: Rows | None) -> Rows | None:
-        """Return rows of ``share`` or ``squares`` for valid cells (c, 3) of any rank (collective).
+        """Return ``rows`` of fills or moments of valid cells (c, 3) of any rank (collective).
 
         If ``rows`` is None, return None.
         """
@@ -131,14 +131,14 @@ def fill(
     route = Route(comm, table.owner(keys))
     order = np.argsort(route.send(keys))
     kind = np.concatenate([kind for _, kind, _ in parts])
-    fills = tuple(cut is not None for _, _, cut in parts)
-    share = squares = None
-    if any(fills):
+    is_weighted = tuple(cut is not None for _, _, cut in parts)
+    fills = moments = None
+    if any(is_weighted):
         of_bodies = [_full_cells(len(kind)) if cut is None else cut for _, kind, cut in parts]
-        share, squares = (
+        fills, moments = (
             route.send(np.concatenate(rows))[order] for rows in zip(*of_bodies, strict=True)
         )
-    return Cages(grids, table, route.send(kind)[order], share, squares, fills)
+    return Cages(grids, table, route.send(kind)[order], fills, moments, is_weighted)
 
 
 # fills (n, 2, 2, 2) of the cells' corners, and second moments (n, 3)
@@ -164,22 +164,22 @@ def _cells_of(
     if cut is None:
         return ijk, kind, None
     full = _full_cells(len(interior))
-    share, squares = (np.concatenate(rows) for rows in zip(cut, full, strict=True))
-    return ijk, kind, (share, squares)
+    fills, moments = (np.concatenate(rows) for rows in zip(cut, full, strict=True))
+    return ijk, kind, (fills, moments)
 
 
 def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | None:
     """Return fills and second moments of boundary cells (collective).
 
     Warn and return None if triangles are wound against each other. Clipping a corner's fill to
-    LEAST_SHARE or 1 changes the mass at that corner, so the second moments change too.
+    LEAST_FILL or 1 changes the mass at that corner, so the second moments change too.
     """
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
-        share, squares = cells.columns.inside(cells.boundary)
-        filled = np.clip(share, 0, 1).mean(axis=(1, 2, 3)).sum() + cells.interior
+        fills, moments = cells.columns.inside(cells.boundary)
+        filled = np.clip(fills, 0, 1).mean(axis=(1, 2, 3)).sum() + cells.interior
         _warn_of_parts(abs(body.report.volume), body.comm.allreduce(filled) * grid.cell_size**3)
-        share, squares = share.transpose(0, *(1 + axes)), squares[:, axes]
+        fills, moments = fills.transpose(0, *(1 + axes)), moments[:, axes]
     elif body.report.closed:
         log.warning(
             "triangles are wound against each other, so boundary cells count whole: "
@@ -187,11 +187,11 @@ def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | No
         )
         return None
     else:
-        share, squares = sampled_inside(
+        fills, moments = sampled_inside(
             body.comm.bcast(body.surface), grid, cells.boundary[:, axes]
         )
-    clipped = np.clip(np.where(share > FULL, 1.0, share), LEAST_SHARE, 1.0)
-    return clipped, squares + (clipped - share).mean(axis=(1, 2, 3))[:, None] / 4
+    clipped = np.clip(np.where(fills > FULL, 1.0, fills), LEAST_FILL, 1.0)
+    return clipped, moments + (clipped - fills).mean(axis=(1, 2, 3))[:, None] / 4
 
 
 def _warn_of_parts(enclosed: float, filled: float) -> None:

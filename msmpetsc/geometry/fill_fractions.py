@@ -58,14 +58,14 @@ class Columns:
 
     keys    : (c,) of the cells (grid.packed)
     corners : (c, 2, 2, 2) fills of their corners; material inside two parts counts twice
-    squares : (c, 3) second moments about the middle of the cell [cells^5]: 1/12 in a full cell
+    moments : (c, 3) second moments about the middle of the cell [cells^5]: 1/12 in a full cell
     below   : (c, 2, 2) winding number below the cell: its mean over the base, weighted by the
               bilinear function of each corner
     """
 
     keys: Indices
     corners: Rows
-    squares: Rows
+    moments: Rows
     below: Rows
 
     @classmethod
@@ -85,10 +85,10 @@ class Columns:
         for first in (SEEN, SEEN + 4):
             sums[:, first : first + 4] += 0.5 * above[:, :4]
         corners = 8 * sums[:, SEEN : SEEN + 8].reshape(-1, 2, 4).transpose(0, 2, 1)
-        squares: Rows = sums[:, -3:].copy()
-        squares[:, :2] += above[:, 4:]
-        squares[:, 2] += above[:, :4].sum(axis=1) / 12
-        return cls(keys, np.reshape(corners, (-1, 2, 2, 2)), squares, below)
+        moments: Rows = sums[:, -3:].copy()
+        moments[:, :2] += above[:, 4:]
+        moments[:, 2] += above[:, :4].sum(axis=1) / 12
+        return cls(keys, np.reshape(corners, (-1, 2, 2, 2)), moments, below)
 
     @property
     def leak(self) -> float:
@@ -106,9 +106,9 @@ class Columns:
         is_above = (next_cut >= keys) & (next_cut // LIMIT == keys // LIMIT)
         uncut = np.where(is_above[:, None, None], self.below[place], 0.0)
         is_cut = next_cut == keys
-        share = np.where(is_cut[:, None, None, None], self.corners[place], uncut[..., None])
-        uncut_squares = uncut.mean(axis=(1, 2))[:, None] / 12
-        return share, np.where(is_cut[:, None], self.squares[place], uncut_squares)
+        fills = np.where(is_cut[:, None, None, None], self.corners[place], uncut[..., None])
+        uncut_moments = uncut.mean(axis=(1, 2))[:, None] / 12
+        return fills, np.where(is_cut[:, None], self.moments[place], uncut_moments)
 
 
 def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
@@ -207,16 +207,16 @@ def sampled_inside(surface: Surface, grid: Grid, cells: Indices) -> tuple[Rows, 
     # the two linear functions of an axis at the samples
     along = np.stack([1 - at, at]) / SAMPLES
     middles = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
-    shares = np.empty((len(cells), 2, 2, 2))
-    squares = np.empty((len(cells), 3))
+    fills = np.empty((len(cells), 2, 2, 2))
+    moments = np.empty((len(cells), 3))
     step = max(1, CHUNK // len(middles))
     for start in range(0, len(cells), step):
         points = grid.node_positions(cells[start : start + step, None, :] + middles).reshape(-1, 3)
         inside = is_inside(surface, points).reshape(-1, SAMPLES, SAMPLES, SAMPLES)
-        shares[start : start + step] = 8 * np.einsum(
+        fills[start : start + step] = 8 * np.einsum(
             "cxyz,ax,by,dz->cabd", inside, along, along, along
         )
-        squares[start : start + step] = (
+        moments[start : start + step] = (
             inside.reshape(len(inside), -1) @ (middles - 0.5) ** 2 / len(middles)
         )
-    return shares, squares
+    return fills, moments

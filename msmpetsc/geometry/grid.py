@@ -18,9 +18,9 @@ PACK = np.array([LIMIT**2, LIMIT, 1])
 CHUNK = 1 << 17
 # distance at which a coordinate is moved onto a grid plane, relative to the longest
 # side [-]; above the rounding of meshes in single precision
-SAME = 1e-6
+ON_PLANE = 1e-6
 # upper limit of this distance [cells]; far below a cell
-MOST_SAME = 1e-3
+MOST_ON_PLANE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Grid:
         Raises InputError if the cell size is too small to number the cells along an axis.
         """
         length = (bounds[1] - bounds[0]) / cell_size
-        cells = np.ceil(length - min(SAME * length.max(), MOST_SAME))
+        cells = np.ceil(length - min(ON_PLANE * length.max(), MOST_ON_PLANE))
         if not cells.max() < LIMIT - 1:
             raise InputError(
                 f"cages.cell_size: {cell_size:g} m would cut the body into {cells.max():.3g} cells "
@@ -55,7 +55,7 @@ class Grid:
         inside = np.nextafter(self.shape.astype(float), 0)
         at = (points - self.origin) / self.cell_size
         plane = np.rint(at)
-        is_on_plane = np.abs(at - plane) <= min(SAME * self.shape.max(), MOST_SAME)
+        is_on_plane = np.abs(at - plane) <= min(ON_PLANE * self.shape.max(), MOST_ON_PLANE)
         return np.clip(np.where(is_on_plane, plane, at), 0, inside)
 
     def node_positions(self, ijk: Array) -> Positions:

@@ -47,6 +47,9 @@ UNCHANGED_DISTANCE = 0.01
 LARGEST_COORDINATE = 1e12
 # least number of triangles for caching a step [-]; steps on smaller meshes are fast
 LEAST_CACHED = 20_000
+# version of the steps in the names of cached files [-]; raise it whenever a step's
+# result changes, or old results stay in use
+VERSION = 1
 # files in the cache [-]; some megabytes each
 MOST_FILES = 32
 Step = Callable[..., Surface]
@@ -331,9 +334,7 @@ def cached(step: Step, surface: Surface, *values: object) -> Surface:
     if len(surface.triangles) < LEAST_CACHED or step is rotate:
         return step(surface, *values)
     versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
-    digest = hashlib.sha256(
-        Path(__file__).read_bytes() + repr((step.__name__, values, versions)).encode()
-    )
+    digest = hashlib.sha256(repr((VERSION, step.__name__, values, versions)).encode())
     digest.update(surface.points.tobytes() + surface.triangles.tobytes())
     path = Path(pooch.os_cache("msmpetsc"), "prepared", f"{digest.hexdigest()}.npz")
     with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile), np.load(path) as arrays:

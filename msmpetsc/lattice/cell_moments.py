@@ -45,7 +45,7 @@ SUMS = np.stack([*SIGNS.T, *(SIGNS[:, i] * SIGNS[:, j] for i, j in PAIRS), SIGNS
 WHOLE = np.array([*[0.0] * 6, *[2 / 3] * 3, *[0.0] * 3, 1 / 3])
 
 
-def forms_of(share: Rows, squares: Rows) -> Rows:
+def forms_of(fills: Rows, moments: Rows) -> Rows:
     """Return the strain form (c, FORM) of cells: mean slopes, then the quadratic form of the modes.
 
     The columns are
@@ -56,19 +56,19 @@ def forms_of(share: Rows, squares: Rows) -> Rows:
         4 C_yz, 4 C_xz, 4 C_xy,                               modes 1 and 2, 1 and 3, 2 and 3
         16 (C_xx C_yy + C_xx C_zz + C_yy C_zz)                the mode XYZ
 
-    share   : (c, 8) shares of the corners (geometry.fill_fractions)
-    squares : (c, 3) integrals of x^2, y^2 and z^2 over the part inside (geometry.fill_fractions)
+    fills   : (c, 8) fills of the corners (geometry.fill_fractions)
+    moments : (c, 3) integrals of x^2, y^2 and z^2 over the part inside (geometry.fill_fractions)
     """
-    volume = share.mean(axis=1, keepdims=True)
+    volume = fills.mean(axis=1, keepdims=True)
     middle, products = (
-        share @ sums.T / (8 * size * volume) for sums, size in ((SUMS[:3], 2), (SUMS[3:6], 4))
+        fills @ sums.T / (8 * size * volume) for sums, size in ((SUMS[:3], 2), (SUMS[3:6], 4))
     )
-    covariance = np.zeros((len(share), 3, 3))
+    covariance = np.zeros((len(fills), 3, 3))
     for k in range(3):
-        covariance[:, k, k] = squares[:, k] / volume[:, 0] - middle[:, k] ** 2
+        covariance[:, k, k] = moments[:, k] / volume[:, 0] - middle[:, k] ** 2
     for k, (i, j) in enumerate(PAIRS):
         covariance[:, i, j] = covariance[:, j, i] = products[:, k] - middle[:, i] * middle[:, j]
-    # Shares are cut at 1 if bodies overlap: a covariance may then be indefinite.
+    # Fills are cut at 1 if bodies overlap: a covariance may then be indefinite.
     values, vectors = np.linalg.eigh(covariance)
     covariance = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     x, y, z = covariance[:, range(3), range(3)].T

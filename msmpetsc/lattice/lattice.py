@@ -5,47 +5,19 @@ ends. Global node numbers follow Morton order, so they do not depend on the numb
 """
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
-from msmpetsc.backend.kernel import njit
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.morton import decode_morton, encode_morton
-from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
-from msmpetsc.lattice.cut_cells import CORNERS as CORNERS
-from msmpetsc.lattice.cut_cells import shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.material import (
-    CellMaterial,
-    MaterialOfCells,
-    calibrated_stiffness,
-    edge_stiffness,
-    lame_constants,
-)
+from msmpetsc.lattice.mass_and_stiffness import SolidCells, law_of_solid, law_of_springs
+from msmpetsc.lattice.material import MaterialOfCells
+from msmpetsc.lattice.topology import DIRECTION_KIND, Topology, topology_of
 from msmpetsc.scene.body import Material
 
-# direction (8, 8) from corner a to b [-]; an index into the 3 x 3 x 3 nodes around a
-DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
-# kind (27,) of the spring in each direction [-]: its squared length in cells
-KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
 NO_CELLS = np.empty((0, 8), np.int64)
-
-
-class SolidCells(NamedTuple):
-    """Constants of a solid for each of a lattice's ``local_cells`` (elasticity.neo_hookean).
-
-    forms  : (d, 13) strain forms of the cells (lattice.cell_moments)
-    volume : (d,) volume inside the surface [m^3]
-    shear, lame : (d,) mu and lambda [Pa]
-    """
-
-    forms: Rows
-    volume: Floats
-    shear: Floats
-    lame: Floats
 
 
 @dataclass(frozen=True)
@@ -66,7 +38,7 @@ class Lattice:
     local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
                   first corner this rank owns. For a solid all cells around owned nodes follow.
     cell_stiffness : (d,) stiffness of an edge inside a body of the cell's material [N/m]
-    cell_share  : (c,) fraction of each of ``cells`` that lies inside the surface [-]
+    cell_fill   : (c,) fraction of each of ``cells`` that lies inside the surface [-]
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
     solid       : constants of a neo-Hookean solid; None if the law is springs
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
@@ -87,7 +59,7 @@ class Lattice:
     local_cells: Indices = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
     cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
-    cell_share: Floats = field(default_factory=lambda: np.empty(0))
+    cell_fill: Floats = field(default_factory=lambda: np.empty(0))
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
     solid: SolidCells | None = None
     viscous: float = 0.0
@@ -125,7 +97,7 @@ def build_lattice(
     cages: Cages,
     material: Material,
     of_cells: MaterialOfCells | None = None,
-    topology: "Topology | None" = None,
+    topology: Topology | None = None,
 ) -> Lattice:
     """Return the lattice of the valid cells; a cut cell counts with its part inside (collective).
 
@@ -138,7 +110,7 @@ def build_lattice(
     first_owned = net.cells[:, 0] < len(net.octants)
     further = ~first_owned & is_solid
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
-    law = (_of_solid if is_solid else _of_springs)(net, h, material, of_cells)
+    law = (law_of_solid if is_solid else law_of_springs)(net, h, material, of_cells)
     grids = cages.grids
     nodes_of_bodies = np.bincount(
         grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids)
@@ -151,12 +123,12 @@ def build_lattice(
         mass=law.mass,
         cells=net.corners,
         cell_kind=cages.kind,
-        cell_share=np.ones(len(cages.kind))
-        if cages.share is None
-        else cages.share.mean(axis=(1, 2, 3)),
+        cell_fill=np.ones(len(cages.kind))
+        if cages.fills is None
+        else cages.fills.mean(axis=(1, 2, 3)),
         springs=net.springs,
         springs_owned=net.springs_owned,
-        rest_length=h * np.sqrt(KIND[net.direction]),
+        rest_length=h * np.sqrt(DIRECTION_KIND[net.direction]),
         stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
         pinned=np.zeros(len(net.ijk), bool),
         local_cells=net.cells[kept],
@@ -165,212 +137,3 @@ def build_lattice(
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid and SolidCells(*(rows[kept] for rows in law.solid)),
     )
-
-
-class Topology(NamedTuple):
-    """Nodes, cells and springs of a rank, without material. Further fields are those of Lattice.
-
-    corners : (c, 8) global corner nodes of the cells that this rank owns
-    ijk     : (l, 3) grid index of the nodes, ghosts included
-    octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
-    cells   : (d, 8) local corner nodes of all cells around the owned nodes
-    share   : (d, 8) shares of their corners (geometry.fill_fractions); None if all cells are whole
-    squares : (d, 3) their second moments (geometry.fill_fractions); None if all cells are whole
-    direction : (s,) direction of each spring from its first end, as in DIRECTION
-    sharing : (s,) number of cells that share each spring
-    """
-
-    table: SortedKeys
-    corners: Indices
-    ijk: Indices
-    octants: Mask
-    ghosts: Indices
-    cells: Indices
-    share: Rows | None
-    squares: Rows | None
-    springs: Indices
-    springs_owned: int
-    direction: Indices
-    sharing: Indices
-
-
-def topology_of(cages: Cages) -> Topology:
-    """Return the nodes, cells and springs of this rank's part of the cages (collective)."""
-    corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
-    table = SortedKeys(cages.table.comm, corner_keys.ravel())
-    corners = table.find(corner_keys)
-    owned = len(table.keys)
-    ijk, cells, octants = _local_cells(cages, table)
-    ghosts = table.find(encode_morton(ijk[owned:]))
-    share = cages.of_cells(ijk[cells[:, 0]], cages.share)
-    share = None if share is None else share[:, *CORNERS.T]
-    squares = cages.of_cells(ijk[cells[:, 0]], cages.squares)
-    numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    springs = _springs(cells, numbers, owned)
-    return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *springs)
-
-
-class LawConstants(NamedTuple):
-    """The material data of a rank's nodes, springs and cells. A scalar holds for all items.
-
-    mass    : (owned,) [kg]
-    springs : (s,) stiffness [N/m]; for a solid, of the constant L
-    cells   : (d,) stiffness of an edge inside a body of the cell's material [N/m]
-    solid   : (d,) constants of a solid's cells; None if the law is springs
-    """
-
-    mass: Floats
-    springs: float | Floats
-    cells: float | Floats
-    solid: SolidCells | None = None
-
-
-def _of_springs(
-    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
-) -> LawConstants:
-    """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
-    if of_cells is None and net.share is None:
-        mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
-        law = LawConstants(mass, material.spring, material.spring)
-    else:
-        owned = len(net.octants)
-        made_of = _made_of(net, material, of_cells)
-        share = np.ones((len(net.cells), 8)) if net.share is None else net.share
-        of_pairs = shares_of_pairs(share)
-        of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
-        mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-        of_spring = _sums_of_springs(net, made_of.spring, of_pairs) / net.sharing
-        law = LawConstants(mass, of_spring, share.mean(axis=1) * made_of.spring)
-    if material.stiffness is not None:
-        return law
-    springs = calibrated_stiffness(law.springs, h, KIND[net.direction], net.sharing)
-    return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
-
-
-def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None) -> CellMaterial:
-    """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given."""
-    if of_cells:
-        return of_cells(net.ijk[net.cells[:, 0]])
-    of_all = material.density, material.spring, material.poisson_ratio
-    return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
-
-
-def _of_solid(
-    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
-) -> LawConstants:
-    """Return masses, spring stiffnesses of L and cell constants of a solid.
-
-    A corner's lumped mass is proportional to the diagonal of L, as with springs.
-    """
-    owned, count = len(net.octants), len(net.cells)
-    made_of = _made_of(net, material, of_cells)
-    shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
-    volume = np.ones(count)
-    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
-    if net.share is not None and net.squares is not None:
-        forms, pairs = forms.copy(), pairs.copy()
-        cut = np.flatnonzero(net.share.min(axis=1) < 1)
-        volume[cut] = net.share[cut].mean(axis=1)
-        forms[cut] = forms_of(net.share[cut], net.squares[cut])
-        pairs[cut] = laplacians(forms[cut], volume[cut])
-    diagonal = np.diagonal(pairs, axis1=1, axis2=2)
-    of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
-    mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-    # 2 mu + 3 lambda times |grad u|^2 bounds the second variation at rest.
-    modulus = 2 * shear + 3 * lame
-    of_spring = _sums_of_springs(net, -h * modulus, pairs)
-    cells = SolidCells(forms, h**3 * volume, shear, lame)
-    return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
-
-
-def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mask]:
-    """Return this rank's nodes and the cells around its owned nodes.
-
-    The result is
-
-    - the grid index (l, 3) of owned and ghost nodes,
-    - the local corner nodes (d, 8) of the cells,
-    - the mask (owned, 8) of the valid cells around each owned node.
-    """
-    ijk = decode_morton(table.keys)
-    around = encode_morton(ijk[:, None, :] - CORNERS)
-    octants = cages.table.find(around) >= 0
-    cell_keys = np.unique(around[octants])
-    corner_keys = encode_morton(decode_morton(cell_keys)[:, None, :] + CORNERS)
-    ghost_keys = np.setdiff1d(corner_keys, table.keys)
-    keys = np.concatenate([table.keys, ghost_keys])
-    order = np.argsort(keys)
-    local = order[np.searchsorted(keys, corner_keys, sorter=order)]
-    return decode_morton(keys), local, octants
-
-
-def _sums_of_springs(net: Topology, values: Floats, share: Rows) -> Floats:
-    """Return the weighted sum (s,) of cell ``values`` (d,) over the cells that share each spring.
-
-    The order of summation does not depend on the rank.
-
-    share : (d, 8, 8) weight of a cell's value for the spring between two of its corners
-    """
-    of_nodes = _sums_by_direction(net.cells, values, share, len(net.octants))
-    sums: Floats = of_nodes[net.springs[:, 0], net.direction]
-    return sums
-
-
-@njit()
-def _sums_by_direction(cells: Indices, values: Floats, share: Rows, owned: int) -> Rows:
-    sums = np.zeros((owned, 27))
-    for i in range(len(cells)):
-        for a in range(8):
-            if cells[i, a] < owned:
-                for b in range(8):
-                    sums[cells[i, a], DIRECTION[a, b]] += values[i] * share[i, a, b]
-    return sums
-
-
-@njit()
-def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int, Indices, Indices]:
-    """Return the springs between the corners of cells.
-
-    cells   : (d, 8) local corner nodes; nodes below ``owned`` are owned
-    numbers : (l,) global node numbers
-
-    Returns the local ends (s, 2), the number of owned springs, the directions (s,), and the number
-    (s,) of cells that share each spring. Owned springs come first.
-    """
-    neighbour = np.full((owned, 27), -1, np.int32)
-    sharing = np.zeros((owned, 27), np.uint8)
-    for cell in cells:
-        for a in range(8):
-            if cell[a] < owned:
-                for b in range(8):
-                    neighbour[cell[a], DIRECTION[a, b]] = cell[b]
-                    sharing[cell[a], DIRECTION[a, b]] += 1
-    count = 0
-    # Direction 13 is the node itself.
-    for node in range(owned):
-        for direction in range(27):
-            end = neighbour[node, direction]
-            count += end >= 0 and direction != 13 and (numbers[end] > numbers[node] or end >= owned)
-    springs = np.empty((count, 2), np.int32)
-    directions = np.empty(count, np.int64)
-    shared = np.empty(count, np.int64)
-    # Owned springs fill the arrays from the front, all further springs from the back.
-    low, high = 0, count
-    for node in range(owned):
-        row = neighbour[node]
-        for direction in np.argsort(numbers[row]):
-            end = row[direction]
-            if end < 0 or direction == 13:
-                continue
-            if numbers[end] > numbers[node]:
-                s = low
-                low += 1
-            elif end >= owned:
-                high -= 1
-                s = high
-            else:
-                continue
-            springs[s, 0], springs[s, 1] = node, end
-            directions[s], shared[s] = direction, sharing[node, direction]
-    return springs, low, directions, shared

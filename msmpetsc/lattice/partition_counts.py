@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.backend.arrays import Array
-from msmpetsc.lattice.lattice import Topology
+from msmpetsc.lattice.topology import Topology
 
 # springs of a cell with neighbours on all sides [-]
 INNER_SPRINGS = 13

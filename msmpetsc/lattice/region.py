@@ -24,14 +24,15 @@ from msmpetsc.geometry.inside import frame_of, inside_bodies
 from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.geometry.surface import Surface, examine, is_inside
 from msmpetsc.geometry.valid_cells import Slab
-from msmpetsc.lattice.lattice import CORNERS, Lattice
+from msmpetsc.lattice.cut_cells import CORNERS
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import CellMaterial, MaterialOfCells
 from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import OfBody, Probe
 
 # tolerance of a point's place in a cell [cell]; a point of a face lies in both cells
-SAME = 1e-9
+ON_FACE = 1e-9
 # names of groups in a message [-]; more fill the screen
 MOST_LISTED = 20
 
@@ -141,8 +142,8 @@ class Finder:
         Raises InputError on all ranks if the region has no cell.
         """
         grids = self.cages.grids
-        share = self.cages.of_cells(ijk, self.cages.share)
-        middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
+        fills = self.cages.of_cells(ijk, self.cages.fills)
+        middles = grids.node_positions(ijk + (0.5 if fills is None else _middles(fills)))
         if table.table.region.is_of_mesh:
             where = self._of_mesh(table, ijk, middles, grids.body_of(ijk), are_nodes=False)
         else:
@@ -296,13 +297,13 @@ def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list
     return points
 
 
-def _middles(share: Rows) -> Rows:
-    """Return the centroid (c, 3) of the part of cells inside the surface, from corner shares.
+def _middles(fills: Rows) -> Rows:
+    """Return the centroid (c, 3) of the part of cells inside the surface, from corner fills.
 
-    It is in cells from the low corner. ``share`` is (c, 2, 2, 2).
+    It is in cells from the low corner. ``fills`` are (c, 2, 2, 2).
     """
-    whole = share.sum(axis=(1, 2, 3))
-    return np.stack([share.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
+    whole = fills.sum(axis=(1, 2, 3))
+    return np.stack([fills.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
 
 
 def _box_text(low: Floats, high: Floats) -> str:
@@ -380,7 +381,7 @@ class ProbePoints:
         self.weights = np.zeros((len(points), 8))
         for row, point in enumerate(points):
             place = (np.array(point) - low) / lattice.cell_size
-            around = np.flatnonzero(((place >= -SAME) & (place <= 1 + SAME)).all(axis=1))
+            around = np.flatnonzero(((place >= -ON_FACE) & (place <= 1 + ON_FACE)).all(axis=1))
             own = int(numbers[around].min(initial=lattice.table.total))
             # A point on a face or in overlapping bodies has several cells.
             first = comm.allreduce(own, MPI.MIN)

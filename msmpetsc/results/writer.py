@@ -45,10 +45,10 @@ from msmpetsc.results.layout import (
     open_to_write,
     write_bytes,
 )
-from msmpetsc.results.reader import (
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import (
     FORMAT,
     FORMAT_VERSION,
-    Result,
     checked_dataset,
     finished,
     open_result,
@@ -418,7 +418,7 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     file.write("lattice/nodes", lattice.nodes[:owned])
     file.write("lattice/cells", lattice.cells)
     file.write("lattice/cell_kind", lattice.cell_kind)
-    file.write("lattice/cell_share", lattice.cell_share)
+    file.write("lattice/cell_share", lattice.cell_fill)
     file.write("lattice/springs", numbers[lattice.springs[springs]])
     file.write("lattice/rest_length", lattice.rest_length[springs])
     file.write("lattice/stiffness", lattice.stiffness[springs])

@@ -4,7 +4,8 @@ from typing import Annotated, Any, Final, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from msmpetsc.scene.problems import rule, unknown_name
+from msmpetsc.scene.problems import rule
+from msmpetsc.scene.suggestions import unknown_name
 from msmpetsc.scene.values import (
     Box,
     Count,

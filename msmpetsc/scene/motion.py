@@ -6,7 +6,8 @@ from typing import Annotated, Self
 from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from msmpetsc.scene.body import Region
-from msmpetsc.scene.problems import TAGS, rule
+from msmpetsc.scene.problems import rule
+from msmpetsc.scene.suggestions import TAGS
 from msmpetsc.scene.values import (
     Direction,
     FunctionName,

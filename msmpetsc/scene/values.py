@@ -18,7 +18,8 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails
 
-from msmpetsc.scene.problems import Broken, one_of_problems, restated, rule, unknown_name
+from msmpetsc.scene.problems import Broken, one_of_problems, rule
+from msmpetsc.scene.suggestions import restated, unknown_name
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -35,10 +35,10 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
+from msmpetsc.elasticity.springs import crushing_energy
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.integrators.integrator import EnergyBudget, Integrator, State
-from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 
 # spurious energy that fails a step, over all energy; Verlet may oscillate by nearly 2
@@ -46,7 +46,7 @@ FAILING_GAIN = 3.0
 # spurious energy that is worth a warning, over all energy; a viewer may notice more
 NOTABLE_GAIN = 0.01
 # energy that an oscillation may regain, over all energy; BDF2 loses 0.06 in an impact
-CREDIT = 0.1
+OSCILLATION_CREDIT = 0.1
 # least legitimate energy, over that of crushed springs; rounding may gain less
 FLOOR = 1e-10
 
@@ -90,7 +90,7 @@ class EnergyBalance:
     def __post_init__(self) -> None:
         self.lattice = self.environment.lattice
         self.comm = self.lattice.table.comm
-        self.credit = CREDIT * self.swings
+        self.credit = OSCILLATION_CREDIT * self.swings
         self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
         self.known: tuple[Positions, Energies] | None = None
         self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))

@@ -13,7 +13,8 @@ from PIL import Image
 
 from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
-from msmpetsc.results.reader import Result, plain_damage
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import plain_damage
 from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture
 from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_result

@@ -13,7 +13,7 @@ from conftest import run
 from one_process import Answers, answers_on, assert_one_line, refusal_in
 
 from msmpetsc.cli.main import split_petsc_options
-from msmpetsc.results.reader import finished
+from msmpetsc.results.untrusted_file import finished
 
 SCENE = """
 [mesh]

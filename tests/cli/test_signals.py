@@ -23,7 +23,7 @@ from stopped_runs import (  # noqa: F401  # a fixture
 )  # fmt: skip
 
 from msmpetsc.cli.main import main
-from msmpetsc.results.reader import finished
+from msmpetsc.results.untrusted_file import finished
 
 STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
 

@@ -214,7 +214,7 @@ def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[str]]:
     def seen(self: ContactFaces) -> StepProblem:
         contacts = self.environment.contacts
         assert contacts is not None
-        asked = "nothing" if contacts.apart else "known" if contacts.is_narrow else "all"
+        asked = "nothing" if contacts.is_left_out else "known" if contacts.is_narrow else "all"
         found.setdefault(round(self.time / 0.01), []).append(asked)
         return problem(self)
 
@@ -262,9 +262,9 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.002 - 0.5 * DISTANCE], 0.0)
     energy = contacts.touch(end, 0.01).energy
     for left_out, is_right in ((1.01, True), (0.99, False)):
-        assert contacts.narrow(start, 0.0) and contacts.apart
+        assert contacts.narrow(start, 0.0) and contacts.is_left_out
         assert contacts.after_way(start, end, left_out * energy) == (True, is_right)
-        assert contacts.is_narrow != is_right and not contacts.apart
+        assert contacts.is_narrow != is_right and not contacts.is_left_out
     assert contacts.touch(end, 0.01).energy == pytest.approx(energy)
     assert contacts.after_way(start, end, 0.0) == (True, True)
 

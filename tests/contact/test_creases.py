@@ -10,6 +10,7 @@ from block_scene import block_scene, play
 from crossings import count_crossings
 
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
+from msmpetsc.contact.surface.continuous_collision import free_share, sweep
 from msmpetsc.geometry.surface import Surface
 
 LONG, HIGH, BOTTOM, HALF = (
@@ -77,10 +78,10 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     ].empty()  # to walls it is less
     assert not barrier.contacts(barrier.creases, closed(points, 0.99 * tight))[level].empty()
     through = closed(points, -2 * HALF) - points
-    assert 0.3 < barrier.free_share(points, through, candidates) < 0.5  # they meet halfway
-    assert 0.3 < barrier.sweep(points, through) < 0.5
-    assert 0.3 < barrier.free_share(points, through, barrier.creases) < 0.5
-    assert barrier.free_share(points, closed(points, 0.05) - points, candidates) == 1
+    assert 0.3 < free_share(barrier, points, through, candidates) < 0.5  # they meet halfway
+    assert 0.3 < sweep(barrier, points, through) < 0.5
+    assert 0.3 < free_share(barrier, points, through, barrier.creases) < 0.5
+    assert free_share(barrier, points, closed(points, 0.05) - points, candidates) == 1
 
 
 def test_the_derivatives_in_a_crease_are_those_of_its_energy():

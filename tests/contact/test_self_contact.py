@@ -17,7 +17,7 @@ from stopped_runs import assert_goes_on_exactly
 
 from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs
-from msmpetsc.contact.surface.surface_friction import RubbingPairs, rubbing_pairs
+from msmpetsc.contact.surface.surface_friction import FrictionPairs, friction_pairs
 from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
@@ -340,7 +340,7 @@ def test_a_block_holds_on_a_tilted_one(tmp_path):
 def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
     """Or its slip, which goes on from step to step, would be lost, or be that of the other way."""
 
-    def found(first: int, second: int, at: tuple[float, float]) -> RubbingPairs:
+    def found(first: int, second: int, at: tuple[float, float]) -> FrictionPairs:
         pair = SimpleNamespace(
             edge0_id=first,
             edge1_id=second,
@@ -351,17 +351,17 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
         built = SimpleNamespace(
             vv_collisions=[], ev_collisions=[], ee_collisions=[pair], fv_collisions=[]
         )
-        return rubbing_pairs([built], mesh)
+        return friction_pairs([built], mesh)
 
     edges, faces = np.array([[1, 5], [2, 4]]), np.empty((0, 3), int)
     mesh = SimpleNamespace(edges=edges, faces=faces, num_vertices=6)
     one, other = found(0, 1, (0.7, 0.6)), found(1, 0, (0.6, 0.7))
     assert one.numbers.tolist() == other.numbers.tolist() == [[1, 5, 2, 4]] and one.push == [2.0]
-    np.testing.assert_allclose(one.shares, [[0.3, 0.7, -0.4, -0.6]])
+    np.testing.assert_allclose(one.weights, [[0.3, 0.7, -0.4, -0.6]])
     points, moved = np.random.default_rng(1).normal(size=(2, 6, 3))
     along, same = (pairs.slips(points) @ moved.ravel() for pairs in (one, other))
     assert along.any() and np.array_equal(along, same)
-    assert along @ (one.shares @ points[one.numbers[0]])[0] == pytest.approx(
+    assert along @ (one.weights @ points[one.numbers[0]])[0] == pytest.approx(
         0
     )  # in the plane of contact
 

@@ -13,7 +13,8 @@ from msmpetsc.elasticity.neo_hookean import ONSET
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes
-from msmpetsc.lattice.lattice import Lattice, SolidCells, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.mass_and_stiffness import SolidCells
 from msmpetsc.lattice.material import lame_constants
 from msmpetsc.scene.body import Material
 
@@ -30,7 +31,7 @@ def points_inside(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Shares (8,) of the corners and squares (3,) of a part of a cell, that are sums over points of
+    """Fills (8,) of the corners and second moments (3,) of a part of a cell, sums over points of
     it."""
     return 8 * (0.5 + SIGNS * points[:, None]).prod(axis=2).sum(axis=0) / n, (points**2).sum(
         axis=0
@@ -43,11 +44,11 @@ def solid(*sides: int, poisson: float, cut: bool = False) -> Lattice:
     lattice = build_lattice(cages_of(block(*sides), H), material)
     if not cut:
         return lattice
-    share, squares = map(
+    fills, second = map(
         np.array,
         zip(*(moments(points_inside(RNG, 400), 400) for _ in lattice.local_cells), strict=True),
     )
-    cells = lattice.solid._replace(forms=forms_of(share, squares), volume=H**3 * share.mean(axis=1))
+    cells = lattice.solid._replace(forms=forms_of(fills, second), volume=H**3 * fills.mean(axis=1))
     return Lattice(**(vars(lattice) | {"solid": cells}))
 
 
@@ -192,10 +193,10 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
     """mu |grad|^2 and the second variation of one cell each; and what F sees of strain is what the
     integral sees."""
     count, n = 10_000, 60
-    share, squares = map(
+    fills, second = map(
         np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True)
     )
-    forms, volume = forms_of(share, squares), share.mean(axis=1)
+    forms, volume = forms_of(fills, second), fills.mean(axis=1)
     slopes, _ = slopes_and_modes(forms)
     k = laplacians(forms, volume)
     lowest = np.linalg.eigvalsh(k)[:, 0] / np.trace(k, axis1=1, axis2=2)
@@ -254,9 +255,9 @@ def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
     say."""
     lattice = solid(1, 1, 1, poisson=0.45)
     points = 0.02 * RNG.random((100, 3)) - 0.5
-    share, squares = moments(points, 10**8)
+    fills, second = moments(points, 10**8)
     cells = lattice.solid._replace(
-        forms=forms_of(share[None], squares[None]), volume=H**3 * share.mean(keepdims=True)
+        forms=forms_of(fills[None], second[None]), volume=H**3 * fills.mean(keepdims=True)
     )
     sliver = Lattice(**(vars(lattice) | {"solid": cells}))
     folded, turn = (

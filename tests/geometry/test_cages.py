@@ -29,7 +29,7 @@ from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.geometry.valid_cells import touched_cells
-from msmpetsc.lattice.lattice import topology_of
+from msmpetsc.lattice.topology import topology_of
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
@@ -275,7 +275,7 @@ def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_
             assert np.array_equal(cells["ijk"], cages.ijk) and np.array_equal(
                 cells["kind"], cages.kind
             ), name
-            assert np.array_equal(cells["share"], cages.share), name
+            assert np.array_equal(cells["fills"], cages.fills), name
     assert len(serial["one cell"].kind) == 1
 
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from surfaces import body_of
 
-from msmpetsc.geometry.cages import BOUNDARY, LEAST_SHARE, Cages, fill
+from msmpetsc.geometry.cages import BOUNDARY, LEAST_FILL, Cages, fill
 from msmpetsc.geometry.fill_fractions import Columns
 
 TURN = trimesh.transformations.rotation_matrix(1.1, [3, 2, 1])
@@ -38,16 +38,16 @@ def columns_of(
 
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 @pytest.mark.parametrize("name", BODIES)
-def test_shares_have_the_bodys_volume_and_its_centre(name: str, offset: float):
+def test_fills_have_the_bodys_volume_and_its_centre(name: str, offset: float):
     """Both exactly: the corners' functions sum to 1, and to the position when each is taken times
     its corner's."""
     mesh, h = BODIES[name], 0.17
     columns, cells, origin = columns_of(mesh, h, offset)
-    share, _ = columns.inside(cells)
-    assert share.min() > -1e-12 and share.max() < 1 + 1e-12 and columns.leak < 1e-12
-    assert share.mean(axis=(1, 2, 3)).sum() * h**3 == pytest.approx(mesh.volume, rel=1e-13)
+    fills, _ = columns.inside(cells)
+    assert fills.min() > -1e-12 and fills.max() < 1 + 1e-12 and columns.leak < 1e-12
+    assert fills.mean(axis=(1, 2, 3)).sum() * h**3 == pytest.approx(mesh.volume, rel=1e-13)
     corners = cells[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T
-    centre = np.einsum("cv,cvx->x", share.reshape(-1, 8), corners) * h**4 / 8 / mesh.volume + origin
+    centre = np.einsum("cv,cvx->x", fills.reshape(-1, 8), corners) * h**4 / 8 / mesh.volume + origin
     np.testing.assert_allclose(centre, mesh.center_mass, atol=1e-13)
 
 
@@ -56,18 +56,18 @@ def test_a_plane_through_a_cell_gives_its_corners_what_lies_near_them():
     and 2 z."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], [3, 2, 1.3]])
     columns, _, _ = columns_of(box, 1.0)
-    share, _ = columns.inside(np.array([[1, 1, 1], [1, 1, 0]]))
+    fills, _ = columns.inside(np.array([[1, 1, 1], [1, 1, 0]]))
     np.testing.assert_allclose(
-        share[0], np.broadcast_to([2 * 0.3 - 0.3**2, 0.3**2], (2, 2, 2)), atol=1e-14
+        fills[0], np.broadcast_to([2 * 0.3 - 0.3**2, 0.3**2], (2, 2, 2)), atol=1e-14
     )
-    np.testing.assert_allclose(share[1], 1, atol=1e-14)
+    np.testing.assert_allclose(fills[1], 1, atol=1e-14)
 
 
 def test_corners_of_an_oblique_cell_are_those_of_many_samples():
     mesh, h = BODIES["tilted box"], 0.2
     columns, cells, origin = columns_of(mesh, h)
-    share, _ = columns.inside(cells)
-    cut = np.flatnonzero(np.ptp(share.reshape(-1, 8), axis=1) > 0.3)[:5]
+    fills, _ = columns.inside(cells)
+    cut = np.flatnonzero(np.ptp(fills.reshape(-1, 8), axis=1) > 0.3)[:5]
     assert len(cut) == 5
     points = np.random.default_rng(0).random((40_000, 3))
     functions = np.prod(
@@ -83,7 +83,7 @@ def test_corners_of_an_oblique_cell_are_those_of_many_samples():
         )
         found = 8 * functions[:, inside].sum(axis=1) / len(points)
         np.testing.assert_allclose(
-            share[cell].ravel(), found, atol=0.02
+            fills[cell].ravel(), found, atol=0.02
         )  # 4 standard deviations of a sample
 
 
@@ -91,7 +91,7 @@ def test_corners_of_an_oblique_cell_are_those_of_many_samples():
 
 
 def volume(cages: Cages) -> float:
-    return cages.share.mean(axis=(1, 2, 3)).sum() * cages.grids.cell_size**3
+    return cages.fills.mean(axis=(1, 2, 3)).sum() * cages.grids.cell_size**3
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -102,18 +102,18 @@ def test_the_longest_side_may_be_any_and_faces_may_be_wound_inwards(axis: int):
     top = expected.ijk[:, (axis + 2) % 3] == 3
     assert volume(expected) == pytest.approx(
         mesh.volume, rel=1e-3
-    )  # the least share of corners that are out of it
-    along = np.moveaxis(expected.share[top], 1 + (axis + 2) % 3, -1)[:, :, :, 1]
+    )  # the least fill of corners that are out of it
+    along = np.moveaxis(expected.fills[top], 1 + (axis + 2) % 3, -1)[:, :, :, 1]
     assert along.max() < 0.8**2 + 1e-12
     mesh.invert()
-    np.testing.assert_allclose(fill([body_of(mesh)], 0.1).share, expected.share, atol=1e-12)
+    np.testing.assert_allclose(fill([body_of(mesh)], 0.1).fills, expected.fills, atol=1e-12)
 
 
-def test_no_share_is_less_than_the_least_and_rounding_leaves_whole_cells_whole():
+def test_no_fill_is_less_than_the_least_and_rounding_leaves_whole_cells_whole():
     cages = fill([body_of(BODIES["ball"])], 0.1)
-    assert cages.share.min() == LEAST_SHARE and (cages.share[cages.kind != BOUNDARY] == 1).all()
+    assert cages.fills.min() == LEAST_FILL and (cages.fills[cages.kind != BOUNDARY] == 1).all()
     aligned = trimesh.creation.box(bounds=[[0.1, 0.2, 0.3], [1.0, 0.9, 0.8]])
-    assert (fill([body_of(aligned)], 0.1).share == 1).all()
+    assert (fill([body_of(aligned)], 0.1).fills == 1).all()
 
 
 def test_an_open_surface_is_sampled_to_about_a_hundredth():
@@ -122,7 +122,7 @@ def test_an_open_surface_is_sampled_to_about_a_hundredth():
     ball.update_faces(np.arange(len(ball.faces)) > 3)
     sampled = fill([body_of(ball)], 0.2)
     assert np.array_equal(sampled.ijk, closed.ijk)
-    error = (sampled.share - closed.share).mean(axis=(1, 2, 3))
+    error = (sampled.fills - closed.fills).mean(axis=(1, 2, 3))
     assert np.sqrt((error**2).mean()) < 0.02 and volume(sampled) == pytest.approx(
         volume(closed), rel=0.01
     )
@@ -134,7 +134,7 @@ def test_triangles_wound_against_each_other_are_told_and_cells_count_whole(
     ball = trimesh.creation.icosphere(3)
     ball.faces[:7] = ball.faces[:7, ::-1]
     with caplog.at_level(logging.WARNING, "msmpetsc"):
-        assert fill([body_of(ball)], 0.2).share is None
+        assert fill([body_of(ball)], 0.2).fills is None
     assert (
         'wound against each other, so boundary cells count whole: prepare = ["orient"]'
         in caplog.text

@@ -261,8 +261,9 @@ class Step:
 
 
 def test_a_step_is_computed_once_for_the_same_mesh_and_value_and_again_where_its_file_is_damaged(
-    folder,
+    folder, monkeypatch
 ):
+    """Another version of the steps takes nothing from the cache."""
     step = Step()
     first, again = cached(step, BODY, 3.0), cached(step, BODY, 3.0)
     assert (
@@ -283,6 +284,9 @@ def test_a_step_is_computed_once_for_the_same_mesh_and_value_and_again_where_its
     ):
         assert np.array_equal(cached(step, surface, value).points, value * surface.points)
     assert step.calls == 7
+    monkeypatch.setattr(steps, "VERSION", steps.VERSION + 1)
+    cached(step, BODY, 3.0)
+    assert step.calls == 8
 
 
 def test_small_meshes_are_not_kept_and_old_files_go(folder, monkeypatch):

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from msmpetsc.build import build_model
 from msmpetsc.fields import FRAME_FIELDS, Frame
-from msmpetsc.results.reader import finished
+from msmpetsc.results.untrusted_file import finished
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.simulate import TimeLoop

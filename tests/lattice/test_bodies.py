@@ -18,7 +18,7 @@ from msmpetsc.build import build_model
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import BodyGrids
 from msmpetsc.geometry.morton import LIMIT, encode_morton
-from msmpetsc.lattice.lattice import CORNERS
+from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.results.comparison import compare
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.metrics import distance_of_shapes, shape_error

@@ -14,8 +14,8 @@ from surfaces import body_of
 
 from msmpetsc.build import nearest_of_body
 from msmpetsc.geometry.cages import fill
-from msmpetsc.lattice.cut_cells import CORNERS, shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.lattice import topology_of
+from msmpetsc.lattice.cut_cells import CORNERS, mass_fractions, spring_fractions
+from msmpetsc.lattice.topology import topology_of
 
 DENSITY = study.DENSITY
 bar_errors = cache(lambda name, size: study.bar_errors(*BARS[name], size * study.RADIUS, "fill")[1])
@@ -30,20 +30,20 @@ def tilted_box() -> trimesh.Trimesh:
     return box.apply_transform(trimesh.transformations.rotation_matrix(1.1, [3, 2, 1]))
 
 
-def test_springs_have_the_mean_share_of_the_corners_that_agree_with_both_ends():
-    share = np.random.default_rng(0).random((5, 8))
-    of_pairs = shares_of_pairs(share)
+def test_springs_have_the_mean_fill_of_the_corners_that_agree_with_both_ends():
+    fills = np.random.default_rng(0).random((5, 8))
+    of_pairs = spring_fractions(fills)
     a, b = 0, int(np.flatnonzero((CORNERS == [1, 0, 0]).all(axis=1))[0])
-    np.testing.assert_allclose(of_pairs[:, a, b], share[:, [a, b]].mean(axis=1))
+    np.testing.assert_allclose(of_pairs[:, a, b], fills[:, [a, b]].mean(axis=1))
     diagonal = int(np.flatnonzero((CORNERS == [1, 0, 1]).all(axis=1))[0])
-    np.testing.assert_allclose(of_pairs[:, a, diagonal], share[:, CORNERS[:, 1] == 0].mean(axis=1))
+    np.testing.assert_allclose(of_pairs[:, a, diagonal], fills[:, CORNERS[:, 1] == 0].mean(axis=1))
     opposite = int(np.flatnonzero((CORNERS == [1, 1, 1]).all(axis=1))[0])
-    np.testing.assert_allclose(of_pairs[:, a, opposite], share.mean(axis=1))
-    np.testing.assert_allclose(shares_of_mass(of_pairs).sum(axis=1), share.sum(axis=1))
+    np.testing.assert_allclose(of_pairs[:, a, opposite], fills.mean(axis=1))
+    np.testing.assert_allclose(mass_fractions(of_pairs).sum(axis=1), fills.sum(axis=1))
 
 
 def test_uniform_strain_costs_the_energy_of_the_volume_inside():
-    """Of a box askew in the grid: u^T H u = C volume of any uniform strain, but for the least share
+    """Of a box askew in the grid: u^T H u = C volume of any uniform strain, but for the least fill
     of corners."""
     box = tilted_box()
     lattice = study.lattice_of(box, 0.06, "fill")

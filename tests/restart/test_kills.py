@@ -16,7 +16,7 @@ from conftest import ENVIRONMENT, WORKERS, run
 from stopped_runs import assert_same, hanging
 
 from msmpetsc.fields import FRAME_FIELDS
-from msmpetsc.results.reader import finished
+from msmpetsc.results.untrusted_file import finished
 from msmpetsc.solve.simulate import REMEMBERED
 
 pytestmark = pytest.mark.slow

@@ -31,8 +31,8 @@ from msmpetsc.app.resume import Resumed
 from msmpetsc.build import build_model
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
-from msmpetsc.results.reader import finished
-from msmpetsc.results.restart import Earlier
+from msmpetsc.results.checkpoint_reader import Earlier
+from msmpetsc.results.untrusted_file import finished
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.presets import PRESETS
 from msmpetsc.solve.simulate import TimeLoop

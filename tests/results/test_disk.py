@@ -11,7 +11,7 @@ from one_process import command_error
 from stopped_runs import assert_same, at_step, every_step_forgets, hanging  # noqa: F401  # a fixture
 
 from msmpetsc.cli.main import main
-from msmpetsc.results.reader import finished
+from msmpetsc.results.untrusted_file import finished
 
 STEPS, BEFORE = 12, 5  # steps; the one after which there is no room
 FINE = {"cages": {"cell_size": 1 / 32}, "output": {"surface": False}}  # 2,601 nodes, 62 kB a frame

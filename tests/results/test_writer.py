@@ -16,7 +16,8 @@ from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.errors import InputError
 from msmpetsc.fields import FIELDS, FRAME_FIELDS
 from msmpetsc.results import writer
-from msmpetsc.results.reader import finished, newest_slot, open_result
+from msmpetsc.results.checkpoint_reader import newest_slot
+from msmpetsc.results.untrusted_file import finished, open_result
 from msmpetsc.results.writer import Begin, ResultFile
 
 WORKER = WORKERS / "frames_worker.py"

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.problems import EXAMPLES
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.suggestions import EXAMPLES
 
 EXAMPLE = """\
 title = "Bunny falls and leaps"

@@ -142,7 +142,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     if direction is None:  # a bound by the load factor
         stepper.jacobian.hessian.linearise(q, None, projected=True)
         load = 1 - eigh(dense, dense_hessian(stepper), eigvals_only=True)[0]
-        assert 0.85 * load < curvature.load < load + 1e-9 and 0.5 <= found <= lowest
+        assert 0.85 * load < curvature.load_factor.value < load + 1e-9 and 0.5 <= found <= lowest
     else:
         # below 0 a direction is a mix of the modes that are nearly as low
         rayleigh = direction @ dense @ direction / (direction**2 @ functional.mass)

@@ -55,13 +55,13 @@ def fill_to_file(mesh: Path, cell_size: float) -> None:
     """Writes all cells in the order of the ranks beside the mesh."""
     cages = fill([body_of(mesh)], cell_size)
     assert comm.allreduce(len(cages.kind)) == cages.table.total
-    parts = comm.gather((cages.table.first, cages.ijk, cages.kind, cages.share))
+    parts = comm.gather((cages.table.first, cages.ijk, cages.kind, cages.fills))
     if comm.rank == 0:
         assert [part[0] for part in parts] == sorted(part[0] for part in parts)
-        ijk, kind, share = (
+        ijk, kind, fills = (
             np.concatenate([part[column] for part in parts]) for column in (1, 2, 3)
         )
-        np.savez(mesh.with_suffix(".cells.npz"), ijk=ijk, kind=kind, share=share)
+        np.savez(mesh.with_suffix(".cells.npz"), ijk=ijk, kind=kind, fills=fills)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ from msmpetsc.results.comparison import (
     point_text,
     rest_of,
 )
-from msmpetsc.results.reader import Result, refuse_deadly
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import refuse_deadly
 
 HEAD = (
     f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"

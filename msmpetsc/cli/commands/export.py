@@ -3,7 +3,7 @@
 import argparse
 
 from msmpetsc.export.formats import export
-from msmpetsc.results.reader import refuse_deadly
+from msmpetsc.results.untrusted_file import refuse_deadly
 
 
 def run(args: argparse.Namespace) -> int:

@@ -27,9 +27,9 @@ from msmpetsc.geometry.cell_size import (
     warn_of_thin_bodies,
 )
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.lattice.lattice import topology_of
 from msmpetsc.lattice.partition_counts import Partition, count_partition
 from msmpetsc.lattice.region import listed
+from msmpetsc.lattice.topology import topology_of
 from msmpetsc.scene.body import CagesTable
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.petsc.initialise import initialise

@@ -17,7 +17,8 @@ from msmpetsc.app.checks import (
 )
 from msmpetsc.errors import InputError
 from msmpetsc.results.frame_choice import Frames, frames_of
-from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
-from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import plain_damage, refuse_deadly
 from msmpetsc.scene.schema import SceneFile, held_by
 from msmpetsc.view.drawable import read_scene
 

@@ -25,9 +25,10 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.friction import STICK
+from msmpetsc.contact.surface.continuous_collision import candidates_on_ways
 from msmpetsc.contact.surface.creases import creases, neighbours
 from msmpetsc.contact.surface.places import PairSet, Places, without_fading_links
-from msmpetsc.contact.surface.surface_friction import RubbingPairs, SurfaceFriction, rubbing_pairs
+from msmpetsc.contact.surface.surface_friction import FrictionPairs, SurfaceFriction, friction_pairs
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
@@ -42,15 +43,6 @@ ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"
 
 # Young's modulus over k_1 / h (lattice.material)
 PER_EDGE = 7 / 4
-# Share of the way to a crossing that a step takes
-KEPT = 0.9
-# Edges that points move in a piece of a long way
-PIECE = 2.0
-# Most pieces of a way; a longer way is shortened
-PIECES = 200
-# Greatest linear part of a way that boxes leave out; beyond, its allowance makes boxes
-# larger
-STRETCHED = 0.2
 
 
 @dataclass(frozen=True)
@@ -97,9 +89,9 @@ class BarrierLaw:
 class Barrier:
     """Barrier of a surface, by positions S (p, 3) [m] of its points.
 
-    bodies : number of points of bodies, which come first; obstacles do not meet each other
-    edge   : mean length of the bodies' edges at rest [m]
-    rubbed : points (p, 3) at which friction's pairs were computed last, and these pairs
+    bodies        : number of points of bodies, which come first; obstacles do not meet each other
+    edge          : mean length of the bodies' edges at rest [m]
+    last_friction : points (p, 3) at which pairs with friction were computed last, and these pairs
     """
 
     def __init__(self, surface: Surface, law: BarrierLaw, bodies: int, meets_itself: bool = True):
@@ -128,7 +120,7 @@ class Barrier:
         self.creases: PairSets = (PairSet(ipctk.Candidates()),)
         # Pairs of creases by kind, with their points (k, 4)
         self._creased: list[list[tuple[list[Any], Indices]]] = []
-        self.rubbed: tuple[Positions, RubbingPairs] | None = None
+        self.last_friction: tuple[Positions, FrictionPairs] | None = None
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
         """Return the barrier of a distance [m], with the law's stiffness over a depth."""
@@ -200,29 +192,18 @@ class Barrier:
     def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> PairSets:
         """Return the pairs that may come closer than dhat, and all pairs of creases.
 
-        Each point x may move by ``reach`` [m], from its place or from its straight way ``moved``.
-        The linear part of the ways, m = c + G x + r, would enlarge the boxes around them. If a pair
-        is closer than d on its way, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
-        ``|x - x'| < (d + 2 max |r|) / (1 - |G|)``, and boxes around r suffice.
+        Each point may move by ``reach`` [m], from its place or from its straight way ``moved``.
 
         points : (p, 3) [m]
         moved  : (p, 3) [m]; None if points stay
         """
-        candidates, ends, near = (
-            self.ipctk.Candidates(),
-            [np.asfortranarray(points)],
-            self.law.distance + 2 * reach,
-        )
-        if moved is not None:
-            rest, linear = _without_linear_part(points, moved)
-            ends += [np.asfortranarray(points + rest)]
-            near += linear / (1 - linear) * (near + 2 * float(np.linalg.norm(rest, axis=1).max()))
-        candidates.build(self.mesh, *ends, 0.5 * near, self.ipctk.LBVH())
+        near = self.law.distance + 2 * reach
+        pairs = PairSet(candidates_on_ways(self.mesh, points, near, moved))
         cushions = (
             self._cushion(points, distance + 2 * reach)
             for distance in self.distances[len(self.creases) :]
         )
-        return PairSet(candidates), *self.creases[1:], *cushions
+        return pairs, *self.creases[1:], *cushions
 
     @contextmanager
     def cushioned(self, distance: float) -> Iterator[None]:
@@ -338,7 +319,7 @@ class Barrier:
         start : (p, 3) positions of points without slip [m]
         stick : slip below which friction fades [m]
         """
-        pairs = self._rubbing(contacts, points)
+        pairs = self._friction_pairs(contacts, points)
         if not len(pairs.push):
             return None
         limit, slips = self.law.friction * pairs.push, pairs.slips(points)
@@ -346,23 +327,23 @@ class Barrier:
 
     def friction_limits(self, contacts: ContactSets, points: Positions) -> tuple[Indices, Floats]:
         """Return points (a, 4) of pairs, -1 for none, and mu N (a,) [N] at points (p, 3) [m]."""
-        pairs = self._rubbing(contacts, points)
+        pairs = self._friction_pairs(contacts, points)
         return pairs.numbers, self.law.friction * pairs.push
 
-    def _rubbing(self, contacts: ContactSets, points: Positions) -> RubbingPairs:
+    def _friction_pairs(self, contacts: ContactSets, points: Positions) -> FrictionPairs:
         """Return the pairs with friction at points (p, 3) [m].
 
         A step begins with the pairs that the last step ended with.
         """
-        if self.rubbed is None or not np.array_equal(self.rubbed[0], points):
+        if self.last_friction is None or not np.array_equal(self.last_friction[0], points):
             found = []
             for potential, pairs in self._pushing(contacts):
                 found.append(self.ipctk.TangentialCollisions())
                 found[-1].build(
                     self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction
                 )
-            self.rubbed = points, rubbing_pairs(found, self.mesh)
-        return self.rubbed[1]
+            self.last_friction = points, friction_pairs(found, self.mesh)
+        return self.last_friction[1]
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite without contacts."""
@@ -391,45 +372,3 @@ class Barrier:
             if len(near) + len(pairs)
         )
         return min(least, default=self.law.distance)
-
-    def free_share(self, start: Positions, moved: Rows, sets: PairSets) -> float:
-        """Return the free share, by CCD, of the ways from start (p, 3) by ``moved`` (p, 3) [m].
-
-        sets : candidate pairs of the ways
-        """
-        share = self._share(start, start + moved - moved.mean(axis=0), sets)
-        return share if share >= 1 else KEPT * share
-
-    def sweep(self, start: Positions, moved: Rows) -> float:
-        """Return the free share of ways of any length, with candidates of each piece."""
-        moved = moved - moved.mean(axis=0)
-        whole = max(
-            int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * self.edge))), 1
-        )
-        for piece in range(min(whole, PIECES)):
-            begin, end = (start + i / whole * moved for i in (piece, piece + 1))
-            share = self._share(begin, end, self.candidates(begin, 0.0, end - begin))
-            if share < 1:
-                return KEPT * (piece + share) / whole
-        return 1.0 if whole <= PIECES else PIECES / whole
-
-    def _share(self, start: Positions, end: Positions, sets: PairSets) -> float:
-        """Return the share of ways up to the first crossing of candidates."""
-        ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
-        shares = (
-            pairs.candidates.compute_collision_free_stepsize(*ways)
-            for pairs in sets[: len(self.creases)]
-            if len(pairs)
-        )
-        return min(shares, default=1.0)
-
-
-def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
-    """Return displacements (p, 3) [m] without their linear part, and the norm of that part.
-
-    A linear part above STRETCHED stays, and its norm counts as 0.
-    """
-    x, rest = points - points.mean(axis=0), moved - moved.mean(axis=0)
-    linear = np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ rest)
-    size = float(np.linalg.norm(linear, 2))
-    return (rest - x @ linear, size) if size < STRETCHED else (rest, 0.0)

@@ -19,7 +19,7 @@ from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
-from msmpetsc.geometry.grid import SAME
+from msmpetsc.geometry.grid import ON_PLANE
 from msmpetsc.geometry.prepare import simplify
 from msmpetsc.geometry.surface import Surface, compact, joined, outward
 from msmpetsc.lattice.lattice import Lattice
@@ -107,9 +107,9 @@ def _prepared(
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
         longest = max(float(np.linalg.norm(np.ptp(body.points, axis=0))) for body in bodies)
-        # Points within SAME of a plane of the grid snap to it, which would close a
+        # Points within ON_PLANE of a plane of the grid snap to it, which would close a
         # smaller gap
-        gap = max(NEAREST * (table.distance or NEAR * longest), 2 * SAME * longest)
+        gap = max(NEAREST * (table.distance or NEAR * longest), 2 * ON_PLANE * longest)
         bodies = _without_cut(_parted(bodies, gap))
     ends = np.concatenate(
         [b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies]

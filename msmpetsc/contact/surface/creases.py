@@ -74,7 +74,7 @@ def _cross_pairs(
 
 
 def creases(
-    apart: Mapping[tuple[int, int], bool],
+    near: Mapping[tuple[int, int], bool],
     mesh: "ipctk.CollisionMesh",
     points: Positions,
     distance: float,
@@ -83,13 +83,13 @@ def creases(
 
     The greatest distance comes first.
 
-    apart    : {(i, j): False} of the points of neighbours
+    near     : {(i, j): False} of the points of neighbours
     points   : (p, 3) [m] at rest
     distance : dhat [m]
     """
     import ipctk
 
-    points, pairs = np.asfortranarray(points), _left_out(apart, mesh, len(points))
+    points, pairs = np.asfortranarray(points), _left_out(near, mesh, len(points))
     squares = [pair.compute_distance(points, mesh.edges, mesh.faces) for pair in pairs]
     lengths = np.sqrt(np.array(squares, float)) / distance
     finer = np.ceil(np.log(ROOM / np.maximum(lengths, NEAREST)) / np.log(FINER)).clip(0).astype(int)
@@ -108,7 +108,7 @@ def creases(
 
 
 def _left_out(
-    apart: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
+    near: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
 ) -> list["ipctk.FaceVertexCandidate | ipctk.EdgeEdgeCandidate"]:
     """Return the pairs of a point and a triangle and of two edges that are neighbours altogether.
 
@@ -116,9 +116,9 @@ def _left_out(
     """
     import ipctk
 
-    if not apart:
+    if not near:
         return []
-    ends = np.array(list(apart)).T
+    ends = np.array(list(near)).T
     met = coo_array(
         (np.ones(2 * ends.shape[1]), np.hstack([ends, ends[::-1]])), shape=(points, points)
     ).tocsr()

@@ -98,17 +98,17 @@ def _add(
 
 
 @njit()
-def _to_edge(along: Vector, apart: Vector) -> tuple[float, int]:
+def _to_edge(along: Vector, vertex: Vector) -> tuple[float, int]:
     """Return the squared distance [m^2] of a vertex from an edge, and where the nearest point is.
 
     The nearest point is at an end of the edge (0, 1) or between the ends (2).
     Ericson 2005, Real-Time Collision Detection, 5.1.2.
 
-    along : from the edge's first end to its second [m]
-    apart : from the edge's first end to the vertex [m]
+    along  : from the edge's first end to its second [m]
+    vertex : from the edge's first end to the vertex [m]
     """
-    share = min(max(dot(apart, along) / dot(along, along), 0.0), 1.0)
-    x = apart[0] - share * along[0], apart[1] - share * along[1], apart[2] - share * along[2]
+    share = min(max(dot(vertex, along) / dot(along, along), 0.0), 1.0)
+    x = vertex[0] - share * along[0], vertex[1] - share * along[1], vertex[2] - share * along[2]
     return dot(x, x), 0 if share == 0.0 else 1 if share == 1.0 else BETWEEN
 
 
@@ -136,19 +136,19 @@ def _over(a: Vector, b: Vector, c: Vector, normal: Vector) -> float:
 
 
 @njit()
-def _crossing(first: Vector, second: Vector, apart: Vector) -> tuple[float, float]:
+def _crossing(first: Vector, second: Vector, offset: Vector) -> tuple[float, float]:
     """Return the squared distance [m^2] of the lines of two edges, and |first x second|^2 [m^4].
 
     The distance is infinite unless both nearest points are between the ends. Ericson 2005, 5.1.9.
 
-    apart : from the first edge's first end to the second edge's [m]
+    offset : from the first edge's first end to the second edge's [m]
     """
     normal = cross(first, second)
     sine = dot(normal, normal)
-    s, t = dot(cross(apart, second), normal), dot(cross(apart, first), normal)
+    s, t = dot(cross(offset, second), normal), dot(cross(offset, first), normal)
     inside = 0.0 < s < sine and 0.0 < t < sine
     if inside and sine > NO_NORMAL * dot(first, first) * dot(second, second):
-        return dot(apart, normal) ** 2 / sine, sine
+        return dot(offset, normal) ** 2 / sine, sine
     return math.inf, sine
 
 

@@ -15,14 +15,14 @@ from msmpetsc.scene.reading import Scene
 
 # Longest edge of an obstacle, in edges of the bodies; larger triangles would push
 # stiffly
-EDGES = 4.0
+LONGEST_EDGE = 4.0
 # Triangles of an obstacle beyond which it is not split
-MOST = 10_000
+MOST_TRIANGLES = 10_000
 # Subdivisions of an icosahedron; it is then 5e-4 of its radius off the ball
 ROUND = 4
 # Distance from an obstacle beyond which nodes change to their own way [cells, or longer
 # ways]
-BESIDE = 4.0
+NEARBY = 4.0
 # Least distance of inverse distances [cells]
 TOUCHING = 1e-9
 
@@ -107,7 +107,7 @@ class ObstacleSurfaces:
             weight = 1 / np.maximum(distance, TOUCHING * cell)
             way, weights = way + weight * of_obstacle, weights + weight
             length = np.maximum(np.linalg.norm(of_obstacle, axis=1), cell)[:, None]
-            near = np.maximum(near, (1 + (BESIDE * cell - distance) / (BESIDE * length)).clip(0, 1))
+            near = np.maximum(near, (1 + (NEARBY * cell - distance) / (NEARBY * length)).clip(0, 1))
         return moved + near * (way / weights - moved)
 
 
@@ -116,7 +116,7 @@ def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> O
     numbers = [number for number, table in enumerate(scene.obstacle) if table.response == BARRIER]
     met = [obstacles[number] for number in numbers]
     whole = (_surface_of(scene.obstacle[number], obstacles[number]) for number in numbers)
-    return ObstacleSurfaces(numbers, met, [_split(solid, EDGES * edge) for solid in whole])
+    return ObstacleSurfaces(numbers, met, [_split(solid, LONGEST_EDGE * edge) for solid in whole])
 
 
 def _surface_of(table: ObstacleTable, obstacle: Obstacle) -> Surface:
@@ -131,13 +131,13 @@ def _surface_of(table: ObstacleTable, obstacle: Obstacle) -> Surface:
 
 
 def _split(surface: Surface, longest: float) -> Surface:
-    """Return a surface with no edge longer than this [m], or of MOST triangles.
+    """Return a surface with no edge longer than this [m], or of MOST_TRIANGLES triangles.
 
     The longest edge of each triangle is halved.
     """
     points = surface.points
     triangles = surface.triangles
-    while len(triangles) < MOST:
+    while len(triangles) < MOST_TRIANGLES:
         lengths = np.linalg.norm(points[np.roll(triangles, -1, axis=1)] - points[triangles], axis=2)
         long = lengths.max(axis=1) > longest
         if not long.any():

@@ -19,7 +19,8 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import PIECE, Barrier, BarrierLaw, ContactSets, PairSets
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, PairSets
+from msmpetsc.contact.surface.continuous_collision import PIECE, free_share, sweep
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -36,7 +37,7 @@ AHEAD = 2.0
 # Share of points in contact from which a second solve costs more than narrow steps save
 FEW = 0.01
 # Relative difference of two sums of contact energy by rounding
-SAME = 1e-9
+SAME_ENERGY = 1e-9
 TINY = np.finfo(float).tiny
 
 
@@ -143,7 +144,7 @@ class NearPairs:
 
     def around(self, q: Positions, time: float) -> Pairs:
         """Return the newest candidates, or those at q if there are none yet."""
-        return self._known[0] if self._known else self.look(q, time, self.law.distance)
+        return self._known[0] if self._known else self.broad_phase(q, time, self.law.distance)
 
     def serving(self, *places: Positions) -> Pairs | None:
         """Return the newest candidates that serve all these places (p, 3) [m] of points.
@@ -159,7 +160,9 @@ class NearPairs:
         self._known.insert(0, self._known.pop(number))
         return self._known[0]
 
-    def look(self, q: Positions, time: float, reach: float, moved: Rows | None = None) -> Pairs:
+    def broad_phase(
+        self, q: Positions, time: float, reach: float, moved: Rows | None = None
+    ) -> Pairs:
         """Find candidates at q, or on the ways of points from there by ``moved`` (p, 3) [m]."""
         points, reach = (
             self.points(q, time),
@@ -196,7 +199,7 @@ class NearPairs:
         """Forget all candidates, so that the next step does not depend on earlier steps."""
         self._known = []
         if self.barrier:
-            self.barrier.rubbed = None
+            self.barrier.last_friction = None
 
 
 class Contacts:
@@ -205,9 +208,9 @@ class Contacts:
     Positions are (owned or more, 3) [m]. Obstacles have their places at the end of the step unless
     another time is given.
 
-    before    : contacts of the last step, whose end is known
-    is_narrow : whether only candidates around some contacts are used
-    apart     : whether the step is narrow without contacts, so that the surface is left out
+    before      : contacts of the last step, whose end is known
+    is_narrow   : whether only candidates around some contacts are used
+    is_left_out : whether the step is narrow without contacts, so that the surface is left out
     """
 
     def __init__(
@@ -216,7 +219,7 @@ class Contacts:
         self.begin, self.time = begin, time
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
-        self.is_narrow = self.apart = False
+        self.is_narrow = self.is_left_out = False
         # Candidates of a narrow step, and whether they are around each point (p,), on
         # rank 0
         self._around: PairSets = ()
@@ -248,7 +251,7 @@ class Contacts:
             return ContactsAt(q, time, 0, np.empty((0, 3)), ())
         points = self.points_at(q, time)
         if bound > pairs.reach and not self.is_narrow:
-            pairs = self.near.serving(points) or self._look(q, time, points, base)
+            pairs = self.near.serving(points) or self._broad_phase(q, time, points, base)
         sets = self._around if self.is_narrow else pairs.sets
         contacts = self.barrier.contacts(sets, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
@@ -269,31 +272,31 @@ class Contacts:
             touched = self.barrier.gradient(moment.contacts, moment.points).any(axis=1)
             touched = touched if self._touched is None else touched | self._touched
         self.is_narrow = self.comm.bcast(touched is None or touched.mean() < FEW)
-        self._moments, self._touched, self.apart = (
+        self._moments, self._touched, self.is_left_out = (
             [moment],
             touched,
             self.is_narrow and moment.count == 0,
         )
-        points = self.points_at(q, self.time) if self.is_narrow and not self.apart else None
+        points = self.points_at(q, self.time) if self.is_narrow and not self.is_left_out else None
         if self.barrier and points is not None and touched is not None:
             self._around = self.barrier.around(touched, points, FARTHEST * self.near.edge)
         return self.is_narrow
 
     def widen(self) -> None:
         """Use all candidates."""
-        self.is_narrow, self.apart, self._moments = False, False, []
+        self.is_narrow, self.is_left_out, self._moments = False, False, []
 
     @contextmanager
     def cushioned(self, distance: float) -> Iterator[None]:
         """Let obstacles also push from a larger ``distance`` [m] in the context."""
         with self.barrier.cushioned(distance) if self.barrier else nullcontext():
-            self._look_anew()
+            self._find_anew()
             try:
                 yield
             finally:
-                self._look_anew()
+                self._find_anew()
 
-    def _look_anew(self) -> None:
+    def _find_anew(self) -> None:
         """Use all candidates, of a new broad phase."""
         self.widen()
         self.near.forget()
@@ -305,28 +308,32 @@ class Contacts:
         From then on all candidates are used. If the way is free and x is not right, the step stays
         narrow, with the candidates around all contacts at x.
         """
-        known = Touch() if self.apart else self.touch(x, self.time)
+        known = Touch() if self.is_left_out else self.touch(x, self.time)
         self.widen()
         pairs, bound = self._bound(q, self.begin, x)
         ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
         # The next steps then need no broad phase
         if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:
-            self.near.look(x, self.time, ahead)
+            self.near.broad_phase(x, self.time, ahead)
         self.find(x, base=q)
         found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
-        is_right = free and abs(found.energy - known.energy) <= SAME * known.energy + left_out
+        is_right = (
+            free and abs(found.energy - known.energy) <= SAME_ENERGY * known.energy + left_out
+        )
         if free and not is_right:
             self.narrow(x, self.time)
         return free, is_right
 
-    def _look(self, q: Positions, time: float, points: Positions, base: Positions | None) -> Pairs:
+    def _broad_phase(
+        self, q: Positions, time: float, points: Positions, base: Positions | None
+    ) -> Pairs:
         """Find candidates at q, with points S (p, 3) [m], and on a short way there from base."""
         moved = None if base is None else self.points_at(base, time) - points
         if self.comm.bcast(
             moved is not None and len(moved) > 0 and farthest(moved) > PIECE * self.near.edge
         ):
             moved = None
-        return self.near.look(q, time, LEAST * self.near.edge, moved)
+        return self.near.broad_phase(q, time, LEAST * self.near.edge, moved)
 
     def points_at(self, q: Positions, time: float) -> Positions:
         """Return the points (p, 3) [m] at q and a time [s] on rank 0; (0, 3) elsewhere."""
@@ -399,11 +406,11 @@ class Contacts:
             serving = self.near.serving(start, start + moved)
             if not serving and way > PIECE * self.near.edge:
                 return float(
-                    self.comm.bcast(self.barrier.sweep(start, moved) if self.barrier else 1.0)
+                    self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
                 )
-            sets = (serving or self.near.look(q, begin, LEAST * self.near.edge, moved)).sets
+            sets = (serving or self.near.broad_phase(q, begin, LEAST * self.near.edge, moved)).sets
         return float(
-            self.comm.bcast(self.barrier.free_share(start, moved, sets) if self.barrier else 1.0)
+            self.comm.bcast(free_share(self.barrier, start, moved, sets) if self.barrier else 1.0)
         )
 
     def _clearance(self, q: Positions, time: float) -> float:

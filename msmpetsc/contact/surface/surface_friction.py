@@ -19,26 +19,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RubbingPairs:
+class FrictionPairs:
     """Pairs of parts that press on each other.
 
     numbers : (a, 4) points of each pair, -1 for none, of its first part, then of its second
-    shares  : (a, 4) weights of these points in the vector from the second part to the first
+    weights : (a, 4) of these points in the vector from the second part to the first
     push    : (a,) normal force N [N]
     """
 
     numbers: Indices
-    shares: Rows
+    weights: Rows
     push: Floats
 
     def slips(self, points: Positions) -> bsr_array:
         """Return the matrix (3a, 3p) from displacements to tangential slips at points (p, 3)."""
-        apart = np.einsum("ai,aic->ac", self.shares, points[self.numbers])
-        normal = apart / np.linalg.norm(apart, axis=1)[:, None]
+        gap = np.einsum("ai,aic->ac", self.weights, points[self.numbers])
+        normal = gap / np.linalg.norm(gap, axis=1)[:, None]
         plane = np.eye(3) - squares(normal)
         of_pair, corner = np.nonzero(self.numbers >= 0)
         begin = np.append(0, np.cumsum((self.numbers >= 0).sum(axis=1)))
-        blocks = self.shares[of_pair, corner, None, None] * plane[of_pair]
+        blocks = self.weights[of_pair, corner, None, None] * plane[of_pair]
         shape = 3 * len(self.numbers), points.size
         return bsr_array((blocks, self.numbers[of_pair, corner], begin), shape=shape)
 
@@ -48,7 +48,7 @@ class SurfaceFriction(Friction):
     """Friction of pairs of a surface's parts.
 
     start : (p, 3) positions of points without slip [m]
-    pairs : (a, 4) points of each pair, -1 for none (``RubbingPairs``)
+    pairs : (a, 4) points of each pair, -1 for none (``FrictionPairs``)
     slips : (3a, 3p) from displacements of all points to the slips of pairs
     """
 
@@ -90,15 +90,15 @@ class SurfaceFriction(Friction):
         return csr_array(self.slips.T @ (middle @ self.slips))
 
 
-def rubbing_pairs(
+def friction_pairs(
     found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
-) -> RubbingPairs:
+) -> FrictionPairs:
     """Return the pairs of some sets that push, their pushes lessened by links of negative weight.
 
     The vertex or edge with the lesser first number is first, since ipctk has no order of its own.
     """
     point, edge, face = np.arange(mesh.num_vertices)[:, None], mesh.edges, mesh.faces
-    numbers, shares, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]
+    numbers, weights, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]
     for built in found:
         # Each kind is a copy: a loop over ``built`` itself may crash (ipctk 1.6)
         for pairs, *parts in (
@@ -126,12 +126,12 @@ def rubbing_pairs(
                 one, other = np.where(turned, other, one), np.where(turned, one, other)
             missing = (0, 0), (0, 4 - of_first.shape[1] - of_second.shape[1])
             numbers.append(np.pad(np.hstack([of_first, of_second]), missing, constant_values=-1))
-            shares.append(np.pad(np.hstack([one, -other]), missing))
+            weights.append(np.pad(np.hstack([one, -other]), missing))
             push.append(np.array([pair.weight * pair.normal_force_magnitude for pair in pairs]))
     every, pushes = np.concatenate(numbers), np.concatenate(push)
     kept = pushes > 0
     lessened = _less_links(every, pushes, mesh.num_vertices)
-    return RubbingPairs(every[kept], np.concatenate(shares)[kept], lessened[kept])
+    return FrictionPairs(every[kept], np.concatenate(weights)[kept], lessened[kept])
 
 
 def _less_links(numbers: Indices, push: Floats, points: int) -> Floats:

@@ -89,12 +89,14 @@ class SurfaceContact:
 
     All methods are collective. Positions are (owned or more, 3) [m].
 
-    start    : positions at the start of the step
-    last     : positions one step before in a step of BDF2, whose friction goes by the end velocity
-    end      : end of an earlier solve of the step, whose normal forces are taken; None: the start's
-    before   : contact in the last step
-    rubs     : whether there is friction
-    friction : of the step, on rank 0
+    start        : positions at the start of the step
+    last         : positions one step before in a step of BDF2, whose friction goes by the end
+                   velocity
+    end          : end of an earlier solve of the step, whose normal forces are taken; None: the
+                   start's
+    before       : contact in the last step
+    has_friction : whether there is friction
+    friction     : of the step, on rank 0
     """
 
     def __init__(
@@ -107,14 +109,14 @@ class SurfaceContact:
         before: "SurfaceContact | None" = None,
     ):
         self.contacts, self.comm = contacts, contacts.comm
-        self.rubs = False
+        self.has_friction = False
         self.friction: SurfaceFriction | None = None
         # The last Hessians, projected or not
         self._hessians: dict[bool, tuple[ContactsAt, Rows | None, SurfaceHessian]] = {}
         if contacts.law.friction > 0:
             moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
-            self.rubs = moment.count > 0
-            if self.rubs:
+            self.has_friction = moment.count > 0
+            if self.has_friction:
                 points = contacts.points_at(start, contacts.begin)
                 came = None if last is None else contacts.points.moved(start - last[: len(start)])
                 friction = self._friction(moment, points, came, time_step, end is None)
@@ -167,8 +169,8 @@ class SurfaceContact:
 
         base : start of a way to q
         """
-        moment = self.contacts.find(q, with_points=self.rubs, base=base)
-        return moment if moment.count or self.rubs else None
+        moment = self.contacts.find(q, with_points=self.has_friction, base=base)
+        return moment if moment.count or self.has_friction else None
 
     def presses(self, q: Positions) -> bool:
         """Return whether contact acts at q."""
@@ -183,15 +185,15 @@ class SurfaceContact:
         before, after = self._acting(base), self._acting(q, base)
         if after is None and before is None:
             return 0.0
-        is_small, rubbed = self._is_small(q, base), 0.0
+        is_small, of_friction = self._is_small(q, base), 0.0
         moved = self.contacts.points.moved(q - base) if is_small else None
         if self.friction and after and before:
-            rubbed = self.friction.change(after.points, before.points, moved)
+            of_friction = self.friction.change(after.points, before.points, moved)
         if moved is not None:
-            return rubbed + sum(
+            return of_friction + sum(
                 0.5 * float(np.vdot(self._pushes(m), moved)) for m in (before, after) if m
             )
-        return rubbed + self._energy(after) - self._energy(before)
+        return of_friction + self._energy(after) - self._energy(before)
 
     def _is_small(self, q: Positions, base: Positions) -> bool:
         """Return whether points move too little from base to q for a difference of energies."""
@@ -237,8 +239,8 @@ class SurfaceContact:
 
     def _gradient(self, moment: ContactsAt) -> Rows:
         """Return the gradient (total, 3) [N] with friction on rank 0; (0, 3) elsewhere."""
-        rubs = self.friction.gradient(moment.points) if self.friction else 0.0
-        return self._pushes(moment) + rubs
+        of_friction = self.friction.gradient(moment.points) if self.friction else 0.0
+        return self._pushes(moment) + of_friction
 
     def _pushes(self, moment: ContactsAt) -> Rows:
         """Return the gradient (total, 3) [N] of the barrier on rank 0; (0, 3) elsewhere."""

@@ -25,20 +25,21 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.node_friction import Movers
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.springs import crushing_energy
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.linear.ghosts import Ghosted
+from msmpetsc.solve.linear.largest_eigenvalue import HighestMode
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
@@ -49,7 +50,7 @@ RETRIES = 4
 # spurious energy that halves the substeps, over all energy; a fifth of NOTABLE_GAIN
 GAIN = 2e-3
 # energy that springs may regain after a loss, over all energy; as in the energy balance
-CREDIT = 0.1
+SPRINGS_CREDIT = 0.1
 # gain that doubles substeps, over the limit; doubled substeps gain 4 to 16 times more
 EASED = 1 / 32
 # most halvings of the substeps; 32 times the substeps bound the cost
@@ -58,10 +59,6 @@ HALVINGS = 5
 MOST_SUBSTEPS = 1e6
 # spurious energy that rounding may cause, over the energy of an unstable body
 ROUNDING = 1e-14
-# relative change of omega^2 that ends the power iteration; SAFETY covers its error
-SETTLED = 1e-3
-# most power iterations; later steps continue from the mode
-MOST_ITERATIONS = 100
 # elastic energy of an unstable body, over that of crushed springs; no load reaches it
 UNSTABLE = 100.0
 
@@ -218,7 +215,7 @@ class Verlet(Integrator):
         )
         total = energy + kinetic
         limit = GAIN * total + ROUNDING * self.unstable_energy
-        gained = max(self.gained + gain, -CREDIT * total)
+        gained = max(self.gained + gain, -SPRINGS_CREDIT * total)
         if (
             min(gain, gained) > limit
             and self.halvings < HALVINGS
@@ -369,73 +366,6 @@ class Verlet(Integrator):
     def destroy(self) -> None:
         for field in (self.position, self.velocity, self.highest):
             field.destroy()
-
-
-class HighestMode:
-    """Compute the largest eigenvalue omega^2 [1/s^2] of M^(-1) (Hessian of E).
-
-    Each power iteration starts from the last mode.
-
-    squared : omega^2, or 0 while it is unknown
-    mode    : (l, 3) eigenvector x with |x|_M = 1
-    """
-
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity):
-        self.comm, self.lattice, self.elasticity = comm, lattice, elasticity
-        self.mode, self.per_mass = Ghosted(comm, lattice), 1 / lattice.mass
-        self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
-
-    def hold(self, fixed: Mask) -> None:
-        """Set the ``fixed`` nodes (owned,) and start from a vector of all modes (collective)."""
-        # The vector must not depend on the number of ranks.
-        self.fixed = fixed
-        numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
-        self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))
-        self.mode.values[: self.lattice.owned][fixed] = 0
-        self._normalise()
-        self.squared = 0.0
-
-    def squared_at(self, q: Positions) -> float:
-        """Return omega^2 [1/s^2] of the projected Hessian at q (l, 3) [m] (collective).
-
-        The projection leaves out the negative curvature across compressed springs, which causes no
-        oscillation and has no bound.
-        """
-        x, owned = self.mode.values, self.lattice.owned
-        hessian = self.elasticity.hessian_at(q, projected=True)
-        product = np.empty_like(q)
-        for _ in range(MOST_ITERATIONS):
-            before = self.squared
-            product[:] = 0
-            hessian.add_product(x, product)
-            np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
-            x[:owned][self.fixed] = 0
-            # |M^(-1) H x|_M for |x|_M = 1
-            self.squared = self._normalise()
-            if not abs(self.squared - before) > SETTLED * self.squared:
-                break
-        return self.squared
-
-    def _normalise(self) -> float:
-        """Scale the mode x to |x|_M = 1; return |x|_M from before (collective)."""
-        x = self.mode.values[: self.lattice.owned]
-        size = float(
-            np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
-        )
-        if size > 0:
-            x /= size
-        self.mode.update()
-        return size
-
-    def destroy(self) -> None:
-        """Destroy the PETSc objects of the mode (collective)."""
-        self.mode.destroy()
-
-
-def crushing_energy(lattice: Lattice) -> float:
-    """Return the energy [J] that compresses every spring of this rank to zero length."""
-    springs = slice(lattice.springs_owned)
-    return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
 
 @kernel

@@ -14,27 +14,26 @@ matrices as products P^T H P. All levels but the coarsest multiply in single pre
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, to_host
-from msmpetsc.backend.kernel import kernel
+from msmpetsc.backend.arrays import Positions, Rows, to_host
 from msmpetsc.contact.surface.term import SurfaceHessian
-from msmpetsc.elasticity.energy import Elasticity, Hessian
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.morton import decode_morton
 from msmpetsc.lattice.initial_state import uniform
+from msmpetsc.solve.linear.largest_eigenvalue import largest_eigenvalue
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
-from msmpetsc.solve.multigrid.contact import CoarseContact, ContactSmoother
+from msmpetsc.solve.multigrid.contact import CoarseContact
+from msmpetsc.solve.multigrid.finest_level import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import device
-from msmpetsc.solve.petsc.events import FINE
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 # most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
@@ -151,7 +150,7 @@ class Multigrid:
         self.bounds[0] = self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
             noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
-            self.bounds[i] = SAFETY * greatest_eigenvalue(level.matrix, noise)
+            self.bounds[i] = SAFETY * largest_eigenvalue(level.matrix, noise)
         for i, bound in enumerate(self.bounds):
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), RANGE_START * bound, bound)
         if is_new:
@@ -191,7 +190,7 @@ class Multigrid:
         if bound is not None:
             return bound
         noise = uniform(unknowns.numbers[to_host(unknowns.free)]).T.ravel()
-        return SAFETY * greatest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
+        return SAFETY * largest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
 
     def _galerkin_product(self, finer: Level, level: Level) -> None:
         """Compute P^T H P of a level from the matrix of the next finer coarse level."""
@@ -287,31 +286,6 @@ class Multigrid:
         self.owned.close()
 
 
-def greatest_eigenvalue(
-    matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlocks | None" = None
-) -> float:
-    """Return an estimate of the largest eigenvalue of D^-1 H by ten CG iterations (collective).
-
-    noise  : (n,) random numbers of this rank, from 0 to 1
-    blocks : D^-1 if H is not assembled; otherwise D is the 3 x 3 block diagonal of the matrix
-    """
-    x, b = matrix.createVecs()
-    b.array[:] = noise - 0.5
-    ksp = PETSc.KSP().create(matrix.comm)
-    ksp.setType(PETSc.KSP.Type.CG)
-    ksp.setOperators(matrix)
-    ksp.getPC().setType(PETSc.PC.Type.PYTHON if blocks else PETSc.PC.Type.PBJACOBI)
-    if blocks:
-        ksp.getPC().setPythonContext(blocks)
-    ksp.setComputeEigenvalues(True)
-    ksp.setTolerances(max_it=10, rtol=np.finfo(float).eps)
-    ksp.solve(b, x)
-    greatest = float(ksp.computeExtremeSingularValues()[0])
-    for owned in (ksp, x, b):
-        owned.destroy()
-    return greatest
-
-
 class Restriction:
     """Apply P^T, also as its own transpose (a context of MATPYTHON)."""
 
@@ -322,148 +296,3 @@ class Restriction:
         self.interpolation.multTranspose(x, y)
 
     multTranspose = mult
-
-
-class ProjectedHessian:
-    """Apply H = M + t^2 (projected Hessian of E and of contact) (a context of MATPYTHON).
-
-    H belongs to the positions of the last ``update`` and is positive definite.
-
-    products   : number of products so far
-    inverse    : (m, 9) D^-1 [1/kg]
-    compliance : (owned,) [m/N] estimated compliance of a node at rest
-    """
-
-    def __init__(self, unknowns: Unknowns, elasticity: Elasticity, t2: float):
-        self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
-        lattice = unknowns.lattice
-        # The rows of pinned nodes stay zero.
-        self.v = np.zeros_like(lattice.nodes, dtype=np.float32)
-        self.product = np.empty_like(self.v)
-        self.elastic: Hessian | None = None
-        self.products = 0
-        self.contact = np.empty((0, 9), like=lattice.nodes)
-        self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
-        blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
-        elasticity.add_bound(lattice.nodes, blocks)
-        self.compliance = 1 / (
-            unknowns.ballast / t2 + blocks[: lattice.owned, [0, 4, 8]].sum(axis=1) / 3
-        )
-        self.joined: SurfaceHessian | None = None
-        self.smoother: ContactSmoother | None = None
-
-    def update(self, q: Positions, contact: Rows, joined: SurfaceHessian | None = None) -> None:
-        """Compute H and D^-1 at positions q (l, 3) [m].
-
-        contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
-        joined  : contact of the surface that couples nodes
-        """
-        self.elastic = self.elasticity.hessian_at(q, projected=True, dtype=np.float32)
-        self.contact = contact
-        unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
-        self.elasticity.add_bound(q, blocks)
-        nodes = FreeNodes(unknowns.free, unknowns.ballast, contact, self.t2)
-        invert_blocks(unknowns.size, self.inverse, blocks, nodes)
-        self.joined = joined
-        self.smoother = (
-            ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
-        )
-
-    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Write H x to y."""
-        assert self.elastic is not None, "the hierarchy was not built"
-        self.products += 1
-        with FINE:
-            self.unknowns.to_nodes(x, self.v)
-            self.product[:] = 0
-            self.elastic.add_product(self.v, self.product)
-            if len(self.contact):
-                add_node_blocks(len(self.contact), self.contact, self.v, self.product)
-            if self.joined:
-                self.joined.add_product(self.v, self.product)
-            self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
-
-    def by_blocks(self, x: Rows, y: Rows) -> Rows:
-        """Write D^-1 x (3, m) to y, contact of the surface included, and return y."""
-        apply_blocks(self.unknowns.size, x, self.inverse, y)
-        if self.smoother:
-            self.smoother.correct(y)
-        return y
-
-
-class DiagonalBlocks:
-    """Apply the inverse of the finest level's 3 x 3 diagonal blocks (a context of PCPYTHON)."""
-
-    def __init__(self, hessian: ProjectedHessian):
-        self.hessian = hessian
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        unknowns = self.hessian.unknowns
-        self.hessian.by_blocks(unknowns.columns(x), unknowns.columns_to_write(y))
-
-    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")
-
-
-@kernel
-def add_node_blocks(
-    first: int, count: int, step: int, blocks: Rows, v: Array, product: Array
-) -> None:
-    for i in range(first, count, step):
-        for r in range(3):
-            for c in range(3):
-                product[i, r] += blocks[i, 3 * r + c] * v[i, c]
-
-
-@kernel
-def apply_blocks(first: int, count: int, step: int, x: Rows, inverse: Array, y: Rows) -> None:
-    for i in range(first, count, step):
-        a, b, c = x[0, i], x[1, i], x[2, i]
-        for r in range(3):
-            y[r, i] = inverse[i, 3 * r] * a + inverse[i, 3 * r + 1] * b + inverse[i, 3 * r + 2] * c
-
-
-class FreeNodes(NamedTuple):
-    """Terms of the diagonal blocks of H.
-
-    free    : (m,) numbers of the free nodes
-    mass    : (owned,) [kg]
-    contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
-    t2      : t^2 [s^2]
-    """
-
-    free: Indices
-    mass: Floats
-    contact: Rows
-    t2: float
-
-
-@kernel
-def invert_blocks(
-    first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes
-) -> None:
-    """Invert the diagonal blocks m I + t^2 (blocks + contact) of the free nodes."""
-    free, mass, contact, t2 = nodes
-    for i in range(first, count, step):
-        node = free[i]
-        m, d = mass[node], blocks[node]
-        a, b, c = t2 * d[0], t2 * d[1], t2 * d[2]
-        e, f, g = t2 * d[4], t2 * d[5], t2 * d[8]
-        if len(contact):
-            p = contact[node]
-            a, b, c = a + t2 * p[0], b + t2 * p[1], c + t2 * p[2]
-            e, f, g = e + t2 * p[4], f + t2 * p[5], g + t2 * p[8]
-        a, e, g = a + m, e + m, g + m
-        u, v, w = e * g - f * f, c * f - b * g, b * f - c * e
-        over = 1.0 / (a * u + b * v + c * w)
-        inverse[i, 0], inverse[i, 1], inverse[i, 2] = over * u, over * v, over * w
-        inverse[i, 3], inverse[i, 4], inverse[i, 5] = (
-            over * v,
-            over * (a * g - c * c),
-            over * (b * c - a * f),
-        )
-        inverse[i, 6], inverse[i, 7], inverse[i, 8] = (
-            over * w,
-            over * (b * c - a * f),
-            over * (a * e - b * b),
-        )

@@ -24,7 +24,7 @@ from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kep
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
 from msmpetsc.geometry.morton import decode_morton, encode_morton
-from msmpetsc.lattice.lattice import CORNERS
+from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Indices, Mask, to_host
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.morton import decode_morton, encode_morton
-from msmpetsc.lattice.lattice import CORNERS
+from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 
 # most nodes of a coarse grid, over the finer grid's; a larger grid does not pay

@@ -325,7 +325,7 @@ class Stepper:
     def work_so_far(self) -> Work:
         """Return the work of all steps so far, with estimates and searches for modes."""
         of_estimates = total_iterations(self.control.estimate.ksp)
-        ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.its
+        ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.search.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
         proof = self.control.estimate.products + self.minimum.curvature.products
         return Work(

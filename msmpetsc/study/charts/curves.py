@@ -38,7 +38,7 @@ from msmpetsc.study.table import (
     succeeded,
 )
 
-KIND = "Speed against accuracy"
+SPEED_ACCURACY = "Speed against accuracy"
 # errors for which the cheapest case is reported
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
 FRONT = "Pareto front, or within its noise"
@@ -134,9 +134,9 @@ def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
                 else f"pareto_{scene}_{formatting.plain(cells)}"
             )
             title = (
-                f"{KIND}: {scene}, {formatting.count(cells)} cells"
+                f"{SPEED_ACCURACY}: {scene}, {formatting.count(cells)} cells"
                 if cells > 0
-                else f"{KIND}: {scene}"
+                else f"{SPEED_ACCURACY}: {scene}"
             )
             charts.append(pareto_chart(name, title, group, styles))
     return [chart for chart in charts if chart.panels]
@@ -154,7 +154,7 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
     panels = [(measure, shown) for measure, shown in panels if len(shown)]
     labels = dict.fromkeys(label for _, shown in panels for label in shown["label"])
     legend = {label: styles[label] for label in labels} | {FRONT: CurveStyle(INK, RING)}
-    chart = Chart(name, KIND, title, CAPTION, legend)
+    chart = Chart(name, SPEED_ACCURACY, title, CAPTION, legend)
     for measure, shown in panels:
         draw_panel(chart, shown, measure)
         lines = [

@@ -11,7 +11,6 @@ from msmpetsc.study.charts.plot import INK, Axes, Chart, CurveStyle, channel, ti
 from msmpetsc.study.metrics import MEANING, OUTCOMES
 from msmpetsc.study.table import Row, grouped, mapped, records
 
-KIND = "Stability"
 CAPTION = (
     "The worst outcome of each run. If every step was solved, a number gives the mean iterations a "
     "step, or the substeps of verlet. The tooltip of a cell gives its numbers and the command that "
@@ -85,9 +84,8 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
         for outcome in reversed(OUTCOMES)
         if outcome in set(rows["outcome"])
     }
-    chart = Chart(
-        f"stability_{name}", KIND, settings.get("title") or name, CAPTION, legend, COLUMNS, gap=35
-    )
+    title = settings.get("title") or name
+    chart = Chart(f"stability_{name}", "Stability", title, CAPTION, legend, COLUMNS, gap=35)
     chart.height = CELL * len(y.values)
     by_label = grouped(rows, "label")
     if set(x.values) == set(by_label):

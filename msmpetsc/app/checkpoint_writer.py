@@ -1,4 +1,4 @@
-"""Checkpoints of a run."""
+"""Write the checkpoints of a run when they are due; the file stores them (results.writer)."""
 
 from collections.abc import Iterator
 from time import perf_counter
@@ -20,7 +20,7 @@ CHECKPOINT_TIME = 0.01
 
 
 class Checkpoints:
-    """Writer of a run's checkpoints: at the first and last step, when due, and at a signal.
+    """Write a run's checkpoints at the first and last step, when due, and at a signal.
 
     every  : frames between checkpoints; None for an interval that takes CHECKPOINT_TIME of the run
     signal : number of the signal that ended the run before its last step; 0 if there was none

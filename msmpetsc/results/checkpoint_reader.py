@@ -1,4 +1,4 @@
-"""Restart from a result file: read its run and last checkpoint, and check its lattice."""
+"""Read a result file for a restart: its run and last checkpoint; check its frame and lattice."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array
+from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.comm import on_root, together
 from msmpetsc.errors import InputError
 from msmpetsc.fields import CHECKPOINT
 from msmpetsc.results.comparison import rows_agree
 from msmpetsc.results.layout import scatter_rows
-from msmpetsc.results.reader import Result, as_python, newest_slot, plain_damage
+from msmpetsc.results.reader import Result
+from msmpetsc.results.untrusted_file import as_python, plain_damage
 
 # median distance of a checkpoint from its frame, in longest sides [-]; most stay near
 NEAR = 0.01
@@ -24,7 +25,7 @@ NEAR = 0.01
 FARTHEST = 1e6
 # difference of equal lattices relative to the largest value [-]; the order of sums over
 # cells depends on the number of ranks
-SAME = 1e-9
+SAME_LATTICE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,12 @@ def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
     numbers = dict(zip(names, values.tolist(), strict=True))
     rows = [name for name in stored if name not in ("step", "numbers")]
     return slot, Checkpoint(int(steps[slot]), numbers=numbers), rows
+
+
+def newest_slot(steps: Indices) -> int | None:
+    """Return the slot of the newest checkpoint, given the steps (2,) of both slots, or None."""
+    slot = int(np.argmax(steps))
+    return slot if steps[slot] >= 0 else None
 
 
 def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None:
@@ -158,7 +165,7 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
             if same:
                 stored = _own_rows(comm, run, (name,), len(rows)).astype(float)
                 greatest = max(comm.allgather(np.abs(stored).max(initial=0)))
-                agree = rows_agree(np.asarray(rows, float), stored, SAME * greatest).all()
+                agree = rows_agree(np.asarray(rows, float), stored, SAME_LATTICE * greatest).all()
                 same = all(comm.allgather(bool(agree)))
             if not same:
                 raise InputError(

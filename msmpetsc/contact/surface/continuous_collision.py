@@ -1,0 +1,100 @@
+"""Continuous collision detection (CCD): the share of straight ways on which no triangles cross.
+
+The broad phase finds the pairs that may meet on the ways. The narrow phase is ipctk's additive CCD
+(Li, Kaufman and Jiang 2021, Codimensional Incremental Potential Contact). A translation that all
+points have in common is left out. The function ``free_share`` takes ways with known candidates,
+``sweep`` takes long ways piece by piece.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Positions, Rows
+
+if TYPE_CHECKING:
+    import ipctk
+
+    from msmpetsc.contact.surface.barrier import Barrier, PairSets
+
+# Share of the way to a crossing that a step takes
+TAKEN = 0.9
+# Edges that points move in a piece of a long way
+PIECE = 2.0
+# Most pieces of a way; a longer way is shortened
+PIECES = 200
+# Greatest linear part of a way that boxes leave out; beyond, its allowance makes boxes
+# larger
+STRETCHED = 0.2
+
+
+def candidates_on_ways(
+    mesh: "ipctk.CollisionMesh", points: Positions, near: float, moved: Rows | None
+) -> "ipctk.Candidates":
+    """Return the pairs that may come closer than ``near`` on the ways of points by ``moved``.
+
+    The linear part of the ways, m = c + G x + r, would enlarge the boxes around them. If a pair
+    is closer than d on its way, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
+    ``|x - x'| < (d + 2 max |r|) / (1 - |G|)``, and boxes around r suffice.
+
+    points : (p, 3) [m]
+    near   : [m]
+    moved  : (p, 3) [m]; None if points stay
+    """
+    import ipctk
+
+    candidates, ends = ipctk.Candidates(), [np.asfortranarray(points)]
+    if moved is not None:
+        rest, linear = _without_linear_part(points, moved)
+        ends += [np.asfortranarray(points + rest)]
+        near += linear / (1 - linear) * (near + 2 * float(np.linalg.norm(rest, axis=1).max()))
+    candidates.build(mesh, *ends, 0.5 * near, ipctk.LBVH())
+    return candidates
+
+
+def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
+    """Return displacements (p, 3) [m] without their linear part, and the norm of that part.
+
+    A linear part above STRETCHED stays, and its norm counts as 0.
+    """
+    x, rest = points - points.mean(axis=0), moved - moved.mean(axis=0)
+    linear = np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ rest)
+    size = float(np.linalg.norm(linear, 2))
+    return (rest - x @ linear, size) if size < STRETCHED else (rest, 0.0)
+
+
+def free_share(barrier: "Barrier", start: Positions, moved: Rows, sets: "PairSets") -> float:
+    """Return the free share of the ways from start (p, 3) by ``moved`` (p, 3) [m].
+
+    sets : candidate pairs of the ways
+    """
+    share = _share_to_crossing(barrier, start, start + moved - moved.mean(axis=0), sets)
+    return share if share >= 1 else TAKEN * share
+
+
+def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
+    """Return the free share of ways of any length, with candidates of each piece."""
+    moved = moved - moved.mean(axis=0)
+    whole = max(
+        int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * barrier.edge))), 1
+    )
+    for piece in range(min(whole, PIECES)):
+        begin, end = (start + i / whole * moved for i in (piece, piece + 1))
+        sets = barrier.candidates(begin, 0.0, end - begin)
+        share = _share_to_crossing(barrier, begin, end, sets)
+        if share < 1:
+            return TAKEN * (piece + share) / whole
+    return 1.0 if whole <= PIECES else PIECES / whole
+
+
+def _share_to_crossing(
+    barrier: "Barrier", start: Positions, end: Positions, sets: "PairSets"
+) -> float:
+    """Return the share of ways up to the first crossing of candidates."""
+    ways = barrier.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, barrier.ccd
+    shares = (
+        pairs.candidates.compute_collision_free_stepsize(*ways)
+        for pairs in sets[: len(barrier.creases)]
+        if len(pairs)
+    )
+    return min(shares, default=1.0)

@@ -1,0 +1,133 @@
+"""Lumped masses of nodes and stiffnesses of springs, summed cell by cell for either law.
+
+The parts of cells that the surface cuts are those of lattice.cut_cells and lattice.cell_moments.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Indices, Rows
+from msmpetsc.backend.kernel import njit
+from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
+from msmpetsc.lattice.cut_cells import mass_fractions, spring_fractions
+from msmpetsc.lattice.material import (
+    CellMaterial,
+    MaterialOfCells,
+    calibrated_stiffness,
+    edge_stiffness,
+    lame_constants,
+)
+from msmpetsc.lattice.topology import DIRECTION, DIRECTION_KIND, Topology
+from msmpetsc.scene.body import Material
+
+
+class SolidCells(NamedTuple):
+    """Constants of a solid for each of a lattice's ``local_cells`` (elasticity.neo_hookean).
+
+    forms  : (d, 13) strain forms of the cells (lattice.cell_moments)
+    volume : (d,) volume inside the surface [m^3]
+    shear, lame : (d,) mu and lambda [Pa]
+    """
+
+    forms: Rows
+    volume: Floats
+    shear: Floats
+    lame: Floats
+
+
+class LawConstants(NamedTuple):
+    """The material data of a rank's nodes, springs and cells. A scalar holds for all items.
+
+    mass    : (owned,) [kg]
+    springs : (s,) stiffness [N/m]; for a solid, of the constant L
+    cells   : (d,) stiffness of an edge inside a body of the cell's material [N/m]
+    solid   : (d,) constants of a solid's cells; None if the law is springs
+    """
+
+    mass: Floats
+    springs: float | Floats
+    cells: float | Floats
+    solid: SolidCells | None = None
+
+
+def law_of_springs(
+    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
+) -> LawConstants:
+    """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
+    if of_cells is None and net.fills is None:
+        mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
+        law = LawConstants(mass, material.spring, material.spring)
+    else:
+        owned = len(net.octants)
+        made_of = _made_of(net, material, of_cells)
+        fills = np.ones((len(net.cells), 8)) if net.fills is None else net.fills
+        of_pairs = spring_fractions(fills)
+        of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
+        mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
+        of_spring = _sums_of_springs(net, made_of.spring, of_pairs) / net.sharing
+        law = LawConstants(mass, of_spring, fills.mean(axis=1) * made_of.spring)
+    if material.stiffness is not None:
+        return law
+    springs = calibrated_stiffness(law.springs, h, DIRECTION_KIND[net.direction], net.sharing)
+    return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
+
+
+def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None) -> CellMaterial:
+    """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given."""
+    if of_cells:
+        return of_cells(net.ijk[net.cells[:, 0]])
+    of_all = material.density, material.spring, material.poisson_ratio
+    return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
+
+
+def law_of_solid(
+    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
+) -> LawConstants:
+    """Return masses, spring stiffnesses of L and cell constants of a solid.
+
+    A corner's lumped mass is proportional to the diagonal of L, as with springs.
+    """
+    owned, count = len(net.octants), len(net.cells)
+    made_of = _made_of(net, material, of_cells)
+    shear, lame = lame_constants(made_of.spring, made_of.poisson)
+    forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
+    volume = np.ones(count)
+    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
+    if net.fills is not None and net.moments is not None:
+        forms, pairs = forms.copy(), pairs.copy()
+        cut = np.flatnonzero(net.fills.min(axis=1) < 1)
+        volume[cut] = net.fills[cut].mean(axis=1)
+        forms[cut] = forms_of(net.fills[cut], net.moments[cut])
+        pairs[cut] = laplacians(forms[cut], volume[cut])
+    diagonal = np.diagonal(pairs, axis1=1, axis2=2)
+    of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
+    mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
+    # 2 mu + 3 lambda times |grad u|^2 bounds the second variation at rest.
+    modulus = 2 * shear + 3 * lame
+    of_spring = _sums_of_springs(net, -h * modulus, pairs)
+    cells = SolidCells(forms, h**3 * volume, shear, lame)
+    return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
+
+
+def _sums_of_springs(net: Topology, values: Floats, weights: Rows) -> Floats:
+    """Return the weighted sum (s,) of cell ``values`` (d,) over the cells that share each spring.
+
+    The order of summation does not depend on the rank.
+
+    weights : (d, 8, 8) weight of a cell's value for the spring between two of its corners
+    """
+    of_nodes = _sums_by_direction(net.cells, values, weights, len(net.octants))
+    sums: Floats = of_nodes[net.springs[:, 0], net.direction]
+    return sums
+
+
+@njit()
+def _sums_by_direction(cells: Indices, values: Floats, weights: Rows, owned: int) -> Rows:
+    sums = np.zeros((owned, 27))
+    for i in range(len(cells)):
+        for a in range(8):
+            if cells[i, a] < owned:
+                for b in range(8):
+                    sums[cells[i, a], DIRECTION[a, b]] += values[i] * weights[i, a, b]
+    return sums

@@ -80,9 +80,9 @@ def test_the_estimate_is_within_three_of_the_true_error(
 
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
-def test_with_multigrid_one_cycle_confirms_what_a_step_has_left(tmp_path: Path, law: str):
+def test_with_multigrid_the_last_solve_proves_most_steps(tmp_path: Path, law: str):
     """What is said is then a bound; a share of 0.6 of all products proved these steps when each was
-    estimated by CG."""
+    estimated by CG, 0.36 do now."""
     scene = SCENES["swings"] | {"material": {"young_modulus": 5e5, "density": 1000.0, "law": law}}
     solver = "solver={preset='newton-multigrid', error=1e-3}"
     loaded = load_scene(
@@ -97,7 +97,7 @@ def test_with_multigrid_one_cycle_confirms_what_a_step_has_left(tmp_path: Path, 
     proof, products = (
         sum(getattr(frame, name) for frame in frames) for name in ("proof_products", "products")
     )
-    assert 0 < proof < 0.35 * products
+    assert 0 < proof < 0.45 * products
 
 
 def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
@@ -159,9 +159,8 @@ def test_what_cannot_be_measured_is_one_clear_line(tmp_path: Path, words: list[s
     )
 
 
-def test_linear_solves_are_no_tighter_than_the_step_needs():
-    """A step to 1e-1 asks for looser ones than a step to 1e-8 does, whose last goes as far as the
-    step needs."""
+def test_only_the_last_linear_solve_goes_beyond_ksp_rtol():
+    """A step to 1e-8 needs a closer last solve, a step to 1e-1 none."""
 
     def tolerances(error: float) -> list[float]:
         lattice, seen = beam(), []
@@ -175,7 +174,7 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
 
     loose, tight = tolerances(1e-1), tolerances(1e-8)
     rtol = float(PRESETS["newton"].options["ksp_rtol"])
-    assert max(loose) > 0.1 and sorted(set(tight)) == [error_control.CLOSEST * rtol, rtol]
+    assert set(loose) == {rtol} and sorted(set(tight)) == [error_control.CLOSEST * rtol, rtol]
 
 
 def test_linear_solves_of_a_long_step_gain_digits():

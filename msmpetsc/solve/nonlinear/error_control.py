@@ -33,15 +33,13 @@ FIRST_RATIO = 5.0
 LEAST_RATIO = 10.0
 # Multiple of the acceptable error at which a step is first estimated
 EARLY = 2.0
-# Greatest ksp_rtol
-LOOSEST = 0.3
 # Iterations of a step after which its linear solves gain a digit. Loose solves may open
 # and close a stiff gap for ever
 ITS_PER_DIGIT = 50
 # Share of the acceptable error that the linear solve may leave
 SHARE = 0.5
 # Multiple of the acceptable error from which a linear solve should be the last
-FINAL = 60.0
+FINAL = 200.0
 # Share of F that the nonlinear residual may have for the bound of the linear solve to
 # hold
 PARABOLA = 0.2
@@ -130,7 +128,7 @@ class ErrorControl:
     """Errors of the iterates of one stepper. All methods that take an iterate are collective.
 
     target       : relative error at which a step is done; 0 if a budget of iterations ends it
-    tightest     : least ksp_rtol of a linear solve
+    rtol         : ksp_rtol of the linear solves before the last
     ratio        : ratio of bound to error in the last estimate
     has_residual : whether estimate.residual has the residual of the last linear solve
     error_per_residual : ratio of the bound on |e|_H to |r|_(P^-1) in the last linear solve; 0 if
@@ -142,7 +140,7 @@ class ErrorControl:
     curvature: LowestCurvature
     rounding: Rounding
     target: float
-    tightest: float
+    rtol: float
     ratio: float = FIRST_RATIO
     has_residual: bool = False
     error_per_residual: float = 0.0
@@ -257,7 +255,11 @@ class ErrorControl:
     def _solved(self, ksp: PETSc.KSP) -> float:
         """Return the bound on |e|_H that a linear solve has left; infinite if unknown."""
         is_far = self.estimate.preconditioner.is_uniform and self.estimate.least < NEAR
-        if ksp.its < FEW or ksp.getInitialGuessNonzero() or self.estimate.needs_probe or is_far:
+        # A residual below the tolerance at the start: the ratio is of another H
+        if ksp.its < FEW:
+            self.error_per_residual = 0.0
+            return np.inf
+        if ksp.getInitialGuessNonzero() or self.estimate.needs_probe or is_far:
             return np.inf
         if not self.estimate.least > 0:
             return np.inf
@@ -267,15 +269,13 @@ class ErrorControl:
     def tolerances(self, now: Outcome, its: int = 0) -> tuple[float, float]:
         """Return ksp_rtol and ksp_atol of the linear solve after ``its`` iterations of a step.
 
-        The solve gains the digits that the step lacks, and no more.
+        A solve that should be the last goes on until its bound is below the acceptable error.
         """
-        missing = now.bound / self.ratio
-        is_last = missing <= FINAL * now.goal
-        tightest = self.tightest * max(0.1 ** (its // ITS_PER_DIGIT), CLOSEST)
-        rtol = CLOSEST * self.tightest if is_last else tightest
-        if is_last and self.error_per_residual and not self.estimate.preconditioner.is_uniform:
-            return rtol, SHARE * now.goal * now.distance / self.error_per_residual
-        return min(max(SHARE * now.goal / missing, tightest), LOOSEST), NO_ATOL
+        is_last = now.bound / self.ratio <= FINAL * now.goal
+        if is_last and self.error_per_residual:
+            atol = SHARE * now.goal * now.distance / self.error_per_residual
+            return CLOSEST * self.rtol, atol
+        return self.rtol * max(0.1 ** (its // ITS_PER_DIGIT), CLOSEST), NO_ATOL
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """Return the outcome from which a step goes on after a doubt; None without any gain.

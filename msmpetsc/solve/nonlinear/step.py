@@ -186,10 +186,8 @@ class Stepper:
         error = self.error
         if error is None and not self.budget:
             error = DEFAULT_STEP_ERROR
-        tightest = self.ksp.getTolerances()[0]
-        return ErrorControl(
-            functional, estimate, curvature, rounding, error or 0.0, tightest
-        ), minimum
+        rtol = self.ksp.getTolerances()[0]
+        return ErrorControl(functional, estimate, curvature, rounding, error or 0.0, rtol), minimum
 
     def _create_method(self) -> Newton | LocalGlobal:
         given = (

@@ -14,11 +14,12 @@ from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
-# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2);
-# then m and lambda V / (16 h^2)
+# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2), and C
+# times 1 - s, too (elasticity.assumed_strain); then m and lambda V / (16 h^2)
 ROWS = FORM + 2
-# entries of a cell in a Hessian's state [-]: F by rows, then V U' and V U'' over 16 h^2
-STATE = 11
+# entries of a cell in a Hessian's state [-]: F by rows, then V U' and V U'' over 16 h^2,
+# then the modes XY, XZ and YZ over 4 h, three components each
+STATE = 20
 # VTK's corner number at each place of the order with x fastest, then y [-]
 BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]
 

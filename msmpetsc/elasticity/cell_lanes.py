@@ -17,11 +17,11 @@ from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
+    cell_gradient,
+    cell_product,
     determinant_and_change,
+    forms_change,
     gradient_of,
-    quadratic_change,
-    slope_gradient,
-    slope_product,
     volume_change,
 )
 
@@ -82,7 +82,8 @@ def _load(rows: Rows, row: int, w: Floats, at: int) -> None:
 def _product_lanes(w: Floats) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        write_forces(w, RESULT + lane, w, k, slope_product(e, w[k + 104], w, AT_STATE + lane), e)
+        slopes, modes = cell_product(w, k, w, AT_STATE + lane, e)
+        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
 
 
 @njit()
@@ -104,7 +105,8 @@ def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
 def _gradient_lanes(w: Floats, h4: float) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        write_forces(w, RESULT + lane, w, k, slope_gradient(e, w[k + 104], w[k + 112], h4), e)
+        slopes, modes = cell_gradient(w, k, e, h4)
+        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
 
 
 @njit()
@@ -122,10 +124,9 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
 def _change_lanes(w: Floats, inverse_h4: float) -> None:
     for lane in range(LANES):
         moved, base, s = _strains_in(w, lane), _strains_in(w, lane, RESULT), AT_STATE + lane
-        w[s], w[s + 8] = determinant_and_change(
-            gradient_of(moved, inverse_h4), gradient_of(base, inverse_h4)
-        )
-        w[s + 16] = quadratic_change(w, CONSTANTS + lane, moved, base)
+        d, f = gradient_of(moved, inverse_h4), gradient_of(base, inverse_h4)
+        w[s], w[s + 8] = determinant_and_change(d, f)
+        w[s + 16] = forms_change(w, CONSTANTS + lane, f, d, base, moved)
 
 
 @njit()

@@ -11,16 +11,18 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
+from msmpetsc.elasticity.assumed_strain import mode, scaled
 from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
+    cell_gradient,
+    cell_product,
     determinant_and_change,
+    forms_change,
     gradient_of,
-    quadratic_change,
-    slope_gradient,
-    slope_product,
     slopes_at,
     volume_change,
+    write_modes,
     write_state,
 )
 from msmpetsc.elasticity.springs import Displacement
@@ -64,8 +66,9 @@ def _write_products(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(v, cells, i)
-        slopes = slope_product(e, cells.constants[k + 104], cells.state, state_at(i))
-        write_forces(store, (i // LANES) * 24 * LANES + i % LANES, cells.constants, k, slopes, e)
+        slopes, modes = cell_product(cells.constants, k, cells.state, state_at(i), e)
+        at = (i // LANES) * 24 * LANES + i % LANES
+        write_forces(store, at, form_of(cells.constants, k), slopes, modes)
 
 
 @kernel
@@ -74,8 +77,9 @@ def _write_gradients(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
-        slopes = slope_gradient(e, cells.constants[k + 104], cells.constants[k + 112], cells.h4)
-        write_forces(store, (i // LANES) * 24 * LANES + i % LANES, cells.constants, k, slopes, e)
+        slopes, modes = cell_gradient(cells.constants, k, e, cells.h4)
+        at = (i // LANES) * 24 * LANES + i % LANES
+        write_forces(store, at, form_of(cells.constants, k), slopes, modes)
 
 
 @kernel
@@ -98,11 +102,21 @@ def _write_states(
     first: int, count: int, step: int, q: Positions, cells: CellRows, projected: bool
 ) -> None:
     for i in range(first, count, step):
-        k, f = constants_at(cells, i), gradient_at(q, cells, i)
+        k, e, inverse_h4 = constants_at(cells, i), strains_at(q, cells, i), 1.0 / cells.h4
+        f = gradient_of(e, inverse_h4)
         slope, curvature = slopes_at(
             f, cells.constants[k + 104], cells.constants[k + 112], projected
         )
         write_state(cells.state, state_at(i), f, slope, curvature)
+        if not projected:
+            xy, xz, yz = mode(e, 0), mode(e, 1), mode(e, 2)
+            write_modes(
+                cells.state,
+                state_at(i),
+                scaled(inverse_h4, xy),
+                scaled(inverse_h4, xz),
+                scaled(inverse_h4, yz),
+            )
 
 
 @kernel
@@ -112,13 +126,12 @@ def _write_changes(
     base, _, moved = displacement
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
-        j_base, j_change = determinant_and_change(
-            gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)
-        )
+        g, f = gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)
+        j_base, j_change = determinant_and_change(g, f)
         m, parts[i] = cells.constants[k + 104], 0.0
         if m > 0.0:
             volume = volume_change(j_base + j_change, j_base, j_change, m, cells.constants[k + 112])
-            parts[i] = quadratic_change(cells.constants, k, d, e) + cells.h4**2 * volume
+            parts[i] = forms_change(cells.constants, k, f, g, e, d) + cells.h4**2 * volume
 
 
 def _add(

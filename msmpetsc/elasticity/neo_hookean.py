@@ -33,7 +33,17 @@ import math
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
-from msmpetsc.elasticity.cell_strain import Nine, Seven, Strains, modes_forces
+from msmpetsc.elasticity.assumed_strain import (
+    frozen_product,
+    full_forces,
+    mode,
+    rest_change,
+    rest_concavity,
+    rest_gradient,
+    rest_product,
+    scaled,
+)
+from msmpetsc.elasticity.cell_strain import Modes, Nine, Seven, Strains
 from msmpetsc.elasticity.springs import Vector
 
 # J_0 [-]; U is a parabola below, so that the force on an inverted cell stays finite
@@ -159,6 +169,15 @@ def _plus(x: Nine, a: float, y: Nine) -> Nine:
 
 
 @njit(inline="always")
+def _sum(x: Nine, y: Nine) -> Nine:
+    return (
+        x[0] + y[0], x[1] + y[1], x[2] + y[2],
+        x[3] + y[3], x[4] + y[4], x[5] + y[5],
+        x[6] + y[6], x[7] + y[7], x[8] + y[8],
+    )  # fmt: skip
+
+
+@njit(inline="always")
 def _slope_of(e: Strains) -> Nine:
     """Return 4 h times the mean slope (9,) by rows, from the strains of three components."""
     a, b, c = e
@@ -207,19 +226,43 @@ def slope_product(e: Strains, m: float, state: Floats, s: int) -> Nine:
 
 
 @njit(inline="always")
-def quadratic(w: Floats, k: int, a: Strains, b: Strains) -> float:
-    """Return the bilinear form of the mu term for two strains: mean slopes and modes, times m."""
-    total: float = w[k + 104] * _inner(_slope_of(a), _slope_of(b))
-    for i in range(3):
-        x, y, z, v = modes_forces(w, k, b[i])
-        total += a[i][3] * x + a[i][4] * y + a[i][5] * z + a[i][6] * v
-    return total
+def cell_gradient(c: Floats, k: int, e: Strains, h4: float) -> tuple[Nine, Modes]:
+    """Return the gradient of E by 4 h times the mean slopes (9,) and by the modes (3 x 4).
+
+    c, k : constants of the cell, from index k on
+    e    : strains of positions
+    """
+    slopes = slope_gradient(e, c[k + 104], c[k + 112], h4)
+    turning, modes = rest_gradient(c, k, gradient_of(e, 1.0 / h4), e, 1.0 / h4)
+    return _sum(slopes, turning), modes
 
 
 @njit(inline="always")
-def quadratic_change(w: Floats, k: int, moved: Strains, base: Strains) -> float:
-    """Return the change of 1/2 ``quadratic`` as strains change from ``base`` by ``moved``."""
-    return quadratic(w, k, moved, base) + 0.5 * quadratic(w, k, moved, moved)
+def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Nine, Modes]:
+    """Return the product of the Hessian of E with a displacement of strains e.
+
+    It is the derivative of ``cell_gradient``.
+
+    state, s : entries of ``write_state``, from index s on
+    """
+    slopes = slope_product(e, c[k + 104], state, s)
+    turning, modes = rest_product(c, k, kept_gradient(state, s), state, s, e)
+    return _sum(slopes, turning), modes
+
+
+@njit(inline="always")
+def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Nine, Modes]:
+    """Return ``cell_product`` of a state without modes."""
+    slopes = slope_product(e, c[k + 104], state, s)
+    return slopes, frozen_product(c, k, kept_gradient(state, s), e)
+
+
+@njit(inline="always")
+def forms_change(c: Floats, k: int, f: Nine, d: Nine, base: Strains, moved: Strains) -> float:
+    """Return the change of E but for U as F changes by d and the strains by ``moved``."""
+    g = _slope_of(moved)
+    own = c[k + 104] * (_inner(_slope_of(base), g) + 0.5 * _inner(g, g))
+    return own + rest_change(c, k, f, d, base, moved)  # type: ignore[no-any-return]
 
 
 @njit(inline="always")
@@ -229,6 +272,15 @@ def write_state(store: Floats, s: int, f: Nine, slope: float, curvature: float) 
     store[s + 24], store[s + 32], store[s + 40] = f[3], f[4], f[5]
     store[s + 48], store[s + 56], store[s + 64] = f[6], f[7], f[8]
     store[s + 72], store[s + 80] = slope, curvature
+    write_modes(store, s, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+@njit(inline="always")
+def write_modes(store: Floats, s: int, xy: Vector, xz: Vector, yz: Vector) -> None:
+    """Write the modes of a cell over 4 h into ``store`` from index s + 88; 0 if projected."""
+    store[s + 88], store[s + 96], store[s + 104] = xy
+    store[s + 112], store[s + 120], store[s + 128] = xz
+    store[s + 136], store[s + 144], store[s + 152] = yz
 
 
 @njit(inline="always")
@@ -244,12 +296,22 @@ def slopes_at(f: Nine, mu: float, lame: float, projected: bool) -> tuple[float, 
 
 
 @njit(inline="always")
-def concavity_bound(f: Nine, mu: float, lame: float) -> float:
-    """Return c >= 0 for which the Hessian's form on a slope G is at least -c |G|^2."""
+def concavity_bounds(c: Floats, k: int, e: Strains, h4: float) -> tuple[float, float]:
+    """Return a, b >= 0: the Hessian's form is at least -a |G|^2 - b |h|^2.
+
+    G are the slopes of a displacement, and h its modes XY, XZ and YZ. mu outweighs a part of what
+    the term of U' takes, and of what W takes (elasticity.assumed_strain).
+
+    e : strains of positions
+    """
+    f, mu, lame = gradient_of(e, 1.0 / h4), c[k + 104], c[k + 112]
+    if not mu > 0.0:
+        return 0.0, 0.0
     n = cofactors(f)
     j = determinant(f, n)
     slope = _slopes(j, mu, lame)[0]
-    return max(abs(slope) * _coupling_bound(f, j, slope, CONVEX) - mu, 0.0)
+    left = mu - abs(slope) * _coupling_bound(f, j, slope, CONVEX)
+    return rest_concavity(c, k, f, e, 1.0 / h4, left)
 
 
 @njit(inline="always")
@@ -297,7 +359,7 @@ def along_cofactors(n: Nine, g: Seven) -> Vector:
 
 @njit(inline="always")
 def corner_stiffness(g: Seven, c: Floats, k: int) -> float:
-    """Return the mu term of the Hessian's diagonal at a corner, from its ``corner_strain`` g."""
-    x, y, z, v = modes_forces(c, k, g)
+    """Return what a corner's diagonal block has of the identity, from its ``corner_strain`` g."""
+    x, y, z, v = full_forces(c, k, g)
     own: float = c[k + 104] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     return own + x * g[3] + y * g[4] + z * g[5] + v * g[6]

@@ -20,6 +20,11 @@ from msmpetsc.backend.arrays import (
 )
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity import cell_lanes, cell_threads
+from msmpetsc.elasticity.assumed_strain import (
+    ASSUMED,
+    corner_tensions,
+    directions,
+)
 from msmpetsc.elasticity.cell_blocks import (
     ROWS,
     STATE,
@@ -29,13 +34,14 @@ from msmpetsc.elasticity.cell_blocks import (
     blocks_of,
     one_by_one,
 )
-from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
-from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, linearise, state_at
+from msmpetsc.elasticity.cell_strain import LANES, Nine, Seven, corner_strain, form_of
+from msmpetsc.elasticity.cell_threads import constants_at, linearise, state_at, strains_at
 from msmpetsc.elasticity.neo_hookean import (
     along_cofactors,
-    concavity_bound,
+    concavity_bounds,
     corner_stiffness,
     kept_cofactors,
+    kept_gradient,
 )
 from msmpetsc.elasticity.springs import add_block
 from msmpetsc.lattice.lattice import Lattice
@@ -48,9 +54,13 @@ def _row_of(cells: CellRows, i: int, a: int) -> int:
 
 
 @njit(inline="always")
-def _size(a: int, constants: Floats, k: int) -> float:
+def _sizes(a: int, constants: Floats, k: int) -> tuple[float, float]:
+    """Return the norms of the mean slopes and of the modes XY, XZ and YZ of corner a."""
     g = corner_strain(a, form_of(constants, k))
-    return math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    return (
+        math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2]),
+        math.sqrt(g[3] * g[3] + g[4] * g[4] + g[5] * g[5]),
+    )
 
 
 @kernel
@@ -59,18 +69,21 @@ def _add_concavity(
 ) -> None:
     """Add each cell's share of the concavity bound to its corners.
 
-    With g_a the mean slope of corner a, |G|^2 <= sum_a |g_a| (sum_b |g_b|) |v_a|^2.
+    With g_a the mean slope of corner a, |G|^2 <= sum_a |g_a| (sum_b |g_b|) |v_a|^2, and the same
+    for modes.
     """
     for i in range(first, count, step):
-        k = constants_at(cells, i)
-        sizes = 0.0
+        k, e = constants_at(cells, i), strains_at(q, cells, i)
+        slopes, modes = 0.0, 0.0
         for a in range(8):
-            sizes += _size(a, cells.constants, k)
-        bound = sizes * concavity_bound(
-            gradient_at(q, cells, i), cells.constants[k + 104], cells.constants[k + 112]
-        )
+            slope, mode = _sizes(a, cells.constants, k)
+            slopes += slope
+            modes += mode
+        of_slopes, of_modes = concavity_bounds(cells.constants, k, e, cells.h4)
         for a in range(8):
-            concavity[_row_of(cells, i, a), 0] += bound * _size(a, cells.constants, k)
+            slope, mode = _sizes(a, cells.constants, k)
+            bound = of_slopes * slopes * slope + of_modes * modes * mode
+            concavity[_row_of(cells, i, a), 0] += bound
 
 
 @kernel
@@ -85,6 +98,19 @@ def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: Cell
             block[4] += own
             block[8] += own
             add_block(block, 0.0, curvature, along_cofactors(n, g))
+            _add_bending(block, directions(kept_gradient(cells.state, s)), g, cells.constants, k)
+
+
+@njit(inline="always")
+def _add_bending(block: Floats, n: Nine, g: Seven, constants: Floats, k: int) -> None:
+    """Add the diagonal block of Q's form for fixed directions n (elasticity.assumed_strain)."""
+    tensions = corner_tensions(constants, k, n, g)
+    for axis in range(3):
+        t = tensions[axis]
+        for row in range(3):
+            for column in range(3):
+                tension = g[3] * t[column] + g[4] * t[3 + column] + g[5] * t[6 + column]
+                block[3 * row + column] += n[3 * row + axis] * tension
 
 
 def _loops(array: Array) -> ModuleType:
@@ -111,7 +137,10 @@ class CellHessians:
         return self.state[:, 9 * LANES : 10 * LANES]
 
     def add_diagonal(self, diagonal: Rows) -> None:
-        """Add the diagonal blocks to ``diagonal`` (l, 9) [N/m]; the term of U' has none."""
+        """Add the diagonal blocks of a projected Hessian to ``diagonal`` (l, 9) [N/m].
+
+        The term of U' has none.
+        """
         cells = one_by_one(self.blocks, self.state)
         count = len(cells.nodes)
         add_corners(
@@ -132,8 +161,9 @@ class NeoHookean:
         h4 = 4 * lattice.cell_size
         forms, volume, shear, lame = map(to_host, lattice.solid)
         m = (shear * volume / h4**2)[:, None]
+        modes = m * forms[:, 6:] * np.array([*[ASSUMED] * 6, 1.0])
         constants = np.concatenate(
-            [forms[:, :6], m * forms[:, 6:], m, (lame * volume / h4**2)[:, None]], axis=1
+            [forms[:, :6], modes, m, (lame * volume / h4**2)[:, None]], axis=1
         )
         return cls(blocks_of(lattice, constants))
 

@@ -15,7 +15,7 @@ from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.morton import decode_morton, encode_morton
-from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
+from msmpetsc.lattice.cell_moments import WHOLE, bounding_laplacians, forms_of, laplacians
 from msmpetsc.lattice.cut_cells import CORNERS as CORNERS
 from msmpetsc.lattice.cut_cells import shares_of_mass, shares_of_pairs
 from msmpetsc.lattice.material import (
@@ -268,15 +268,18 @@ def _of_solid(
     forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
     volume = np.ones(count)
     pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
+    cut = np.empty(0, np.int64)
     if net.share is not None and net.squares is not None:
         forms, pairs = forms.copy(), pairs.copy()
         cut = np.flatnonzero(net.share.min(axis=1) < 1)
         volume[cut] = net.share[cut].mean(axis=1)
         forms[cut] = forms_of(net.share[cut], net.squares[cut])
         pairs[cut] = laplacians(forms[cut], volume[cut])
-    diagonal = np.diagonal(pairs, axis1=1, axis2=2)
+    diagonal = np.diagonal(pairs, axis1=1, axis2=2).copy()
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
+    if len(cut):
+        pairs[cut] = bounding_laplacians(forms[cut], volume[cut])
     # 2 mu + 3 lambda times |grad u|^2 bounds the second variation at rest.
     modulus = 2 * shear + 3 * lame
     of_spring = _sums_of_springs(net, -h * modulus, pairs)

@@ -44,13 +44,17 @@ with the modes in a state divided by 4 h, all products are in units of slopes.
 """
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
-from msmpetsc.elasticity.cell_strain import Modes, Nine, Seven, Strains
+from msmpetsc.elasticity.cell_strain import Eight, Modes, Nine, Seven, Strains
 from msmpetsc.elasticity.springs import Vector, dot
+
+# vectors of the modes XY, XZ and YZ
+Bent: TypeAlias = tuple[Vector, Vector, Vector]
 
 # Numbers of products are of single precision and exact there, so that products of
 # single precision stay so.
@@ -63,7 +67,7 @@ RANGE = np.float32(1.5)
 FULL = np.float32(1 / 128)
 # 1 - s [-], the factor of C in a cell's constants
 ASSUMED = 2 / (2 + float(FULL))
-# added to moduli so that cells of no stiffness divide by no zero
+# keeps divisors from zero [-]
 LEAST = np.float32(1e-30)
 
 
@@ -86,9 +90,13 @@ def slope_column(e: Strains, i: int) -> Vector:
 
 
 @njit(inline="always")
-def kept_mode(state: Floats, s: int, m: int) -> Vector:
-    """Return mode m over 4 h of the cell whose entries begin at ``state[s]``."""
-    return state[s + 88 + 24 * m], state[s + 96 + 24 * m], state[s + 104 + 24 * m]
+def kept_modes(state: Floats, s: int) -> Bent:
+    """Return the modes XY, XZ and YZ over 4 h of the cell whose entries begin at ``state[s]``."""
+    return (
+        (state[s + 88], state[s + 96], state[s + 104]),
+        (state[s + 112], state[s + 120], state[s + 128]),
+        (state[s + 136], state[s + 144], state[s + 152]),
+    )
 
 
 @njit(inline="always")
@@ -145,18 +153,23 @@ def turned_force(f: Vector, c: float, b: float, r: Vector, g: Vector) -> Vector:
 
 
 @njit(inline="always")
-def plane_stress(c: Floats, k: int) -> float:
-    """Return beta of a cell."""
-    lame = c[k + 112]
-    return (lame + lame) / (lame + c[k + 104] + c[k + 104] + LEAST)  # type: ignore[no-any-return]
+def rest_constants(c: Floats, k: int) -> Eight:
+    """Return 4 m (1 - s) C (6,) as xx, yy, zz, yz, xz, xy, then the constant of XYZ, and beta.
+
+    c, k : constants of the cell, from index k on
+    """
+    # a cell of no stiffness must not divide by zero
+    m, lame = c[k + 104], c[k + 112]
+    beta = (lame + lame) / (lame + m + m + LEAST)
+    return (
+        c[k + 48], c[k + 56], c[k + 64], c[k + 72], c[k + 80], c[k + 88], c[k + 96], beta,
+    )  # fmt: skip
 
 
 @njit(inline="always")
-def tensions(c: Floats, k: int, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
+def tensions(c: Eight, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
     """Return K a, from the a (3,) of XY, XZ and YZ for each axis."""
-    xx, yy, zz = c[k + 48], c[k + 56], c[k + 64]
-    yz, xz, xy = c[k + 72], c[k + 80], c[k + 88]
-    beta = plane_stress(c, k)
+    xx, yy, zz, yz, xz, xy, _, beta = c
     # sum of the e_I is d . s
     sx, sy, sz = y[0] + z[1], x[0] + z[2], x[1] + y[2]
     tx = beta * (xx * sx + xy * sy + xz * sz)
@@ -180,20 +193,19 @@ def along(n: Vector, xy: Vector, xz: Vector, yz: Vector) -> Vector:
 
 
 @njit(inline="always")
-def full_forces(c: Floats, k: int, e: Seven) -> tuple[float, float, float, float]:
+def full_forces(c: Eight, e: Seven) -> tuple[float, float, float, float]:
     """Return the derivative of the share of <|G|^2> and of XYZ by the modes (4,) of a strain."""
-    xx, yy, zz = c[k + 48], c[k + 56], c[k + 64]
-    yz, xz, xy = c[k + 72], c[k + 80], c[k + 88]
+    xx, yy, zz, yz, xz, xy, xyz, _ = c
     return (
         FULL * ((xx + yy) * e[3] + yz * e[4] + xz * e[5]),
         FULL * (yz * e[3] + (xx + zz) * e[4] + xy * e[5]),
         FULL * (xz * e[3] + xy * e[4] + (yy + zz) * e[5]),
-        c[k + 96] * e[6],
+        xyz * e[6],
     )
 
 
 @njit(inline="always")
-def rest_gradient(c: Floats, k: int, f: Nine, e: Strains, inverse_h4: float) -> tuple[Nine, Modes]:
+def rest_gradient(c: Eight, f: Nine, e: Strains, inverse_h4: float) -> tuple[Nine, Modes]:
     """Return the gradient of W by the slopes (9,), as they are in F, and by the modes (3 x 4).
 
     e : strains of positions; ``inverse_h4`` is 1 / (4 h)
@@ -202,7 +214,7 @@ def rest_gradient(c: Floats, k: int, f: Nine, e: Strains, inverse_h4: float) -> 
     fx, fy, fz = column(f, 0), column(f, 1), column(f, 2)
     cx, cy, cz = direction_factor(fx), direction_factor(fy), direction_factor(fz)
     nx, ny, nz = scaled(cx, fx), scaled(cy, fy), scaled(cz, fz)
-    tx, ty, tz = tensions(c, k, along(nx, xy, xz, yz), along(ny, xy, xz, yz), along(nz, xy, xz, yz))
+    tx, ty, tz = tensions(c, along(nx, xy, xz, yz), along(ny, xy, xz, yz), along(nz, xy, xz, yz))
     gx = turned(fx, cx, bend_factor(cx), combined(tx[0], xy, tx[1], xz, tx[2], yz))
     gy = turned(fy, cy, bend_factor(cy), combined(ty[0], xy, ty[1], xz, ty[2], yz))
     gz = turned(fz, cz, bend_factor(cz), combined(tz[0], xy, tz[1], xz, tz[2], yz))
@@ -210,20 +222,20 @@ def rest_gradient(c: Floats, k: int, f: Nine, e: Strains, inverse_h4: float) -> 
     of_xy = combined(tx[0], nx, ty[0], ny, tz[0], nz)
     of_xz = combined(tx[1], nx, ty[1], ny, tz[1], nz)
     of_yz = combined(tx[2], nx, ty[2], ny, tz[2], nz)
-    return slopes, _with_full(c, k, e, of_xy, of_xz, of_yz)
+    return slopes, _with_full(c, e, of_xy, of_xz, of_yz)
 
 
 @njit(inline="always")
-def rest_product(c: Floats, k: int, f: Nine, state: Floats, s: int, e: Strains) -> tuple[Nine, Modes]:
+def rest_product(c: Eight, f: Nine, p: Bent, e: Strains) -> tuple[Nine, Modes]:
     """Return the product of the Hessian of W with the strains of a displacement.
 
     It is the derivative of ``rest_gradient``, in terms of 4 h times the slopes.
 
-    f        : F (9,)
-    state, s : the modes of positions over 4 h are in ``state`` from index s + 88 on
+    f : F (9,)
+    p : ``kept_modes``
     """
     xy, xz, yz = mode(e, 0), mode(e, 1), mode(e, 2)
-    p_xy, p_xz, p_yz = kept_mode(state, s, 0), kept_mode(state, s, 1), kept_mode(state, s, 2)
+    p_xy, p_xz, p_yz = p
     fx, fy, fz = column(f, 0), column(f, 1), column(f, 2)
     cx, cy, cz = direction_factor(fx), direction_factor(fy), direction_factor(fz)
     bx, by, bz = bend_factor(cx), bend_factor(cy), bend_factor(cz)
@@ -232,11 +244,10 @@ def rest_product(c: Floats, k: int, f: Nine, state: Floats, s: int, e: Strains) 
     mx, my, mz = turned(fx, cx, bx, gx), turned(fy, cy, by, gy), turned(fz, cz, bz, gz)
     # tensions of the state, then their change
     sx, sy, sz = tensions(
-        c, k, along(nx, p_xy, p_xz, p_yz), along(ny, p_xy, p_xz, p_yz), along(nz, p_xy, p_xz, p_yz)
+        c, along(nx, p_xy, p_xz, p_yz), along(ny, p_xy, p_xz, p_yz), along(nz, p_xy, p_xz, p_yz)
     )
     tx, ty, tz = tensions(
         c,
-        k,
         added(along(nx, xy, xz, yz), along(mx, p_xy, p_xz, p_yz)),
         added(along(ny, xy, xz, yz), along(my, p_xy, p_xz, p_yz)),
         added(along(nz, xy, xz, yz), along(mz, p_xy, p_xz, p_yz)),
@@ -255,26 +266,26 @@ def rest_product(c: Floats, k: int, f: Nine, state: Floats, s: int, e: Strains) 
     of_xy = added(combined(tx[0], nx, ty[0], ny, tz[0], nz), combined(sx[0], mx, sy[0], my, sz[0], mz))
     of_xz = added(combined(tx[1], nx, ty[1], ny, tz[1], nz), combined(sx[1], mx, sy[1], my, sz[1], mz))
     of_yz = added(combined(tx[2], nx, ty[2], ny, tz[2], nz), combined(sx[2], mx, sy[2], my, sz[2], mz))
-    return slopes, _with_full(c, k, e, of_xy, of_xz, of_yz)
+    return slopes, _with_full(c, e, of_xy, of_xz, of_yz)
 
 
 @njit(inline="always")
-def frozen_product(c: Floats, k: int, f: Nine, e: Strains) -> Modes:
+def frozen_product(c: Eight, f: Nine, e: Strains) -> Modes:
     """Return ``rest_product`` of a projected Hessian, whose state has no modes."""
     xy, xz, yz = mode(e, 0), mode(e, 1), mode(e, 2)
     fx, fy, fz = column(f, 0), column(f, 1), column(f, 2)
     nx, ny, nz = scaled(direction_factor(fx), fx), scaled(direction_factor(fy), fy), scaled(direction_factor(fz), fz)
-    tx, ty, tz = tensions(c, k, along(nx, xy, xz, yz), along(ny, xy, xz, yz), along(nz, xy, xz, yz))
+    tx, ty, tz = tensions(c, along(nx, xy, xz, yz), along(ny, xy, xz, yz), along(nz, xy, xz, yz))
     of_xy = combined(tx[0], nx, ty[0], ny, tz[0], nz)
     of_xz = combined(tx[1], nx, ty[1], ny, tz[1], nz)
     of_yz = combined(tx[2], nx, ty[2], ny, tz[2], nz)
-    return _with_full(c, k, e, of_xy, of_xz, of_yz)
+    return _with_full(c, e, of_xy, of_xz, of_yz)
 
 
 @njit(inline="always")
-def _with_full(c: Floats, k: int, e: Strains, xy: Vector, xz: Vector, yz: Vector) -> Modes:
+def _with_full(c: Eight, e: Strains, xy: Vector, xz: Vector, yz: Vector) -> Modes:
     """Return the gradient by the modes: that of Q, by mode, and the rest of Eq. 4."""
-    a, b, d = full_forces(c, k, e[0]), full_forces(c, k, e[1]), full_forces(c, k, e[2])
+    a, b, d = full_forces(c, e[0]), full_forces(c, e[1]), full_forces(c, e[2])
     return (
         (a[0] + xy[0], a[1] + xz[0], a[2] + yz[0], a[3]),
         (b[0] + xy[1], b[1] + xz[1], b[2] + yz[1], b[3]),
@@ -309,15 +320,15 @@ def _changes(f: Vector, g: Vector, e: Strains, d: Strains) -> tuple[Vector, Vect
 
 
 @njit(inline="always")
-def rest_change(c: Floats, k: int, f: Nine, g: Nine, e: Strains, d: Strains) -> float:
+def rest_change(c: Eight, f: Nine, g: Nine, e: Strains, d: Strains) -> float:
     """Return the change of W as F changes by g and the strains e by d, with the digits of d."""
     dx, ax = _changes(column(f, 0), column(g, 0), e, d)
     dy, ay = _changes(column(f, 1), column(g, 1), e, d)
     dz, az = _changes(column(f, 2), column(g, 2), e, d)
-    tx, ty, tz = tensions(c, k, ax, ay, az)
+    tx, ty, tz = tensions(c, ax, ay, az)
     change = dot(dx, tx) + dot(dy, ty) + dot(dz, tz)
     for i in range(3):
-        a, b = full_forces(c, k, d[i]), d[i]
+        a, b = full_forces(c, d[i]), d[i]
         base = e[i]
         change += a[0] * (base[3] + 0.5 * b[3]) + a[1] * (base[4] + 0.5 * b[4])
         change += a[2] * (base[5] + 0.5 * b[5]) + a[3] * (base[6] + 0.5 * b[6])
@@ -339,7 +350,7 @@ def directions(f: Nine) -> Nine:
 
 
 @njit(inline="always")
-def corner_tensions(c: Floats, k: int, n: Nine, h: Seven) -> tuple[Nine, Nine, Nine]:
+def corner_tensions(c: Eight, n: Nine, h: Seven) -> tuple[Nine, Nine, Nine]:
     """Return K's tensions of modes by a corner's displacement, for fixed directions n (9,).
 
     Result I has the rows y (3,) of the modes m: the displacement v has the tension (K a)_I,m =
@@ -350,9 +361,9 @@ def corner_tensions(c: Floats, k: int, n: Nine, h: Seven) -> tuple[Nine, Nine, N
     # A displacement along n_J has the a (3,) of axis J alone
     own, zero = (h[3], h[4], h[5]), (0.0, 0.0, 0.0)
     x, y, z = column(n, 0), column(n, 1), column(n, 2)
-    xx, xy, xz = tensions(c, k, own, zero, zero)
-    yx, yy, yz = tensions(c, k, zero, own, zero)
-    zx, zy, zz = tensions(c, k, zero, zero, own)
+    xx, xy, xz = tensions(c, own, zero, zero)
+    yx, yy, yz = tensions(c, zero, own, zero)
+    zx, zy, zz = tensions(c, zero, zero, own)
     return (
         _along_directions(x, y, z, xx, yx, zx),
         _along_directions(x, y, z, xy, yy, zy),
@@ -369,7 +380,7 @@ def _along_directions(x: Vector, y: Vector, z: Vector, a: Vector, b: Vector, c: 
 
 @njit(inline="always")
 def rest_concavity(
-    c: Floats, k: int, f: Nine, e: Strains, inverse_h4: float, left: float
+    c: Eight, f: Nine, e: Strains, inverse_h4: float, left: float
 ) -> tuple[float, float]:
     """Return a, b >= 0 for which the Hessian of W plus ``left`` |G|^2 is at least -a |G|^2 - b |h|^2.
 
@@ -387,7 +398,7 @@ def rest_concavity(
     yz = scaled(inverse_h4, mode(e, 2))
     n = directions(f)
     nx, ny, nz = column(n, 0), column(n, 1), column(n, 2)
-    own = tensions(c, k, along(nx, xy, xz, yz), along(ny, xy, xz, yz), along(nz, xy, xz, yz))
+    own = tensions(c, along(nx, xy, xz, yz), along(ny, xy, xz, yz), along(nz, xy, xz, yz))
     tension, turning, factor = 0.0, 0.0, 0.0
     for i in range(3):
         x, s = column(f, i), own[i]
@@ -398,8 +409,8 @@ def rest_concavity(
         change = bend_factor(of_column) * math.sqrt(square * dot(r, r) * shape)
         turning, factor = max(turning, change), max(factor, of_column)
         tension += dot(s, s)
-    least, greatest = _least_and_greatest(c, k)
-    greatest *= max(2.0 + 2.0 * plane_stress(c, k), 4.0)
+    least, greatest = _least_and_greatest(c)
+    greatest *= max(2.0 + 2.0 * c[7], 4.0)
     parts = abs(dot(nx, ny)), abs(dot(nx, nz)), abs(dot(ny, nz))
     frame = min(
         dot(nx, nx) - parts[0] - parts[1],
@@ -417,10 +428,9 @@ def rest_concavity(
 
 
 @njit(inline="always")
-def _least_and_greatest(c: Floats, k: int) -> tuple[float, float]:
+def _least_and_greatest(c: Eight) -> tuple[float, float]:
     """Return bounds of the eigenvalues of C in a cell's constants (Smith 1961)."""
-    xx, yy, zz = c[k + 48], c[k + 56], c[k + 64]
-    yz, xz, xy = c[k + 72], c[k + 80], c[k + 88]
+    xx, yy, zz, yz, xz, xy, _, _ = c
     mean = (xx + yy + zz) / 3.0
     x, y, z = xx - mean, yy - mean, zz - mean
     spread = math.sqrt((x * x + y * y + z * z + 2.0 * (yz * yz + xz * xz + xy * xy)) / 6.0)

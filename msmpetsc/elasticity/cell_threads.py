@@ -11,8 +11,8 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
-from msmpetsc.elasticity.assumed_strain import mode, scaled
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_by_one
+from msmpetsc.elasticity.assumed_strain import rest_constants
+from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, Blocks, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
     cell_gradient,
@@ -20,6 +20,7 @@ from msmpetsc.elasticity.neo_hookean import (
     determinant_and_change,
     forms_change,
     gradient_of,
+    projected_product,
     slopes_at,
     volume_change,
     write_modes,
@@ -35,9 +36,9 @@ def constants_at(cells: CellRows, i: int) -> int:
 
 
 @njit(inline="always")
-def state_at(i: int) -> int:
+def state_at(cells: CellRows, i: int) -> int:
     """Return the index at which the Hessian's state of cell i begins."""
-    return (i // LANES) * STATE * LANES + i % LANES
+    return (i // LANES) * cells.width * LANES + i % LANES
 
 
 @njit(inline="always")
@@ -66,7 +67,11 @@ def _write_products(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(v, cells, i)
-        slopes, modes = cell_product(cells.constants, k, cells.state, state_at(i), e)
+        s = state_at(cells, i)
+        if cells.width == PROJECTED:
+            slopes, modes = projected_product(cells.constants, k, cells.state, s, e)
+        else:
+            slopes, modes = cell_product(cells.constants, k, cells.state, s, e)
         at = (i // LANES) * 24 * LANES + i % LANES
         write_forces(store, at, form_of(cells.constants, k), slopes, modes)
 
@@ -77,7 +82,8 @@ def _write_gradients(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
-        slopes, modes = cell_gradient(cells.constants, k, e, cells.h4)
+        m, lame = cells.constants[k + 104], cells.constants[k + 112]
+        slopes, modes = cell_gradient(rest_constants(cells.constants, k), m, lame, e, cells.h4)
         at = (i // LANES) * 24 * LANES + i % LANES
         write_forces(store, at, form_of(cells.constants, k), slopes, modes)
 
@@ -107,16 +113,9 @@ def _write_states(
         slope, curvature = slopes_at(
             f, cells.constants[k + 104], cells.constants[k + 112], projected
         )
-        write_state(cells.state, state_at(i), f, slope, curvature)
+        write_state(cells.state, state_at(cells, i), f, slope, curvature)
         if not projected:
-            xy, xz, yz = mode(e, 0), mode(e, 1), mode(e, 2)
-            write_modes(
-                cells.state,
-                state_at(i),
-                scaled(inverse_h4, xy),
-                scaled(inverse_h4, xz),
-                scaled(inverse_h4, yz),
-            )
+            write_modes(cells.state, state_at(cells, i), e, inverse_h4)
 
 
 @kernel
@@ -154,7 +153,10 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
 
 
 def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> None:
-    """Write F, V U' and V U'' of each cell at q (l, 3) [m] into ``state`` (b, STATE * LANES)."""
+    """Write the entries of each cell at q (l, 3) [m] into ``state`` (b, width * LANES).
+
+    The width is PROJECTED if the Hessian is ``projected``, else STATE (elasticity.cell_blocks).
+    """
     _write_states(LANES * len(blocks.nodes), q, one_by_one(blocks, state), projected)
 
 

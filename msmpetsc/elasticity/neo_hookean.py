@@ -36,14 +36,14 @@ from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.assumed_strain import (
     frozen_product,
     full_forces,
-    mode,
+    kept_modes,
     rest_change,
     rest_concavity,
+    rest_constants,
     rest_gradient,
     rest_product,
-    scaled,
 )
-from msmpetsc.elasticity.cell_strain import Modes, Nine, Seven, Strains
+from msmpetsc.elasticity.cell_strain import Eight, Modes, Nine, Seven, Strains
 from msmpetsc.elasticity.springs import Vector
 
 # J_0 [-]; U is a parabola below, so that the force on an inverted cell stays finite
@@ -226,14 +226,19 @@ def slope_product(e: Strains, m: float, state: Floats, s: int) -> Nine:
 
 
 @njit(inline="always")
-def cell_gradient(c: Floats, k: int, e: Strains, h4: float) -> tuple[Nine, Modes]:
+def cell_gradient(
+    rest: Eight, m: float, lame: float, e: Strains, h4: float
+) -> tuple[Nine, Modes]:
     """Return the gradient of E by 4 h times the mean slopes (9,) and by the modes (3 x 4).
 
-    c, k : constants of the cell, from index k on
-    e    : strains of positions
+    The constants are not in an array, because numba would then not vectorise loops over cells.
+
+    rest    : ``rest_constants``
+    m, lame : V mu and V lambda over 16 h^2
+    e       : strains of positions
     """
-    slopes = slope_gradient(e, c[k + 104], c[k + 112], h4)
-    turning, modes = rest_gradient(c, k, gradient_of(e, 1.0 / h4), e, 1.0 / h4)
+    slopes = slope_gradient(e, m, lame, h4)
+    turning, modes = rest_gradient(rest, gradient_of(e, 1.0 / h4), e, 1.0 / h4)
     return _sum(slopes, turning), modes
 
 
@@ -246,7 +251,8 @@ def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[
     state, s : entries of ``write_state``, from index s on
     """
     slopes = slope_product(e, c[k + 104], state, s)
-    turning, modes = rest_product(c, k, kept_gradient(state, s), state, s, e)
+    f, p = kept_gradient(state, s), kept_modes(state, s)
+    turning, modes = rest_product(rest_constants(c, k), f, p, e)
     return _sum(slopes, turning), modes
 
 
@@ -254,7 +260,7 @@ def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[
 def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Nine, Modes]:
     """Return ``cell_product`` of a state without modes."""
     slopes = slope_product(e, c[k + 104], state, s)
-    return slopes, frozen_product(c, k, kept_gradient(state, s), e)
+    return slopes, frozen_product(rest_constants(c, k), kept_gradient(state, s), e)
 
 
 @njit(inline="always")
@@ -262,7 +268,7 @@ def forms_change(c: Floats, k: int, f: Nine, d: Nine, base: Strains, moved: Stra
     """Return the change of E but for U as F changes by d and the strains by ``moved``."""
     g = _slope_of(moved)
     own = c[k + 104] * (_inner(_slope_of(base), g) + 0.5 * _inner(g, g))
-    return own + rest_change(c, k, f, d, base, moved)  # type: ignore[no-any-return]
+    return own + rest_change(rest_constants(c, k), f, d, base, moved)  # type: ignore[no-any-return]
 
 
 @njit(inline="always")
@@ -272,15 +278,15 @@ def write_state(store: Floats, s: int, f: Nine, slope: float, curvature: float) 
     store[s + 24], store[s + 32], store[s + 40] = f[3], f[4], f[5]
     store[s + 48], store[s + 56], store[s + 64] = f[6], f[7], f[8]
     store[s + 72], store[s + 80] = slope, curvature
-    write_modes(store, s, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 @njit(inline="always")
-def write_modes(store: Floats, s: int, xy: Vector, xz: Vector, yz: Vector) -> None:
-    """Write the modes of a cell over 4 h into ``store`` from index s + 88; 0 if projected."""
-    store[s + 88], store[s + 96], store[s + 104] = xy
-    store[s + 112], store[s + 120], store[s + 128] = xz
-    store[s + 136], store[s + 144], store[s + 152] = yz
+def write_modes(store: Floats, s: int, e: Strains, inverse_h4: float) -> None:
+    """Write the modes over 4 h of the strains e of positions into ``store``, from index s + 88."""
+    for i in range(3):
+        store[s + 88 + 8 * i] = inverse_h4 * e[i][3]
+        store[s + 112 + 8 * i] = inverse_h4 * e[i][4]
+        store[s + 136 + 8 * i] = inverse_h4 * e[i][5]
 
 
 @njit(inline="always")
@@ -311,7 +317,7 @@ def concavity_bounds(c: Floats, k: int, e: Strains, h4: float) -> tuple[float, f
     j = determinant(f, n)
     slope = _slopes(j, mu, lame)[0]
     left = mu - abs(slope) * _coupling_bound(f, j, slope, CONVEX)
-    return rest_concavity(c, k, f, e, 1.0 / h4, left)
+    return rest_concavity(rest_constants(c, k), f, e, 1.0 / h4, left)
 
 
 @njit(inline="always")
@@ -360,6 +366,6 @@ def along_cofactors(n: Nine, g: Seven) -> Vector:
 @njit(inline="always")
 def corner_stiffness(g: Seven, c: Floats, k: int) -> float:
     """Return what a corner's diagonal block has of the identity, from its ``corner_strain`` g."""
-    x, y, z, v = full_forces(c, k, g)
+    x, y, z, v = full_forces(rest_constants(c, k), g)
     own: float = c[k + 104] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     return own + x * g[3] + y * g[4] + z * g[5] + v * g[6]

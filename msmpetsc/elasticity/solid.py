@@ -24,8 +24,10 @@ from msmpetsc.elasticity.assumed_strain import (
     ASSUMED,
     corner_tensions,
     directions,
+    rest_constants,
 )
 from msmpetsc.elasticity.cell_blocks import (
+    PROJECTED,
     ROWS,
     STATE,
     Blocks,
@@ -89,7 +91,7 @@ def _add_concavity(
 @kernel
 def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: CellRows) -> None:
     for i in range(first, count, step):
-        k, s = constants_at(cells, i), state_at(i)
+        k, s = constants_at(cells, i), state_at(cells, i)
         n, curvature = kept_cofactors(cells.state, s), cells.state[s + 80]
         for a in range(8):
             g, block = corner_strain(a, form_of(cells.constants, k)), diagonal[_row_of(cells, i, a)]
@@ -104,7 +106,7 @@ def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: Cell
 @njit(inline="always")
 def _add_bending(block: Floats, n: Nine, g: Seven, constants: Floats, k: int) -> None:
     """Add the diagonal block of Q's form for fixed directions n (elasticity.assumed_strain)."""
-    tensions = corner_tensions(constants, k, n, g)
+    tensions = corner_tensions(rest_constants(constants, k), n, g)
     for axis in range(3):
         t = tensions[axis]
         for row in range(3):
@@ -217,7 +219,8 @@ class NeoHookean:
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
         """Return the Hessian of E at q (l, 3) [m], ``projected`` to be positive semidefinite."""
-        state: Rows = np.empty((len(self.blocks.nodes), STATE * LANES), dtype, like=q)
+        width = PROJECTED if projected else STATE
+        state: Rows = np.empty((len(self.blocks.nodes), width * LANES), dtype, like=q)
         linearise(self.blocks, q, projected, state)
         constants: Rows = self.blocks.constants.astype(dtype, copy=False)
         return CellHessians(self.blocks._replace(constants=constants), state)

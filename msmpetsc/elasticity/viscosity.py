@@ -15,7 +15,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, CellRows, one_by_one
+from msmpetsc.elasticity.cell_blocks import ROWS, PROJECTED, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
 from msmpetsc.elasticity.neo_hookean import rotation_of, write_state
@@ -35,7 +35,7 @@ def _turned_states(
         r, has_rotation = rotation_of(gradient_at(q, cells, i))
         m = cells.constants[k + 104]
         slope = -m if has_rotation else 0.0
-        write_state(state, state_at(i), r, slope, m + cells.constants[k + 112])
+        write_state(state, state_at(cells, i), r, slope, m + cells.constants[k + 112])
 
 
 class Viscosity:
@@ -63,7 +63,7 @@ class Viscosity:
         self.before, self.hessian = before, self._turned_as(turned)
 
     def _turned_as(self, q: Positions) -> CellHessians:
-        state = np.empty((len(self.blocks.nodes), STATE * LANES), like=q)
+        state = np.empty((len(self.blocks.nodes), PROJECTED * LANES), like=q)
         _turned_states(LANES * len(state), q, one_by_one(self.blocks), state.ravel())
         return CellHessians(self.blocks, state)
 

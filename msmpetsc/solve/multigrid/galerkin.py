@@ -17,7 +17,12 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
-from msmpetsc.elasticity.assumed_strain import corner_tensions, directions, full_forces
+from msmpetsc.elasticity.assumed_strain import (
+    corner_tensions,
+    directions,
+    full_forces,
+    rest_constants,
+)
 from msmpetsc.elasticity.cell_strain import Nine, form_of, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
 from msmpetsc.elasticity.energy import Elasticity
@@ -312,7 +317,8 @@ def add_solid(
     for i in range(first, count, step):
         e = scratch[i % len(scratch)]
         for at in range(by_cell.start[i], by_cell.start[i + 1]):
-            k, s = constants_at(cells, by_cell.order[at]), state_at(by_cell.order[at])
+            cell = by_cell.order[at]
+            k, s = constants_at(cells, cell), state_at(cells, cell)
             m, n = cells.constants[k + 104], directions(kept_gradient(cells.state, s))
             _write_coarse(e, weights, by_cell.code[at], cells, k, s)
             pair = -1
@@ -335,6 +341,7 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
     A row has the strain g, h of a unit displacement (7), the forces of the modes h (4) that the
     identity multiplies, cof F g (3), and the tensions of ``corner_tensions`` (27).
     """
+    rest = rest_constants(cells.constants, k)
     n, of_columns = kept_cofactors(cells.state, s), directions(kept_gradient(cells.state, s))
     for a in range(8):
         u = (
@@ -343,9 +350,9 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
         )  # fmt: skip
         e, row = strain(u, form_of(cells.constants, k)), rows[a]
         row[0], row[1], row[2], row[3], row[4], row[5], row[6] = e
-        row[7], row[8], row[9], row[10] = full_forces(cells.constants, k, e)
+        row[7], row[8], row[9], row[10] = full_forces(rest, e)
         row[11], row[12], row[13] = along_cofactors(n, e)
-        tensions = corner_tensions(cells.constants, k, of_columns, e)
+        tensions = corner_tensions(rest, of_columns, e)
         for axis in range(3):
             for j in range(9):
                 row[14 + 9 * axis + j] = tensions[axis][j]

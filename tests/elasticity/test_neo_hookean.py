@@ -109,8 +109,8 @@ def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
     """lambda = 49 mu, no more than mu meanwhile: as that of Poisson's ratio 1/4, by its mu. A
-    Hessian with the pressure of the softer solid is that solid's, and above it only by what resists
-    the change of each cell's volume."""
+    Hessian with the pressure of the softer solid is that solid's in cells that are not bent, and
+    above it only by what resists the change of each cell's volume and three sums of its modes."""
     lattice = solid(2, 2, 1, poisson=0.49, cut=cut)
     assert lattice.solid is not None
     elastic = Elasticity(lattice)
@@ -123,9 +123,11 @@ def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
     with pytest.raises(KeyError), law.softened(1.0):
         assert elastic.energy(q) == pytest.approx(softer.energy(q), rel=1e-12)
         np.testing.assert_allclose(gradient(elastic, q), gradient(softer, q), rtol=1e-9, atol=1e-9)
-        slopes = law.hessian_at(q, False).slopes
         raise KeyError
     assert np.array_equal(gradient(elastic, q), before)
+    q = lattice.nodes @ (np.eye(3) + 0.2 * RNG.standard_normal((3, 3))).T
+    with law.softened(1.0):
+        slopes = law.hessian_at(q, False).slopes
     hessian, columns = law.hessian_at(q, False), []
     hessian.slopes[:] = slopes
     for unit in np.eye(q.size):
@@ -133,7 +135,7 @@ def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
         hessian(unit.reshape(q.shape), columns[-1])
     added = np.reshape(columns, (q.size, q.size)) - dense_hessian(softer, q)
     values = np.linalg.eigvalsh(added)
-    assert values[0] > -1e-9 * values[-1] and (values > 1e-9 * values[-1]).sum() <= len(
+    assert values[0] > -1e-9 * values[-1] and (values > 1e-9 * values[-1]).sum() <= 4 * len(
         lattice.local_cells
     )
 

@@ -63,8 +63,8 @@ Bent: TypeAlias = tuple[Vector, Vector, Vector]
 SQUARE = np.float32(0.5)
 # 1 + D [-]
 RANGE = np.float32(1.5)
-# 2 s / (1 - s) [-]; a wall of a tenth of a cell keeps two thirds of its bending
-FULL = np.float32(1 / 128)
+# 2 s / (1 - s) [-]; walls of a tenth of a cell bend 15% too little
+FULL = np.float32(1 / 256)
 # 1 - s [-], the factor of C in a cell's constants
 ASSUMED = 2 / (2 + float(FULL))
 # keeps divisors from zero [-]

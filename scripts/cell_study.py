@@ -21,6 +21,8 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 from msmpetsc.lattice.lattice import Lattice
 
 POISSON = (0.0, 0.25, 0.45, 0.499)
+# displacements and forces (n, 3)
+Fields = tuple[np.ndarray, np.ndarray]
 # torsion constant of a square of side 1 [-]
 SQUARE = 0.140577
 # length of a cantilever of thickness 1 m [m]
@@ -34,7 +36,7 @@ def shares(lattice: Lattice, *axes: int) -> np.ndarray:
     return np.where(ends[:, axes], 0.5, 1.0).prod(axis=1)
 
 
-def solve(lattice: Lattice, fixed: np.ndarray, u: np.ndarray, f: np.ndarray) -> np.ndarray:
+def solve(lattice: Lattice, fixed: np.ndarray, u: np.ndarray, f: np.ndarray) -> Fields:
     """Return u (n, 3) [m] under forces f (n, 3) [N] and the forces K u (n, 3) [N].
 
     fixed : (n, 3) mask of the prescribed entries of u
@@ -112,11 +114,9 @@ def plate_error(through: int, poisson: float, clamp: bool, side: int = 20) -> fl
 def plate_rows() -> lab.Rows:
     """Yield the errors of a plate's deflection."""
     for poisson in POISSON:
-        row: lab.Row = {"Poisson's ratio": str(poisson)}
+        row: dict[str, object] = {"Poisson's ratio": str(poisson)}
         for clamp, name in ((False, "supported"), (True, "clamped")):
-            row |= {
-                f"{name}, {n} through": percent(plate_error(n, poisson, clamp)) for n in (1, 2)
-            }
+            row |= {f"{name}, {n} through": percent(plate_error(n, poisson, clamp)) for n in (1, 2)}
         yield row
 
 
@@ -153,7 +153,7 @@ def beam(poisson: float, length: float, width: float, thickness: float) -> float
 
 def strip_error(thickness: float, poisson: float, length: int = 20, width: int = 3) -> float:
     """Return the error of a strip in the middle of a layer of cells of 1 m."""
-    mesh = trimesh.creation.box(bounds=[[0, 0, 0], [length, width, thickness]])
+    mesh = trimesh.creation.box(bounds=np.array([[0, 0, 0], [length, width, thickness]]))
     lattice = lattice_of(mesh, 1.0, poisson=poisson, offset=(0, 0, (1 - thickness) / 2))
     tip = clamped(lattice, np.array([0.0, 0.0, 1.0]))
     return tip / beam(poisson, length, width, thickness) - 1
@@ -162,9 +162,7 @@ def strip_error(thickness: float, poisson: float, length: int = 20, width: int =
 def strip_rows() -> lab.Rows:
     """Yield the errors of strips thinner than a cell, along the grid."""
     for poisson in POISSON:
-        errors = {
-            f"{t:g} cells": percent(strip_error(t, poisson)) for t in (1.0, 0.5, 0.25, 0.1)
-        }
+        errors = {f"{t:g} cells": percent(strip_error(t, poisson)) for t in (1.0, 0.5, 0.25, 0.1)}
         yield {"Poisson's ratio": str(poisson)} | errors
 
 
@@ -178,9 +176,7 @@ def fem_tip(poisson: float) -> float:
     face = skfem.FacetBasis(mesh, basis.elem, facets=end, intorder=4)
     f = skfem.LinearForm(lambda v, _: v[2]).assemble(face)
     fixed = basis.get_dofs(mesh.facets_satisfying(lambda x: np.isclose(x[0], 0)))
-    u = skfem.solve(
-        *skfem.condense(K, f, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-9)
-    )
+    u = skfem.solve(*skfem.condense(K, f, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-9))
     return float(f @ u)
 
 
@@ -198,7 +194,7 @@ def cantilever_rows() -> lab.Rows:
     """Yield the errors of a square cantilever."""
     for poisson in POISSON:
         exact = fem_tip(poisson)
-        row: lab.Row = {
+        row: dict[str, object] = {
             "Poisson's ratio": str(poisson),
             "hexahedra over Timoshenko": percent(exact / beam(poisson, LENGTH, 1, 1) - 1, 2),
         }

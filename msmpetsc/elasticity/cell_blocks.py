@@ -14,13 +14,13 @@ from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
-# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2), and C
-# times 1 - s, too (elasticity.assumed_strain); then m and lambda V / (16 h^2)
+# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2), and
+# C also times 1 - s (elasticity.assumed_strain); then m and lambda V / (16 h^2)
 ROWS = FORM + 2
-# entries of a cell in a projected Hessian's state [-]: F by rows, then V U' and V U'' over
-# 16 h^2
+# entries of a cell in a projected Hessian's state [-]: F by rows, then V U' and V U''
+# over 16 h^2
 PROJECTED = 11
-# entries of a cell in a true Hessian's state [-]: then the modes XY, XZ and YZ over 4 h, three
+# entries in a true Hessian's state [-]: then the modes XY, XZ and YZ over 4 h, of three
 # components each
 STATE = 20
 # VTK's corner number at each place of the order with x fastest, then y [-]

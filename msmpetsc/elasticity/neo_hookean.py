@@ -34,9 +34,10 @@ import math
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.assumed_strain import (
-    frozen_product,
+    Three,
+    columns,
     full_forces,
-    kept_modes,
+    projected_modes,
     rest_change,
     rest_concavity,
     rest_constants,
@@ -201,6 +202,16 @@ def kept_gradient(state: Floats, s: int) -> Nine:
 
 
 @njit(inline="always")
+def kept_modes(state: Floats, s: int) -> Three:
+    """Return the modes XY, XZ and YZ over 4 h of the cell whose entries begin at ``state[s]``."""
+    return (
+        (state[s + 88], state[s + 96], state[s + 104]),
+        (state[s + 112], state[s + 120], state[s + 128]),
+        (state[s + 136], state[s + 144], state[s + 152]),
+    )
+
+
+@njit(inline="always")
 def slope_gradient(e: Strains, m: float, lame: float, h4: float) -> Nine:
     """Return the derivative (9,) of E with respect to 4 h times the mean slope."""
     g, inverse_h4 = _slope_of(e), 1.0 / h4
@@ -226,9 +237,7 @@ def slope_product(e: Strains, m: float, state: Floats, s: int) -> Nine:
 
 
 @njit(inline="always")
-def cell_gradient(
-    rest: Eight, m: float, lame: float, e: Strains, h4: float
-) -> tuple[Nine, Modes]:
+def cell_gradient(rest: Eight, m: float, lame: float, e: Strains, h4: float) -> tuple[Nine, Modes]:
     """Return the gradient of E by 4 h times the mean slopes (9,) and by the modes (3 x 4).
 
     The constants are not in an array, because numba would then not vectorise loops over cells.
@@ -238,7 +247,7 @@ def cell_gradient(
     e       : strains of positions
     """
     slopes = slope_gradient(e, m, lame, h4)
-    turning, modes = rest_gradient(rest, gradient_of(e, 1.0 / h4), e, 1.0 / h4)
+    turning, modes = rest_gradient(rest, columns(gradient_of(e, 1.0 / h4)), e, 1.0 / h4)
     return _sum(slopes, turning), modes
 
 
@@ -251,7 +260,7 @@ def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[
     state, s : entries of ``write_state``, from index s on
     """
     slopes = slope_product(e, c[k + 104], state, s)
-    f, p = kept_gradient(state, s), kept_modes(state, s)
+    f, p = columns(kept_gradient(state, s)), kept_modes(state, s)
     turning, modes = rest_product(rest_constants(c, k), f, p, e)
     return _sum(slopes, turning), modes
 
@@ -260,7 +269,7 @@ def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[
 def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Nine, Modes]:
     """Return ``cell_product`` of a state without modes."""
     slopes = slope_product(e, c[k + 104], state, s)
-    return slopes, frozen_product(rest_constants(c, k), kept_gradient(state, s), e)
+    return slopes, projected_modes(rest_constants(c, k), columns(kept_gradient(state, s)), e)
 
 
 @njit(inline="always")
@@ -268,7 +277,7 @@ def forms_change(c: Floats, k: int, f: Nine, d: Nine, base: Strains, moved: Stra
     """Return the change of E but for U as F changes by d and the strains by ``moved``."""
     g = _slope_of(moved)
     own = c[k + 104] * (_inner(_slope_of(base), g) + 0.5 * _inner(g, g))
-    return own + rest_change(rest_constants(c, k), f, d, base, moved)  # type: ignore[no-any-return]
+    return own + rest_change(rest_constants(c, k), columns(f), columns(d), base, moved)  # type: ignore[no-any-return]
 
 
 @njit(inline="always")
@@ -305,8 +314,8 @@ def slopes_at(f: Nine, mu: float, lame: float, projected: bool) -> tuple[float, 
 def concavity_bounds(c: Floats, k: int, e: Strains, h4: float) -> tuple[float, float]:
     """Return a, b >= 0: the Hessian's form is at least -a |G|^2 - b |h|^2.
 
-    G are the slopes of a displacement, and h its modes XY, XZ and YZ. mu outweighs a part of what
-    the term of U' takes, and of what W takes (elasticity.assumed_strain).
+    G are the slopes of a displacement, and h its modes XY, XZ and YZ. mu outweighs a part of the
+    terms of U' and of W (elasticity.assumed_strain).
 
     e : strains of positions
     """
@@ -317,7 +326,7 @@ def concavity_bounds(c: Floats, k: int, e: Strains, h4: float) -> tuple[float, f
     j = determinant(f, n)
     slope = _slopes(j, mu, lame)[0]
     left = mu - abs(slope) * _coupling_bound(f, j, slope, CONVEX)
-    return rest_concavity(rest_constants(c, k), f, e, 1.0 / h4, left)
+    return rest_concavity(rest_constants(c, k), columns(f), e, 1.0 / h4, left)
 
 
 @njit(inline="always")
@@ -365,7 +374,7 @@ def along_cofactors(n: Nine, g: Seven) -> Vector:
 
 @njit(inline="always")
 def corner_stiffness(g: Seven, c: Floats, k: int) -> float:
-    """Return what a corner's diagonal block has of the identity, from its ``corner_strain`` g."""
+    """Return the factor of I in a corner's diagonal block, from its ``corner_strain`` g."""
     x, y, z, v = full_forces(rest_constants(c, k), g)
     own: float = c[k + 104] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     return own + x * g[3] + y * g[4] + z * g[5] + v * g[6]

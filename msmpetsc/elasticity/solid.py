@@ -22,8 +22,11 @@ from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity import cell_lanes, cell_threads
 from msmpetsc.elasticity.assumed_strain import (
     ASSUMED,
+    columns,
+    combined,
     corner_tensions,
     directions,
+    factors,
     rest_constants,
 )
 from msmpetsc.elasticity.cell_blocks import (
@@ -36,7 +39,7 @@ from msmpetsc.elasticity.cell_blocks import (
     blocks_of,
     one_by_one,
 )
-from msmpetsc.elasticity.cell_strain import LANES, Nine, Seven, corner_strain, form_of
+from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import constants_at, linearise, state_at, strains_at
 from msmpetsc.elasticity.neo_hookean import (
     along_cofactors,
@@ -45,7 +48,7 @@ from msmpetsc.elasticity.neo_hookean import (
     kept_cofactors,
     kept_gradient,
 )
-from msmpetsc.elasticity.springs import add_block
+from msmpetsc.elasticity.springs import Vector, add_block
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -92,27 +95,27 @@ def _add_concavity(
 def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: CellRows) -> None:
     for i in range(first, count, step):
         k, s = constants_at(cells, i), state_at(cells, i)
-        n, curvature = kept_cofactors(cells.state, s), cells.state[s + 80]
+        cofactors, curvature = kept_cofactors(cells.state, s), cells.state[s + 80]
+        f, rest = columns(kept_gradient(cells.state, s)), rest_constants(cells.constants, k)
+        n = directions(f, factors(f))
         for a in range(8):
             g, block = corner_strain(a, form_of(cells.constants, k)), diagonal[_row_of(cells, i, a)]
             own = corner_stiffness(g, cells.constants, k)
             block[0] += own
             block[4] += own
             block[8] += own
-            add_block(block, 0.0, curvature, along_cofactors(n, g))
-            _add_bending(block, directions(kept_gradient(cells.state, s)), g, cells.constants, k)
+            add_block(block, 0.0, curvature, along_cofactors(cofactors, g))
+            t = corner_tensions(rest, f, g)
+            for axis in range(3):
+                _add_along(block, n[axis], combined((g[3], g[4], g[5]), t[axis]))
 
 
 @njit(inline="always")
-def _add_bending(block: Floats, n: Nine, g: Seven, constants: Floats, k: int) -> None:
-    """Add the diagonal block of Q's form for fixed directions n (elasticity.assumed_strain)."""
-    tensions = corner_tensions(rest_constants(constants, k), n, g)
-    for axis in range(3):
-        t = tensions[axis]
-        for row in range(3):
-            for column in range(3):
-                tension = g[3] * t[column] + g[4] * t[3 + column] + g[5] * t[6 + column]
-                block[3 * row + column] += n[3 * row + axis] * tension
+def _add_along(block: Floats, n: Vector, t: Vector) -> None:
+    """Add n t^T to a block (9,)."""
+    for row in range(3):
+        for column in range(3):
+            block[3 * row + column] += n[row] * t[column]
 
 
 def _loops(array: Array) -> ModuleType:

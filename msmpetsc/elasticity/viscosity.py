@@ -15,7 +15,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.cell_blocks import ROWS, PROJECTED, CellRows, one_by_one
+from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
 from msmpetsc.elasticity.neo_hookean import rotation_of, write_state

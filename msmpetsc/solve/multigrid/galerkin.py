@@ -16,14 +16,17 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel, njit
-from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
 from msmpetsc.elasticity.assumed_strain import (
+    Three,
+    columns,
     corner_tensions,
     directions,
+    factors,
     full_forces,
     rest_constants,
 )
-from msmpetsc.elasticity.cell_strain import Nine, form_of, strain
+from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
+from msmpetsc.elasticity.cell_strain import form_of, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
@@ -319,7 +322,8 @@ def add_solid(
         for at in range(by_cell.start[i], by_cell.start[i + 1]):
             cell = by_cell.order[at]
             k, s = constants_at(cells, cell), state_at(cells, cell)
-            m, n = cells.constants[k + 104], directions(kept_gradient(cells.state, s))
+            m, f = cells.constants[k + 104], columns(kept_gradient(cells.state, s))
+            n = directions(f, factors(f))
             _write_coarse(e, weights, by_cell.code[at], cells, k, s)
             pair = -1
             for a in range(8):
@@ -338,11 +342,11 @@ def add_solid(
 def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: int, s: int) -> None:
     """Write a row (COARSE,) for each coarse corner of a fine cell.
 
-    A row has the strain g, h of a unit displacement (7), the forces of the modes h (4) that the
-    identity multiplies, cof F g (3), and the tensions of ``corner_tensions`` (27).
+    A row has the strain of a unit displacement (7), ``full_forces`` (4), cof F g (3) and
+    ``corner_tensions`` (27).
     """
-    rest = rest_constants(cells.constants, k)
-    n, of_columns = kept_cofactors(cells.state, s), directions(kept_gradient(cells.state, s))
+    f, rest = columns(kept_gradient(cells.state, s)), rest_constants(cells.constants, k)
+    n = kept_cofactors(cells.state, s)
     for a in range(8):
         u = (
             weights[code[0], a], weights[code[1], a], weights[code[2], a], weights[code[3], a],
@@ -352,24 +356,25 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
         row[0], row[1], row[2], row[3], row[4], row[5], row[6] = e
         row[7], row[8], row[9], row[10] = full_forces(rest, e)
         row[11], row[12], row[13] = along_cofactors(n, e)
-        tensions = corner_tensions(rest, of_columns, e)
+        t = corner_tensions(rest, f, e)
         for axis in range(3):
-            for j in range(9):
-                row[14 + 9 * axis + j] = tensions[axis][j]
+            for mode in range(3):
+                at = 14 + 9 * axis + 3 * mode
+                row[at], row[at + 1], row[at + 2] = t[axis][mode]
 
 
 @njit(inline="always")
-def _add_bending(block: Floats, n: Nine, g: Floats, h: Floats) -> None:
-    """Add what bending and twist couple two corners by, for fixed directions n (9,)."""
+def _add_bending(block: Floats, n: Three, g: Floats, h: Floats) -> None:
+    """Add the coupling of two corners by bending and twist, for fixed directions n."""
     for axis in range(3):
         at = 14 + 9 * axis
         x = g[3] * h[at] + g[4] * h[at + 3] + g[5] * h[at + 6]
         y = g[3] * h[at + 1] + g[4] * h[at + 4] + g[5] * h[at + 7]
         z = g[3] * h[at + 2] + g[4] * h[at + 5] + g[5] * h[at + 8]
         for r in range(3):
-            block[3 * r] += n[3 * r + axis] * x
-            block[3 * r + 1] += n[3 * r + axis] * y
-            block[3 * r + 2] += n[3 * r + axis] * z
+            block[3 * r] += n[axis][r] * x
+            block[3 * r + 1] += n[axis][r] * y
+            block[3 * r + 2] += n[axis][r] * z
 
 
 @njit(inline="always")

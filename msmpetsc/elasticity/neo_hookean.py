@@ -3,18 +3,19 @@
 A cell has Lame's constants mu and lambda and the volume V inside the surface. F is the mean
 deformation gradient over that volume, J = det F. The energy is
 
-    E = 1/2 mu (integral of |grad x|^2 - 3 V) + V U(J),     U(J) = -mu ln J + lambda/2 (J - 1)^2
+    E = V (mu/2 (|F|^2 - 3) + U(J)) + W,        U(J) = -mu ln J + lambda/2 (J - 1)^2
 
 for J above J_0 (Bonet and Wood 2008, Eq. 6.27; Smith, de Goes and Kim 2018 on the logarithm). Below
-J_0, U is continued by its Taylor polynomial of second order. lattice.cell_moments has the integral.
+J_0, U is continued by its Taylor polynomial of second order. W is the energy of bending and twist
+within the cell (elasticity.assumed_strain).
 
-- The first term is a quadratic form of positions, like springs of zero rest length.
-- L in A = M + t^2 L is this form with 2 mu + 3 lambda in place of mu: A dominates the Hessian.
+- L in A = M + t^2 L is 2 mu + 3 lambda times the integral of |grad x|^2, or more
+  (lattice.cell_moments.bounding_laplacians): A dominates the Hessian.
 - U'' > 0 everywhere, so an inverted cell is pushed back.
 - The second variation at rest is not negative, however the cell is cut. For a mean slope G
-  it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the form of the modes.
+  it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the squares of W.
 
-The Hessian of a cell maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where F x G is the
+The Hessian of a cell but for W maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where F x G is the
 change of cof F. In the singular frame of F, with the singular values s, it splits into blocks:
 
 - 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu];
@@ -26,7 +27,8 @@ the traceless matrix of s has the norm sqrt(2) |F|. The projected Hessian limits
 outweighs this term.
 
 The loops of a CPU (elasticity.cell_lanes) and of a GPU (elasticity.cell_threads) share these
-formulas. A Hessian stores F, V U' and V U'' of each cell. A cell's constants are scaled with V.
+formulas. A Hessian stores F, V U' and V U'' of each cell, and its modes unless it is projected.
+A cell's constants are scaled with V.
 """
 
 import math

@@ -14,11 +14,15 @@ from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
-# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2);
-# then m and lambda V / (16 h^2)
+# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2), and
+# C also times 1 - s (elasticity.assumed_strain); then m and lambda V / (16 h^2)
 ROWS = FORM + 2
-# entries of a cell in a Hessian's state [-]: F by rows, then V U' and V U'' over 16 h^2
-STATE = 11
+# entries of a cell in a projected Hessian's state [-]: F by rows, then V U' and V U''
+# over 16 h^2
+PROJECTED = 11
+# entries in a true Hessian's state [-]: then the modes XY, XZ and YZ over 4 h, of three
+# components each
+STATE = 20
 # VTK's corner number at each place of the order with x fastest, then y [-]
 BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]
 
@@ -51,7 +55,8 @@ class CellRows(NamedTuple):
     nodes     : (c, 8) local corner nodes, x fastest
     constants : ``Blocks.constants``, flat
     by_node   : True on a CPU, where a corner adds to its node's row; on a GPU it has its own row
-    state     : (b, STATE, LANES) state of a Hessian, flat; empty if the kernel needs none
+    state     : (b, width, LANES) state of a Hessian, flat; empty if the kernel needs none
+    width     : entries of a cell in the state, PROJECTED or STATE
     """
 
     nodes: Indices
@@ -60,13 +65,16 @@ class CellRows(NamedTuple):
     h4: float
     by_node: bool
     state: Floats
+    width: int
 
 
 def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
     """Return the cells of blocks in sequence, with the ``state`` of a Hessian if given."""
     constants, by_node = blocks.constants.ravel(), on_host(blocks.nodes)
     own = constants[:0] if state is None else state.ravel()
-    return CellRows(blocks.nodes.reshape(-1, 8), blocks.which, constants, blocks.h4, by_node, own)
+    width = len(own) // (LANES * len(blocks.nodes))
+    nodes = blocks.nodes.reshape(-1, 8)
+    return CellRows(nodes, blocks.which, constants, blocks.h4, by_node, own, width)
 
 
 def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:

@@ -14,14 +14,16 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import njit
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks
+from msmpetsc.elasticity.assumed_strain import rest_constants
+from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, STATE, Blocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
+    cell_gradient,
+    cell_product,
     determinant_and_change,
+    forms_change,
     gradient_of,
-    quadratic_change,
-    slope_gradient,
-    slope_product,
+    projected_product,
     volume_change,
 )
 
@@ -82,21 +84,35 @@ def _load(rows: Rows, row: int, w: Floats, at: int) -> None:
 def _product_lanes(w: Floats) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        write_forces(w, RESULT + lane, w, k, slope_product(e, w[k + 104], w, AT_STATE + lane), e)
+        slopes, modes = cell_product(w, k, w, AT_STATE + lane, e)
+        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
+
+
+@njit(fastmath=FAST, error_model="numpy")
+def _projected_product_lanes(w: Floats) -> None:
+    for lane in range(LANES):
+        k, e = CONSTANTS + lane, _strains_in(w, lane)
+        slopes, modes = projected_product(w, k, w, AT_STATE + lane, e)
+        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
 
 
 @njit()
 def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
     """Add (Hessian) v [N] to ``product`` (l, 3), with the ``state`` of ``linearise``.
 
+    A projected Hessian has a narrow state.
+
     All arrays have the same dtype.
     """
-    w = np.zeros(WORK, v.dtype)
+    w, projected = np.zeros(WORK, v.dtype), state.shape[1] == PROJECTED * LANES
     for b in range(len(blocks.nodes)):
         _gather(blocks.nodes, b, v, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
         _load(state, b, w, AT_STATE)
-        _product_lanes(w)
+        if projected:
+            _projected_product_lanes(w)
+        else:
+            _product_lanes(w)
         _scatter(blocks.nodes, b, w, product)
 
 
@@ -104,7 +120,8 @@ def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
 def _gradient_lanes(w: Floats, h4: float) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        write_forces(w, RESULT + lane, w, k, slope_gradient(e, w[k + 104], w[k + 112], h4), e)
+        slopes, modes = cell_gradient(rest_constants(w, k), w[k + 104], w[k + 112], e, h4)
+        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
 
 
 @njit()
@@ -122,10 +139,9 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
 def _change_lanes(w: Floats, inverse_h4: float) -> None:
     for lane in range(LANES):
         moved, base, s = _strains_in(w, lane), _strains_in(w, lane, RESULT), AT_STATE + lane
-        w[s], w[s + 8] = determinant_and_change(
-            gradient_of(moved, inverse_h4), gradient_of(base, inverse_h4)
-        )
-        w[s + 16] = quadratic_change(w, CONSTANTS + lane, moved, base)
+        d, f = gradient_of(moved, inverse_h4), gradient_of(base, inverse_h4)
+        w[s], w[s + 8] = determinant_and_change(d, f)
+        w[s + 16] = forms_change(w, CONSTANTS + lane, f, d, base, moved)
 
 
 @njit()

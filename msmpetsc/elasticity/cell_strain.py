@@ -19,6 +19,8 @@ Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 # strains of the components x, y and z
 Strains: TypeAlias = tuple[Seven, Seven, Seven]
+# derivatives by the four modes, for the components x, y and z
+Modes: TypeAlias = tuple[Four, Four, Four]
 
 
 @njit(inline="always")
@@ -64,35 +66,22 @@ def corner_strain(a: int, form: Six) -> Seven:
 
 
 @njit(inline="always")
-def modes_forces(c: Floats, k: int, e: Seven) -> Four:
-    """Return the derivatives (4,) of the modes' energy with respect to the modes of a strain."""
-    xy, xz, yz = c[k + 48], c[k + 56], c[k + 64]
-    of_yz, of_xz, of_xy = c[k + 72], c[k + 80], c[k + 88]
-    return (
-        xy * e[3] + of_yz * e[4] + of_xz * e[5],
-        of_yz * e[3] + xz * e[4] + of_xy * e[5],
-        of_xz * e[3] + of_xy * e[4] + yz * e[5],
-        c[k + 96] * e[6],
-    )
-
-
-@njit(inline="always")
-def write_forces(store: Floats, at: int, c: Floats, k: int, slopes: Nine, e: Strains) -> None:
+def write_forces(store: Floats, at: int, form: Six, slopes: Nine, modes: Modes) -> None:
     """Write the gradient at a cell's corners, 24 numbers, into ``store`` from index ``at``.
 
     slopes : (9,) derivative of E with respect to 4 h times the mean slopes
-    e      : strains, whose modes give the rest of the gradient
+    modes  : (3 x 4) derivative of E with respect to the modes of each component
     """
-    _write_component(store, at, c, k, (slopes[0], slopes[1], slopes[2]), e[0])
-    _write_component(store, at + 8, c, k, (slopes[3], slopes[4], slopes[5]), e[1])
-    _write_component(store, at + 16, c, k, (slopes[6], slopes[7], slopes[8]), e[2])
+    _write_component(store, at, form, (slopes[0], slopes[1], slopes[2]), modes[0])
+    _write_component(store, at + 8, form, (slopes[3], slopes[4], slopes[5]), modes[1])
+    _write_component(store, at + 16, form, (slopes[6], slopes[7], slopes[8]), modes[2])
 
 
 @njit(inline="always")
-def _write_component(w: Floats, at: int, c: Floats, k: int, slopes: Vector, e: Seven) -> None:
+def _write_component(w: Floats, at: int, form: Six, slopes: Vector, modes: Four) -> None:
     p, q, r = slopes
-    m, n, o, v = modes_forces(c, k, e)
-    cx, cy, cz, mxy, mxz, myz = form_of(c, k)
+    m, n, o, v = modes
+    cx, cy, cz, mxy, mxz, myz = form
     xyz = v + m * cz + n * cy + o * cx + p * myz + q * mxz + r * mxy
     xy, xz, yz = m + p * cy + q * cx, n + p * cz + r * cx, o + q * cz + r * cy
     x0, x1, y0, y1, xy0, xy1 = p - xz, p + xz, q - yz, q + yz, xy - xyz, xy + xyz

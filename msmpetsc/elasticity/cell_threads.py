@@ -11,16 +11,19 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, Blocks, CellRows, one_by_one
+from msmpetsc.elasticity.assumed_strain import rest_constants
+from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, Blocks, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
+    cell_gradient,
+    cell_product,
     determinant_and_change,
+    forms_change,
     gradient_of,
-    quadratic_change,
-    slope_gradient,
-    slope_product,
+    projected_product,
     slopes_at,
     volume_change,
+    write_modes,
     write_state,
 )
 from msmpetsc.elasticity.springs import Displacement
@@ -33,9 +36,9 @@ def constants_at(cells: CellRows, i: int) -> int:
 
 
 @njit(inline="always")
-def state_at(i: int) -> int:
+def state_at(cells: CellRows, i: int) -> int:
     """Return the index at which the Hessian's state of cell i begins."""
-    return (i // LANES) * STATE * LANES + i % LANES
+    return (i // LANES) * cells.width * LANES + i % LANES
 
 
 @njit(inline="always")
@@ -64,8 +67,13 @@ def _write_products(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(v, cells, i)
-        slopes = slope_product(e, cells.constants[k + 104], cells.state, state_at(i))
-        write_forces(store, (i // LANES) * 24 * LANES + i % LANES, cells.constants, k, slopes, e)
+        s = state_at(cells, i)
+        if cells.width == PROJECTED:
+            slopes, modes = projected_product(cells.constants, k, cells.state, s, e)
+        else:
+            slopes, modes = cell_product(cells.constants, k, cells.state, s, e)
+        at = (i // LANES) * 24 * LANES + i % LANES
+        write_forces(store, at, form_of(cells.constants, k), slopes, modes)
 
 
 @kernel
@@ -74,8 +82,10 @@ def _write_gradients(
 ) -> None:
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
-        slopes = slope_gradient(e, cells.constants[k + 104], cells.constants[k + 112], cells.h4)
-        write_forces(store, (i // LANES) * 24 * LANES + i % LANES, cells.constants, k, slopes, e)
+        m, lame = cells.constants[k + 104], cells.constants[k + 112]
+        slopes, modes = cell_gradient(rest_constants(cells.constants, k), m, lame, e, cells.h4)
+        at = (i // LANES) * 24 * LANES + i % LANES
+        write_forces(store, at, form_of(cells.constants, k), slopes, modes)
 
 
 @kernel
@@ -98,11 +108,14 @@ def _write_states(
     first: int, count: int, step: int, q: Positions, cells: CellRows, projected: bool
 ) -> None:
     for i in range(first, count, step):
-        k, f = constants_at(cells, i), gradient_at(q, cells, i)
+        k, e, inverse_h4 = constants_at(cells, i), strains_at(q, cells, i), 1.0 / cells.h4
+        f = gradient_of(e, inverse_h4)
         slope, curvature = slopes_at(
             f, cells.constants[k + 104], cells.constants[k + 112], projected
         )
-        write_state(cells.state, state_at(i), f, slope, curvature)
+        write_state(cells.state, state_at(cells, i), f, slope, curvature)
+        if not projected:
+            write_modes(cells.state, state_at(cells, i), e, inverse_h4)
 
 
 @kernel
@@ -112,13 +125,12 @@ def _write_changes(
     base, moved = displacement
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
-        j_base, j_change = determinant_and_change(
-            gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)
-        )
+        g, f = gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)
+        j_base, j_change = determinant_and_change(g, f)
         m, parts[i] = cells.constants[k + 104], 0.0
         if m > 0.0:
             volume = volume_change(j_base + j_change, j_base, j_change, m, cells.constants[k + 112])
-            parts[i] = quadratic_change(cells.constants, k, d, e) + cells.h4**2 * volume
+            parts[i] = forms_change(cells.constants, k, f, g, e, d) + cells.h4**2 * volume
 
 
 def _add(
@@ -141,7 +153,10 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
 
 
 def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> None:
-    """Write F, V U' and V U'' of each cell at q (l, 3) [m] into ``state`` (b, STATE * LANES)."""
+    """Write the entries of each cell at q (l, 3) [m] into ``state`` (b, width * LANES).
+
+    The width is PROJECTED if the Hessian is ``projected``, else STATE (elasticity.cell_blocks).
+    """
     _write_states(LANES * len(blocks.nodes), q, one_by_one(blocks, state), projected)
 
 

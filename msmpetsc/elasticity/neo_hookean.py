@@ -3,18 +3,19 @@
 A cell has Lame's constants mu and lambda and the volume V inside the surface. F is the mean
 deformation gradient over that volume, J = det F. The energy is
 
-    E = 1/2 mu (integral of |grad x|^2 - 3 V) + V U(J),     U(J) = -mu ln J + lambda/2 (J - 1)^2
+    E = V (mu/2 (|F|^2 - 3) + U(J)) + W,        U(J) = -mu ln J + lambda/2 (J - 1)^2
 
 for J above J_0 (Bonet and Wood 2008, Eq. 6.27; Smith, de Goes and Kim 2018 on the logarithm). Below
-J_0, U is continued by its Taylor polynomial of second order. lattice.cell_moments has the integral.
+J_0, U is continued by its Taylor polynomial of second order. W is the energy of bending and twist
+within the cell (elasticity.assumed_strain).
 
-- The first term is a quadratic form of positions, like springs of zero rest length.
-- L in A = M + t^2 L is this form with 2 mu + 3 lambda in place of mu: A dominates the Hessian.
+- L in A = M + t^2 L is 2 mu + 3 lambda times the integral of |grad x|^2, or more
+  (lattice.cell_moments.bounding_laplacians): A dominates the Hessian.
 - U'' > 0 everywhere, so an inverted cell is pushed back.
 - The second variation at rest is not negative, however the cell is cut. For a mean slope G
-  it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the form of the modes.
+  it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the squares of W.
 
-The Hessian of a cell maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where F x G is the
+The Hessian of a cell but for W maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where F x G is the
 change of cof F. In the singular frame of F, with the singular values s, it splits into blocks:
 
 - 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu];
@@ -26,14 +27,26 @@ the traceless matrix of s has the norm sqrt(2) |F|. The projected Hessian limits
 outweighs this term.
 
 The loops of a CPU (elasticity.cell_lanes) and of a GPU (elasticity.cell_threads) share these
-formulas. A Hessian stores F, V U' and V U'' of each cell. A cell's constants are scaled with V.
+formulas. A Hessian stores F, V U' and V U'' of each cell, and its modes unless it is projected.
+A cell's constants are scaled with V.
 """
 
 import math
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
-from msmpetsc.elasticity.cell_strain import Nine, Seven, Strains, modes_forces
+from msmpetsc.elasticity.assumed_strain import (
+    Three,
+    columns,
+    full_forces,
+    projected_modes,
+    rest_change,
+    rest_concavity,
+    rest_constants,
+    rest_gradient,
+    rest_product,
+)
+from msmpetsc.elasticity.cell_strain import Eight, Modes, Nine, Seven, Strains
 from msmpetsc.elasticity.springs import Vector
 
 # J_0 [-]; U is a parabola below, so that the force on an inverted cell stays finite
@@ -159,6 +172,15 @@ def _plus(x: Nine, a: float, y: Nine) -> Nine:
 
 
 @njit(inline="always")
+def _sum(x: Nine, y: Nine) -> Nine:
+    return (
+        x[0] + y[0], x[1] + y[1], x[2] + y[2],
+        x[3] + y[3], x[4] + y[4], x[5] + y[5],
+        x[6] + y[6], x[7] + y[7], x[8] + y[8],
+    )  # fmt: skip
+
+
+@njit(inline="always")
 def _slope_of(e: Strains) -> Nine:
     """Return 4 h times the mean slope (9,) by rows, from the strains of three components."""
     a, b, c = e
@@ -179,6 +201,16 @@ def kept_gradient(state: Floats, s: int) -> Nine:
         state[s + 24], state[s + 32], state[s + 40],
         state[s + 48], state[s + 56], state[s + 64],
     )  # fmt: skip
+
+
+@njit(inline="always")
+def kept_modes(state: Floats, s: int) -> Three:
+    """Return the modes XY, XZ and YZ over 4 h of the cell whose entries begin at ``state[s]``."""
+    return (
+        (state[s + 88], state[s + 96], state[s + 104]),
+        (state[s + 112], state[s + 120], state[s + 128]),
+        (state[s + 136], state[s + 144], state[s + 152]),
+    )
 
 
 @njit(inline="always")
@@ -207,19 +239,47 @@ def slope_product(e: Strains, m: float, state: Floats, s: int) -> Nine:
 
 
 @njit(inline="always")
-def quadratic(w: Floats, k: int, a: Strains, b: Strains) -> float:
-    """Return the bilinear form of the mu term for two strains: mean slopes and modes, times m."""
-    total: float = w[k + 104] * _inner(_slope_of(a), _slope_of(b))
-    for i in range(3):
-        x, y, z, v = modes_forces(w, k, b[i])
-        total += a[i][3] * x + a[i][4] * y + a[i][5] * z + a[i][6] * v
-    return total
+def cell_gradient(rest: Eight, m: float, lame: float, e: Strains, h4: float) -> tuple[Nine, Modes]:
+    """Return the gradient of E by 4 h times the mean slopes (9,) and by the modes (3 x 4).
+
+    The constants are not in an array, because numba would then not vectorise loops over cells.
+
+    rest    : ``rest_constants``
+    m, lame : V mu and V lambda over 16 h^2
+    e       : strains of positions
+    """
+    slopes = slope_gradient(e, m, lame, h4)
+    turning, modes = rest_gradient(rest, columns(gradient_of(e, 1.0 / h4)), e, 1.0 / h4)
+    return _sum(slopes, turning), modes
 
 
 @njit(inline="always")
-def quadratic_change(w: Floats, k: int, moved: Strains, base: Strains) -> float:
-    """Return the change of 1/2 ``quadratic`` as strains change from ``base`` by ``moved``."""
-    return quadratic(w, k, moved, base) + 0.5 * quadratic(w, k, moved, moved)
+def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Nine, Modes]:
+    """Return the product of the Hessian of E with a displacement of strains e.
+
+    It is the derivative of ``cell_gradient``.
+
+    state, s : entries of ``write_state``, from index s on
+    """
+    slopes = slope_product(e, c[k + 104], state, s)
+    f, p = columns(kept_gradient(state, s)), kept_modes(state, s)
+    turning, modes = rest_product(rest_constants(c, k), f, p, e)
+    return _sum(slopes, turning), modes
+
+
+@njit(inline="always")
+def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Nine, Modes]:
+    """Return ``cell_product`` of a state without modes."""
+    slopes = slope_product(e, c[k + 104], state, s)
+    return slopes, projected_modes(rest_constants(c, k), columns(kept_gradient(state, s)), e)
+
+
+@njit(inline="always")
+def forms_change(c: Floats, k: int, f: Nine, d: Nine, base: Strains, moved: Strains) -> float:
+    """Return the change of E but for U as F changes by d and the strains by ``moved``."""
+    g = _slope_of(moved)
+    own = c[k + 104] * (_inner(_slope_of(base), g) + 0.5 * _inner(g, g))
+    return own + rest_change(rest_constants(c, k), columns(f), columns(d), base, moved)  # type: ignore[no-any-return]
 
 
 @njit(inline="always")
@@ -229,6 +289,15 @@ def write_state(store: Floats, s: int, f: Nine, slope: float, curvature: float) 
     store[s + 24], store[s + 32], store[s + 40] = f[3], f[4], f[5]
     store[s + 48], store[s + 56], store[s + 64] = f[6], f[7], f[8]
     store[s + 72], store[s + 80] = slope, curvature
+
+
+@njit(inline="always")
+def write_modes(store: Floats, s: int, e: Strains, inverse_h4: float) -> None:
+    """Write the modes over 4 h of the strains e of positions into ``store``, from index s + 88."""
+    for i in range(3):
+        store[s + 88 + 8 * i] = inverse_h4 * e[i][3]
+        store[s + 112 + 8 * i] = inverse_h4 * e[i][4]
+        store[s + 136 + 8 * i] = inverse_h4 * e[i][5]
 
 
 @njit(inline="always")
@@ -244,12 +313,22 @@ def slopes_at(f: Nine, mu: float, lame: float, projected: bool) -> tuple[float, 
 
 
 @njit(inline="always")
-def concavity_bound(f: Nine, mu: float, lame: float) -> float:
-    """Return c >= 0 for which the Hessian's form on a slope G is at least -c |G|^2."""
+def concavity_bounds(c: Floats, k: int, e: Strains, h4: float) -> tuple[float, float]:
+    """Return a, b >= 0: the Hessian's form is at least -a |G|^2 - b |h|^2.
+
+    G are the slopes of a displacement, and h its modes XY, XZ and YZ. mu outweighs a part of the
+    terms of U' and of W (elasticity.assumed_strain).
+
+    e : strains of positions
+    """
+    f, mu, lame = gradient_of(e, 1.0 / h4), c[k + 104], c[k + 112]
+    if not mu > 0.0:
+        return 0.0, 0.0
     n = cofactors(f)
     j = determinant(f, n)
     slope = _slopes(j, mu, lame)[0]
-    return max(abs(slope) * _coupling_bound(f, j, slope, CONVEX) - mu, 0.0)
+    left = mu - abs(slope) * _coupling_bound(f, j, slope, CONVEX)
+    return rest_concavity(rest_constants(c, k), columns(f), e, 1.0 / h4, left)
 
 
 @njit(inline="always")
@@ -297,7 +376,7 @@ def along_cofactors(n: Nine, g: Seven) -> Vector:
 
 @njit(inline="always")
 def corner_stiffness(g: Seven, c: Floats, k: int) -> float:
-    """Return the mu term of the Hessian's diagonal at a corner, from its ``corner_strain`` g."""
-    x, y, z, v = modes_forces(c, k, g)
+    """Return the factor of I in a corner's diagonal block, from its ``corner_strain`` g."""
+    x, y, z, v = full_forces(rest_constants(c, k), g)
     own: float = c[k + 104] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     return own + x * g[3] + y * g[4] + z * g[5] + v * g[6]

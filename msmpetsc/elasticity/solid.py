@@ -20,7 +20,17 @@ from msmpetsc.backend.arrays import (
 )
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity import cell_lanes, cell_threads
+from msmpetsc.elasticity.assumed_strain import (
+    ASSUMED,
+    columns,
+    combined,
+    corner_tensions,
+    directions,
+    factors,
+    rest_constants,
+)
 from msmpetsc.elasticity.cell_blocks import (
+    PROJECTED,
     ROWS,
     STATE,
     Blocks,
@@ -30,14 +40,15 @@ from msmpetsc.elasticity.cell_blocks import (
     one_by_one,
 )
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
-from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, linearise, state_at
+from msmpetsc.elasticity.cell_threads import constants_at, linearise, state_at, strains_at
 from msmpetsc.elasticity.neo_hookean import (
     along_cofactors,
-    concavity_bound,
+    concavity_bounds,
     corner_stiffness,
     kept_cofactors,
+    kept_gradient,
 )
-from msmpetsc.elasticity.springs import add_block
+from msmpetsc.elasticity.springs import Vector, add_block
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -48,9 +59,13 @@ def _row_of(cells: CellRows, i: int, a: int) -> int:
 
 
 @njit(inline="always")
-def _size(a: int, constants: Floats, k: int) -> float:
+def _sizes(a: int, constants: Floats, k: int) -> tuple[float, float]:
+    """Return the norms of the mean slopes and of the modes XY, XZ and YZ of corner a."""
     g = corner_strain(a, form_of(constants, k))
-    return math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    return (
+        math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2]),
+        math.sqrt(g[3] * g[3] + g[4] * g[4] + g[5] * g[5]),
+    )
 
 
 @kernel
@@ -59,32 +74,48 @@ def _add_concavity(
 ) -> None:
     """Add each cell's share of the concavity bound to its corners.
 
-    With g_a the mean slope of corner a, |G|^2 <= sum_a |g_a| (sum_b |g_b|) |v_a|^2.
+    With g_a the mean slope of corner a, |G|^2 <= sum_a |g_a| (sum_b |g_b|) |v_a|^2, and the same
+    for modes.
     """
     for i in range(first, count, step):
-        k = constants_at(cells, i)
-        sizes = 0.0
+        k, e = constants_at(cells, i), strains_at(q, cells, i)
+        slopes, modes = 0.0, 0.0
         for a in range(8):
-            sizes += _size(a, cells.constants, k)
-        bound = sizes * concavity_bound(
-            gradient_at(q, cells, i), cells.constants[k + 104], cells.constants[k + 112]
-        )
+            slope, mode = _sizes(a, cells.constants, k)
+            slopes += slope
+            modes += mode
+        of_slopes, of_modes = concavity_bounds(cells.constants, k, e, cells.h4)
         for a in range(8):
-            concavity[_row_of(cells, i, a), 0] += bound * _size(a, cells.constants, k)
+            slope, mode = _sizes(a, cells.constants, k)
+            bound = of_slopes * slopes * slope + of_modes * modes * mode
+            concavity[_row_of(cells, i, a), 0] += bound
 
 
 @kernel
 def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: CellRows) -> None:
     for i in range(first, count, step):
-        k, s = constants_at(cells, i), state_at(i)
-        n, curvature = kept_cofactors(cells.state, s), cells.state[s + 80]
+        k, s = constants_at(cells, i), state_at(cells, i)
+        cofactors, curvature = kept_cofactors(cells.state, s), cells.state[s + 80]
+        f, rest = columns(kept_gradient(cells.state, s)), rest_constants(cells.constants, k)
+        n = directions(f, factors(f))
         for a in range(8):
             g, block = corner_strain(a, form_of(cells.constants, k)), diagonal[_row_of(cells, i, a)]
             own = corner_stiffness(g, cells.constants, k)
             block[0] += own
             block[4] += own
             block[8] += own
-            add_block(block, 0.0, curvature, along_cofactors(n, g))
+            add_block(block, 0.0, curvature, along_cofactors(cofactors, g))
+            t = corner_tensions(rest, f, g)
+            for axis in range(3):
+                _add_along(block, n[axis], combined((g[3], g[4], g[5]), t[axis]))
+
+
+@njit(inline="always")
+def _add_along(block: Floats, n: Vector, t: Vector) -> None:
+    """Add n t^T to a block (9,)."""
+    for row in range(3):
+        for column in range(3):
+            block[3 * row + column] += n[row] * t[column]
 
 
 def _loops(array: Array) -> ModuleType:
@@ -111,7 +142,10 @@ class CellHessians:
         return self.state[:, 9 * LANES : 10 * LANES]
 
     def add_diagonal(self, diagonal: Rows) -> None:
-        """Add the diagonal blocks to ``diagonal`` (l, 9) [N/m]; the term of U' has none."""
+        """Add the diagonal blocks of a projected Hessian to ``diagonal`` (l, 9) [N/m].
+
+        The term of U' has none.
+        """
         cells = one_by_one(self.blocks, self.state)
         count = len(cells.nodes)
         add_corners(
@@ -132,8 +166,9 @@ class NeoHookean:
         h4 = 4 * lattice.cell_size
         forms, volume, shear, lame = map(to_host, lattice.solid)
         m = (shear * volume / h4**2)[:, None]
+        modes = m * forms[:, 6:] * np.array([*[ASSUMED] * 6, 1.0])
         constants = np.concatenate(
-            [forms[:, :6], m * forms[:, 6:], m, (lame * volume / h4**2)[:, None]], axis=1
+            [forms[:, :6], modes, m, (lame * volume / h4**2)[:, None]], axis=1
         )
         return cls(blocks_of(lattice, constants))
 
@@ -187,7 +222,8 @@ class NeoHookean:
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
         """Return the Hessian of E at q (l, 3) [m], ``projected`` to be positive semidefinite."""
-        state: Rows = np.empty((len(self.blocks.nodes), STATE * LANES), dtype, like=q)
+        width = PROJECTED if projected else STATE
+        state: Rows = np.empty((len(self.blocks.nodes), width * LANES), dtype, like=q)
         linearise(self.blocks, q, projected, state)
         constants: Rows = self.blocks.constants.astype(dtype, copy=False)
         return CellHessians(self.blocks._replace(constants=constants), state)

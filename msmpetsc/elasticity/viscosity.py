@@ -13,9 +13,9 @@ have to rotate them, too. In a bend over n cells their share is 1 / n^2.
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.cell_blocks import ROWS, STATE, CellRows, one_by_one
+from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
 from msmpetsc.elasticity.neo_hookean import rotation_of, write_state
@@ -23,9 +23,7 @@ from msmpetsc.elasticity.solid import CellHessians, NeoHookean
 
 
 @kernel
-def _turned_states(
-    first: int, count: int, step: int, q: Positions, cells: CellRows, state: Floats
-) -> None:
+def _turned_states(first: int, count: int, step: int, q: Positions, cells: CellRows) -> None:
     """Write the state of cells at rest, rotated as the cells at q (l, 3) [m], for their Hessians.
 
     A flat or inverted cell has no rotation. Its K is not rotated, and resists rotations, too.
@@ -35,7 +33,7 @@ def _turned_states(
         r, has_rotation = rotation_of(gradient_at(q, cells, i))
         m = cells.constants[k + 104]
         slope = -m if has_rotation else 0.0
-        write_state(state, state_at(i), r, slope, m + cells.constants[k + 112])
+        write_state(cells.state, state_at(cells, i), r, slope, m + cells.constants[k + 112])
 
 
 class Viscosity:
@@ -63,8 +61,8 @@ class Viscosity:
         self.before, self.hessian = before, self._turned_as(turned)
 
     def _turned_as(self, q: Positions) -> CellHessians:
-        state = np.empty((len(self.blocks.nodes), STATE * LANES), like=q)
-        _turned_states(LANES * len(state), q, one_by_one(self.blocks), state.ravel())
+        state = np.empty((len(self.blocks.nodes), PROJECTED * LANES), like=q)
+        _turned_states(LANES * len(state), q, one_by_one(self.blocks, state))
         return CellHessians(self.blocks, state)
 
     def energy(self, q: Positions) -> float:

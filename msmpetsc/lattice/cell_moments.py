@@ -42,18 +42,18 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 # coefficients (7, 8) of the seven sums [-]
 SUMS = np.stack([*SIGNS.T, *(SIGNS[:, i] * SIGNS[:, j] for i, j in PAIRS), SIGNS.prod(axis=1)])
 # row of ``forms_of`` for a whole cell [-]; its variances are 1/12
-WHOLE = np.array([*[0.0] * 6, *[2 / 3] * 3, *[0.0] * 3, 1 / 3])
+WHOLE = np.array([*[0.0] * 6, *[1 / 3] * 3, *[0.0] * 3, 1 / 3])
 
 
 def forms_of(fills: Rows, moments: Rows) -> Rows:
-    """Return the strain form (c, FORM) of cells: mean slopes, then the quadratic form of the modes.
+    """Return the strain form (c, FORM) of cells: constants of the mean slopes and of the modes.
 
     The columns are
 
         2 c_x, 2 c_y, 2 c_z,
         4 <x y>, 4 <x z>, 4 <y z>,
-        4 (C_xx + C_yy), 4 (C_xx + C_zz), 4 (C_yy + C_zz),    the modes' diagonal
-        4 C_yz, 4 C_xz, 4 C_xy,                               modes 1 and 2, 1 and 3, 2 and 3
+        4 C_xx, 4 C_yy, 4 C_zz,
+        4 C_yz, 4 C_xz, 4 C_xy,
         16 (C_xx C_yy + C_xx C_zz + C_yy C_zz)                the mode XYZ
 
     fills   : (c, 8) fills of the corners (geometry.fill_fractions)
@@ -73,7 +73,7 @@ def forms_of(fills: Rows, moments: Rows) -> Rows:
     covariance = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     x, y, z = covariance[:, range(3), range(3)].T
     coupled = 4 * np.stack([covariance[:, 1, 2], covariance[:, 0, 2], covariance[:, 0, 1]], axis=1)
-    own = 4 * np.stack([x + y, x + z, y + z], axis=1)
+    own = 4 * np.stack([x, y, z], axis=1)
     return np.concatenate(
         [2 * middle, 4 * products, own, coupled, 16 * (x * y + x * z + y * z)[:, None]], axis=1
     )
@@ -103,13 +103,58 @@ def laplacians(forms: Rows, volume: Floats) -> Rows:
 
     volume : (c,) fraction of each cell that lies inside [-]
     """
-    slopes, modes = slopes_and_modes(forms)
-    form = np.zeros((len(forms), 4, 4))
+    return _with_form(forms, volume, _modes_form(forms))
+
+
+def bounding_laplacians(forms: Rows, volume: Floats) -> Rows:
+    """Return matrices (c, 8, 8) no less than ``laplacians`` that bound the solid's Hessian at rest.
+
+    With the module's notation, the energy of elasticity.assumed_strain at rest is for the component
+    x at most (2 mu + 3 lambda) / 16 times
+
+        4 <(d_y h_xy + d_z h_xz)^2> + 4 (C_yy + C_zz) h_yz^2 + 16 (...) XYZ^2,
+
+    and alike for y and z. If coordinates are correlated, the form of |grad u|^2 may be less. Its
+    diagonal D is then added as often as the greatest eigenvalue of D^(-1/2) (form' - form) D^(-1/2)
+    demands.
+    """
+    form = _modes_form(forms)
+    diagonal = np.diagonal(form, axis1=1, axis2=2)[:, :3]
+    scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
+    lack = np.zeros(len(forms))
+    own = forms[:, 6:9]
+    for axis in range(3):
+        # The two modes that bend along the axis, and the mode that twists
+        bends = [k for k, pair in enumerate(PAIRS) if axis in pair]
+        others = [sum(PAIRS[k]) - axis for k in bends]
+        twist = 3 - sum(bends)
+        of_axis = np.zeros((len(forms), 3, 3))
+        for k, other in zip(bends, others, strict=True):
+            of_axis[:, k, k] = own[:, other]
+        i, j = bends
+        of_axis[:, i, j] = of_axis[:, j, i] = form[:, i, j]
+        of_axis[:, twist, twist] = own[:, others].sum(axis=1)
+        missing = (of_axis - form[:, :3, :3]) * scale[:, :, None] * scale[:, None, :]
+        lack = np.maximum(lack, np.linalg.eigvalsh(missing)[:, -1])
     for k in range(3):
-        form[:, k, k] = forms[:, 6 + k]
+        form[:, k, k] += lack * diagonal[:, k]
+    return _with_form(forms, volume, form)
+
+
+def _modes_form(forms: Rows) -> Rows:
+    """Return the quadratic form (c, 4, 4) of the modes in 16 times the mean square."""
+    x, y, z = forms[:, 6:9].T
+    form = np.zeros((len(forms), 4, 4))
+    for k, own in enumerate((x + y, x + z, y + z)):
+        form[:, k, k] = own
     for k, (i, j) in enumerate(PAIRS):
         form[:, i, j] = form[:, j, i] = forms[:, 9 + k]
     form[:, 3, 3] = forms[:, 12]
+    return form
+
+
+def _with_form(forms: Rows, volume: Floats, form: Rows) -> Rows:
+    slopes, modes = slopes_and_modes(forms)
     both = slopes.transpose(0, 2, 1) @ slopes + modes.transpose(0, 2, 1) @ form @ modes
     integrals: Rows = volume[:, None, None] / 16 * both
     return integrals

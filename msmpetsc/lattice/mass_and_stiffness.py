@@ -9,7 +9,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
-from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
+from msmpetsc.lattice.cell_moments import WHOLE, bounding_laplacians, forms_of, laplacians
 from msmpetsc.lattice.cut_cells import mass_fractions, spring_fractions
 from msmpetsc.lattice.material import (
     CellMaterial,
@@ -94,15 +94,18 @@ def law_of_solid(
     forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
     volume = np.ones(count)
     pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
+    cut = np.empty(0, np.int64)
     if net.fills is not None and net.moments is not None:
         forms, pairs = forms.copy(), pairs.copy()
         cut = np.flatnonzero(net.fills.min(axis=1) < 1)
         volume[cut] = net.fills[cut].mean(axis=1)
         forms[cut] = forms_of(net.fills[cut], net.moments[cut])
         pairs[cut] = laplacians(forms[cut], volume[cut])
-    diagonal = np.diagonal(pairs, axis1=1, axis2=2)
+    diagonal = np.diagonal(pairs, axis1=1, axis2=2).copy()
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
+    if len(cut):
+        pairs[cut] = bounding_laplacians(forms[cut], volume[cut])
     # 2 mu + 3 lambda times |grad u|^2 bounds the second variation at rest.
     modulus = 2 * shear + 3 * lame
     of_spring = _sums_of_springs(net, -h * modulus, pairs)

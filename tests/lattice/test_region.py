@@ -86,7 +86,7 @@ def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
 
 
 @pytest.mark.parametrize(
-    ("law", "low", "high"), [("neo-hookean", 0.95, 1.05), ("linear", 0.7, 1.0)]
+    ("law", "low", "high"), [("neo-hookean", 0.93, 1.05), ("linear", 0.7, 1.0)]
 )
 def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
     """Work of the weight: 9.65e-5 J by 11,206 quadratic tetrahedra (scikit-fem), clamped where they

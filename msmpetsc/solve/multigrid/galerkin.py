@@ -16,8 +16,17 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel, njit
+from msmpetsc.elasticity.assumed_strain import (
+    Three,
+    columns,
+    corner_tensions,
+    directions,
+    factors,
+    full_forces,
+    rest_constants,
+)
 from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
-from msmpetsc.elasticity.cell_strain import form_of, modes_forces, strain
+from msmpetsc.elasticity.cell_strain import form_of, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
@@ -33,6 +42,8 @@ from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 PINNED = 27
 # the upper triangle in a 3 x 3 block, and the diagonal in the upper triangle
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
+# entries of a row of ``_write_coarse`` [-]
+COARSE = 41
 # pairs (36, 2) of corners: the upper triangle of a cell's matrix
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])
 
@@ -211,7 +222,7 @@ class GalerkinSum:
             own += self.t2 * contact[:, UPPER]
         add_nodes(count, own, PairSum(symmetric, self.places, self.nodes, self.of_nodes))
         into = CellSum(symmetric[:, self.full], self.places, self.cells, self.weights)
-        scratch = np.empty((1 if on_host(q) else count, 8, 14), like=q)
+        scratch = np.empty((1 if on_host(q) else count, 8, COARSE), like=q)
         hessians: list[CellHessians] = [solid.hessian_at(q, True)] if solid else []
         for hessian in hessians + ([viscosity.hessian] if viscosity else []):
             add_solid(count, scratch, into, one_by_one(hessian.blocks, hessian.state))
@@ -303,14 +314,16 @@ def add_solid(
 ) -> None:
     """Add t^2 times the Hessians of fine cells, whose corners are interpolated from coarse corners.
 
-    scratch : (s, 8, 14) rows of ``_write_coarse``; coarse cell i uses row i % s
+    scratch : (s, 8, COARSE) rows of ``_write_coarse``; coarse cell i uses row i % s
     """
     values, places, by_cell, weights = into
     for i in range(first, count, step):
         e = scratch[i % len(scratch)]
         for at in range(by_cell.start[i], by_cell.start[i + 1]):
-            k, s = constants_at(cells, by_cell.order[at]), state_at(by_cell.order[at])
-            m = cells.constants[k + 104]
+            cell = by_cell.order[at]
+            k, s = constants_at(cells, cell), state_at(cells, cell)
+            m, f = cells.constants[k + 104], columns(kept_gradient(cells.state, s))
+            n = directions(f, factors(f))
             _write_coarse(e, weights, by_cell.code[at], cells, k, s)
             pair = -1
             for a in range(8):
@@ -320,16 +333,19 @@ def add_solid(
                         own = m * (e[a, 0] * e[c, 0] + e[a, 1] * e[c, 1] + e[a, 2] * e[c, 2])
                         for mode in range(4):
                             own += e[a, 3 + mode] * e[c, 7 + mode]
-                        _add_block(values[places[i, pair]], own, cells.state, s, e[a], e[c])
+                        block = values[places[i, pair]]
+                        _add_block(block, own, cells.state, s, e[a], e[c])
+                        _add_bending(block, n, e[a], e[c])
 
 
 @njit(inline="always")
 def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: int, s: int) -> None:
-    """Write a row (14,) for each coarse corner of a fine cell.
+    """Write a row (COARSE,) for each coarse corner of a fine cell.
 
-    A row has the strain g, h of a unit displacement (7), the forces of the modes h (4), and
-    cof F g (3).
+    A row has the strain of a unit displacement (7), ``full_forces`` (4), cof F g (3) and
+    ``corner_tensions`` (27).
     """
+    f, rest = columns(kept_gradient(cells.state, s)), rest_constants(cells.constants, k)
     n = kept_cofactors(cells.state, s)
     for a in range(8):
         u = (
@@ -338,8 +354,27 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
         )  # fmt: skip
         e, row = strain(u, form_of(cells.constants, k)), rows[a]
         row[0], row[1], row[2], row[3], row[4], row[5], row[6] = e
-        row[7], row[8], row[9], row[10] = modes_forces(cells.constants, k, e)
+        row[7], row[8], row[9], row[10] = full_forces(rest, e)
         row[11], row[12], row[13] = along_cofactors(n, e)
+        t = corner_tensions(rest, f, e)
+        for axis in range(3):
+            for mode in range(3):
+                at = 14 + 9 * axis + 3 * mode
+                row[at], row[at + 1], row[at + 2] = t[axis][mode]
+
+
+@njit(inline="always")
+def _add_bending(block: Floats, n: Three, g: Floats, h: Floats) -> None:
+    """Add the coupling of two corners by bending and twist, for fixed directions n."""
+    for axis in range(3):
+        at = 14 + 9 * axis
+        x = g[3] * h[at] + g[4] * h[at + 3] + g[5] * h[at + 6]
+        y = g[3] * h[at + 1] + g[4] * h[at + 4] + g[5] * h[at + 7]
+        z = g[3] * h[at + 2] + g[4] * h[at + 5] + g[5] * h[at + 8]
+        for r in range(3):
+            block[3 * r] += n[axis][r] * x
+            block[3 * r + 1] += n[axis][r] * y
+            block[3 * r + 2] += n[axis][r] * z
 
 
 @njit(inline="always")

@@ -1,0 +1,448 @@
+"""Bending and twist of a cell: the energy beside the mean deformation gradient.
+
+F is the mean deformation gradient of a cell, with the columns f_x, f_y and f_z. With the distance
+d = X - c from the centroid of the part inside the surface, positions in the cell are
+
+    x = c' + F d + p_xy d_x d_y + p_xz d_x d_z + p_yz d_y d_z + ...
+
+The vectors p are the mixed second derivatives at the centroid. The directions of the columns are
+
+    n_I = (1 + D) f_I / (D + |f_I|^2),        D = 1/2.                                          (1)
+
+They are f_I at rest, turn with the cell, and stay finite if a column vanishes. Their length falls
+as a column stretches, as the tangent of the neo-Hookean law does. With a_I,JK = n_I . p_JK the
+strains are (Simo and Rifai 1990 and Belytschko and Bindeman 1993 on assumed strains)
+
+    e_I  = sum over K != I of d_K a_I,IK               normal strains, from bending             (2)
+    g_IJ = d_K (a_I,JK + a_J,IK), K the third axis     shear strains, from twist                (3)
+
+The shear d_I a_I,IK that a cell has in bending is left out: trilinear functions have it, but a beam
+does not. With <> the mean over the part inside the surface the energy is
+
+    W = 1/2 mu V ((1 - s) Q + 2 s <|G|^2> + XYZ),                                               (4)
+    Q = <2 sum e_I^2 + beta (sum e_I)^2 + sum g_IJ^2>,     beta = 2 lambda / (lambda + 2 mu).
+
+beta is that of plane stress, so a plate of a single cell bends as it should at any Poisson's ratio.
+<|G|^2> is the mean square of the whole remainder of the gradient. Its share s holds corners of
+cells of which little is inside. XYZ is the square of the mode XYZ (lattice.cell_moments).
+
+- W is a sum of squares: it is never negative, also in folded cells, and 0 for rigid motions.
+- At rest W is at most mu V <|G|^2> (1 + 3 beta / 2) if d_x, d_y and d_z are not correlated. The
+  general bound is that of lattice.cell_moments.bounding_laplacians.
+- Q depends on the covariance C = <d d^T> alone. Its form on the nine a (3 by axis, 3 by mode) is K.
+
+With r_I = sum over m of (K a)_I,m p_m, the gradient of Q / 2 has the parts
+
+    dQ/dp_m = sum over I of (K a)_I,m n_I,        dQ/df_I = c r_I - b (f_I . r_I) f_I           (5)
+
+with c = (1 + D) / (D + |f_I|^2) and b = 2 c^2 / (1 + D). The change of a direction with f_I by g is
+c g - b (f_I . g) f_I; its norm is at most c |g|. The projected Hessian keeps the directions: it is
+the form K of the changes n_I . dp. A Hessian's state therefore has p = 0 if it is projected.
+
+Lengths: the modes h of a strain are 2 h^2 p, h the side of a cell, and slopes are 4 h times F. So
+with the modes in a state divided by 4 h, all products are in units of slopes.
+"""
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats
+from msmpetsc.backend.kernel import njit
+from msmpetsc.elasticity.cell_strain import Eight, Modes, Nine, Seven, Strains
+from msmpetsc.elasticity.springs import Four, Vector, dot
+
+# three vectors: of the axes x, y and z, or of the modes XY, XZ and YZ
+Three: TypeAlias = tuple[Vector, Vector, Vector]
+# three vectors for each axis
+NineVectors: TypeAlias = tuple[Three, Three, Three]
+
+
+def _single(number: float) -> float:
+    """Return a number of single precision, so that products of single precision keep it."""
+    return np.float32(number)  # type: ignore[return-value]
+
+
+# D [-] of Eq. 1; bending and torsion of a single cell stretched by 0.7 to 1.5 are right
+# within a factor of 2
+SQUARE = _single(0.5)
+# 1 + D [-]
+RANGE = _single(1.5)
+# 2 s / (1 - s) [-]; a wall of a tenth of a cell bends 15 to 20% too little. A power of
+# 2 is exact in single precision.
+FULL = _single(1 / 256)
+# 1 - s [-], the factor of C in a cell's constants
+ASSUMED = 2 / (2 + float(FULL))
+# keeps divisors from zero [-]
+LEAST = _single(1e-30)
+
+
+# ---- three vectors
+
+
+@njit(inline="always")
+def columns(f: Nine) -> Three:
+    """Return the columns of a matrix (9,) by rows."""
+    return (f[0], f[3], f[6]), (f[1], f[4], f[7]), (f[2], f[5], f[8])
+
+
+@njit(inline="always")
+def by_rows(f: Three) -> Nine:
+    """Return a matrix (9,) by rows from its columns."""
+    x, y, z = f
+    return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
+
+
+@njit(inline="always")
+def modes_of(e: Strains) -> Three:
+    """Return the modes XY, XZ and YZ of a strain."""
+    x, y, z = e
+    return (x[3], y[3], z[3]), (x[4], y[4], z[4]), (x[5], y[5], z[5])
+
+
+@njit(inline="always")
+def slopes_of(e: Strains) -> Three:
+    """Return the mean slopes along each axis of a strain, 4 h times the columns of F."""
+    x, y, z = e
+    return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
+
+
+@njit(inline="always")
+def _scaled(a: float, x: Vector) -> Vector:
+    return a * x[0], a * x[1], a * x[2]
+
+
+@njit(inline="always")
+def _added(x: Vector, y: Vector) -> Vector:
+    return x[0] + y[0], x[1] + y[1], x[2] + y[2]
+
+
+@njit(inline="always")
+def _sum(x: Three, y: Three) -> Three:
+    return _added(x[0], y[0]), _added(x[1], y[1]), _added(x[2], y[2])
+
+
+@njit(inline="always")
+def _times(a: float, x: Three) -> Three:
+    return _scaled(a, x[0]), _scaled(a, x[1]), _scaled(a, x[2])
+
+
+@njit(inline="always")
+def combined(t: Vector, x: Three) -> Vector:
+    """Return the sum of t_i x_i."""
+    a, b, c = t
+    f, g, h = x
+    return (
+        a * f[0] + b * g[0] + c * h[0],
+        a * f[1] + b * g[1] + c * h[1],
+        a * f[2] + b * g[2] + c * h[2],
+    )
+
+
+@njit(inline="always")
+def _each(t: Three, x: Three) -> Three:
+    """Return the sums of t_i,j x_j for each i."""
+    return combined(t[0], x), combined(t[1], x), combined(t[2], x)
+
+
+@njit(inline="always")
+def _transposed(t: Three) -> Three:
+    x, y, z = t
+    return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
+
+
+@njit(inline="always")
+def _products(x: Three, y: Three) -> Three:
+    """Return x_i . y_j for each i and j."""
+    return (
+        (dot(x[0], y[0]), dot(x[0], y[1]), dot(x[0], y[2])),
+        (dot(x[1], y[0]), dot(x[1], y[1]), dot(x[1], y[2])),
+        (dot(x[2], y[0]), dot(x[2], y[1]), dot(x[2], y[2])),
+    )
+
+
+# ---- directions
+
+
+@njit(inline="always")
+def _factor(f: Vector) -> float:
+    return RANGE / (SQUARE + dot(f, f))
+
+
+@njit(inline="always")
+def factors(f: Three) -> Vector:
+    """Return c of each column: the length of its direction (Eq. 1) over its own."""
+    return _factor(f[0]), _factor(f[1]), _factor(f[2])
+
+
+@njit(inline="always")
+def directions(f: Three, c: Vector) -> Three:
+    """Return the directions n (Eq. 1) of the columns f, from their factors c."""
+    return _scaled(c[0], f[0]), _scaled(c[1], f[1]), _scaled(c[2], f[2])
+
+
+@njit(inline="always")
+def _lag(c: float) -> float:
+    """Return b of Eq. 5, by which a direction falls behind its column as it stretches."""
+    return c * (c + c) / RANGE
+
+
+@njit(inline="always")
+def _turned(f: Vector, c: float, g: Vector) -> Vector:
+    along = _lag(c) * dot(f, g)
+    return c * g[0] - along * f[0], c * g[1] - along * f[1], c * g[2] - along * f[2]
+
+
+@njit(inline="always")
+def turned(f: Three, c: Vector, g: Three) -> Three:
+    """Return the change of the directions as the columns f change by g.
+
+    The map is symmetric, so it also takes forces on directions to forces on columns.
+    """
+    return _turned(f[0], c[0], g[0]), _turned(f[1], c[1], g[1]), _turned(f[2], c[2], g[2])
+
+
+@njit(inline="always")
+def _change_of_turned(f: Vector, c: float, r: Vector, g: Vector) -> Vector:
+    b = _lag(c)
+    fg, fr = b * dot(f, g), b * dot(f, r)
+    along = (b + b) * (c + c) / RANGE * dot(f, r) * dot(f, g) - b * dot(g, r)
+    return combined((along, -fg, -fr), (f, r, g))
+
+
+@njit(inline="always")
+def change_of_turned(f: Three, c: Vector, r: Three, g: Three) -> Three:
+    """Return the change of ``turned(f, c, r)`` as the columns f change by g."""
+    return (
+        _change_of_turned(f[0], c[0], r[0], g[0]),
+        _change_of_turned(f[1], c[1], r[1], g[1]),
+        _change_of_turned(f[2], c[2], r[2], g[2]),
+    )
+
+
+# ---- the form K
+
+
+@njit(inline="always")
+def rest_constants(c: Floats, k: int) -> Eight:
+    """Return 4 m (1 - s) C (6,) as xx, yy, zz, yz, xz, xy, then the constant of XYZ, and beta.
+
+    c, k : constants of the cell, from index k on
+    """
+    # A cell without stiffness must not divide by zero
+    m, lame = c[k + 104], c[k + 112]
+    beta = (lame + lame) / (lame + m + m + LEAST)
+    return (
+        c[k + 48], c[k + 56], c[k + 64], c[k + 72], c[k + 80], c[k + 88], c[k + 96], beta,
+    )  # fmt: skip
+
+
+@njit(inline="always")
+def tensions(c: Eight, a: Three) -> Three:
+    """Return K a, for each axis the parts of XY, XZ and YZ."""
+    xx, yy, zz, yz, xz, xy, _, beta = c
+    x, y, z = a
+    # The sum of the e_I is d . s
+    sx, sy, sz = y[0] + z[1], x[0] + z[2], x[1] + y[2]
+    tx = beta * (xx * sx + xy * sy + xz * sz)
+    ty = beta * (xy * sx + yy * sy + yz * sz)
+    tz = beta * (xz * sx + yz * sy + zz * sz)
+    # C_xx g_yz and so on
+    gx, gy, gz = xx * (y[1] + z[0]), yy * (x[2] + z[0]), zz * (x[2] + y[1])
+    own_x = yy * x[0] + yz * x[1], yz * x[0] + zz * x[1]
+    own_y = xx * y[0] + xz * y[2], xz * y[0] + zz * y[2]
+    own_z = xx * z[1] + xy * z[2], xy * z[1] + yy * z[2]
+    return (
+        (own_x[0] + own_x[0] + ty, own_x[1] + own_x[1] + tz, gy + gz),
+        (own_y[0] + own_y[0] + tx, gx + gz, own_y[1] + own_y[1] + tz),
+        (gx + gy, own_z[0] + own_z[0] + tx, own_z[1] + own_z[1] + ty),
+    )
+
+
+@njit(inline="always")
+def full_forces(c: Eight, e: Seven) -> Four:
+    """Return the derivative of the last two terms of W by the modes (4,) of a component."""
+    xx, yy, zz, yz, xz, xy, xyz, _ = c
+    return (
+        FULL * ((xx + yy) * e[3] + yz * e[4] + xz * e[5]),
+        FULL * (yz * e[3] + (xx + zz) * e[4] + xy * e[5]),
+        FULL * (xz * e[3] + xy * e[4] + (yy + zz) * e[5]),
+        xyz * e[6],
+    )
+
+
+@njit(inline="always")
+def _with_full(c: Eight, e: Strains, forces: Three) -> Modes:
+    """Return the derivative of W by the modes, from the forces of Q on XY, XZ and YZ."""
+    x, y, z = full_forces(c, e[0]), full_forces(c, e[1]), full_forces(c, e[2])
+    xy, xz, yz = forces
+    return (
+        (x[0] + xy[0], x[1] + xz[0], x[2] + yz[0], x[3]),
+        (y[0] + xy[1], y[1] + xz[1], y[2] + yz[1], y[3]),
+        (z[0] + xy[2], z[1] + xz[2], z[2] + yz[2], z[3]),
+    )
+
+
+# ---- gradient, Hessian and change
+
+
+@njit(inline="always")
+def rest_gradient(c: Eight, f: Three, e: Strains, inverse_h4: float) -> tuple[Nine, Modes]:
+    """Return the gradient of W (Eq. 5) by 4 h times the slopes (9,), and by the modes (3 x 4).
+
+    f : columns of F
+    e : strains of positions; ``inverse_h4`` is 1 / (4 h)
+    """
+    p, factor = modes_of(e), factors(f)
+    n = directions(f, factor)
+    t = tensions(c, _products(n, p))
+    slopes = _times(inverse_h4, turned(f, factor, _each(t, p)))
+    return by_rows(slopes), _with_full(c, e, _each(_transposed(t), n))
+
+
+@njit(inline="always")
+def rest_product(c: Eight, f: Three, p: Three, e: Strains) -> tuple[Nine, Modes]:
+    """Return the product of the Hessian of W with a displacement, as ``rest_gradient`` does.
+
+    f : columns of F
+    p : modes of positions over 4 h
+    e : strains of the displacement
+    """
+    h, g, factor = modes_of(e), slopes_of(e), factors(f)
+    n, m = directions(f, factor), turned(f, factor, g)
+    s = tensions(c, _products(n, p))
+    t = tensions(c, _sum(_products(n, h), _products(m, p)))
+    slopes = _sum(
+        turned(f, factor, _sum(_each(t, p), _each(s, h))),
+        change_of_turned(f, factor, _each(s, p), g),
+    )
+    forces = _sum(_each(_transposed(t), n), _each(_transposed(s), m))
+    return by_rows(slopes), _with_full(c, e, forces)
+
+
+@njit(inline="always")
+def projected_modes(c: Eight, f: Three, e: Strains) -> Modes:
+    """Return the product of the projected Hessian of W: its directions do not change."""
+    n = directions(f, factors(f))
+    t = tensions(c, _products(n, modes_of(e)))
+    return _with_full(c, e, _each(_transposed(t), n))
+
+
+@njit(inline="always")
+def _change_of_direction(f: Vector, g: Vector) -> Vector:
+    """Return the change of a direction as its column f changes by g, with the digits of g.
+
+    n' - n = c' g + (c' - c) f,    c' - c = -c c' / (1 + D) g . (f + f').
+    """
+    after = _added(f, g)
+    c = _factor(after)
+    along = -_factor(f) * c / RANGE * dot(g, _added(f, after))
+    return _added(_scaled(c, g), _scaled(along, f))
+
+
+@njit(inline="always")
+def rest_change(c: Eight, f: Three, g: Three, e: Strains, d: Strains) -> float:
+    """Return the change of W, with its digits, as the columns f change by g and strains e by d.
+
+    Q(a') - Q(a) = (a' - a) . K (a' + a), and likewise for the other squares.
+    """
+    p, moved = modes_of(e), modes_of(d)
+    n = directions(f, factors(f))
+    m = (
+        _change_of_direction(f[0], g[0]),
+        _change_of_direction(f[1], g[1]),
+        _change_of_direction(f[2], g[2]),
+    )
+    changes = _sum(_products(m, _sum(p, moved)), _products(n, moved))
+    t = tensions(c, _sum(_products(n, p), _times(0.5, changes)))
+    change = dot(changes[0], t[0]) + dot(changes[1], t[1]) + dot(changes[2], t[2])
+    for i in range(3):
+        forces, own, before = full_forces(c, d[i]), d[i], e[i]
+        change += forces[0] * (before[3] + 0.5 * own[3]) + forces[1] * (before[4] + 0.5 * own[4])
+        change += forces[2] * (before[5] + 0.5 * own[5]) + forces[3] * (before[6] + 0.5 * own[6])
+    return change
+
+
+# ---- for multigrid and for the proof of a minimum
+
+
+@njit(inline="always")
+def corner_tensions(c: Eight, f: Three, g: Seven) -> NineVectors:
+    """Return the tensions by a corner's displacement v, for fixed directions.
+
+    Entry [I][m] of the result is a vector y (3,): the tension (K a)_I,m is y . v.
+
+    f : columns of F
+    g : ``corner_strain`` of the corner
+    """
+    n, h, zero = directions(f, factors(f)), (g[3], g[4], g[5]), (0.0, 0.0, 0.0)
+    # A displacement along n_J has the a (3,) of axis J alone
+    x, y, z = (
+        tensions(c, (h, zero, zero)),
+        tensions(c, (zero, h, zero)),
+        tensions(c, (zero, zero, h)),
+    )
+    return (
+        _each(_transposed((x[0], y[0], z[0])), n),
+        _each(_transposed((x[1], y[1], z[1])), n),
+        _each(_transposed((x[2], y[2], z[2])), n),
+    )
+
+
+@njit(inline="always")
+def rest_concavity(
+    c: Eight, f: Three, e: Strains, inverse_h4: float, left: float
+) -> tuple[float, float]:
+    """Return a, b >= 0: the Hessian of W, and ``left`` |G|^2, are at least -a |G|^2 - b |h|^2.
+
+    G are the slopes of a displacement, h its modes, and m the change of the directions. In units
+    of slopes the form is K(n . h + m . p) + 2 (K a) (m . h), and a term of the change of m. Three
+    bounds hold, with c the greatest of the columns':
+
+    - 2 (K a)(m . h) <= 2 c |K a| |G| |h|
+    - K(x + y) >= K(x) / 2 - K(y); K lies between its least and its greatest eigenvalue
+    - the last term is at most b |f| |r| sqrt(max(2, 1 + (4 u - 3)^2)) |g|^2 in each column. Here
+      u = |f|^2 / (D + |f|^2).
+
+    So the form is at least A |G|^2 - 2 X |G| |h| + B |h|^2, which is semidefinite if A B >= X^2.
+    """
+    p, factor = _times(inverse_h4, modes_of(e)), factors(f)
+    n = directions(f, factor)
+    t = tensions(c, _products(n, p))
+    r = _each(t, p)
+    largest, turning = max(factor[0], max(factor[1], factor[2])), 0.0
+    for i in range(3):
+        square = dot(f[i], f[i])
+        u = square / (SQUARE + square)
+        shape = max(2.0, 1.0 + (4.0 * u - 3.0) ** 2)
+        change = _lag(factor[i]) * math.sqrt(square * dot(r[i], r[i]) * shape)
+        turning = max(turning, change)
+    least, greatest = _least_and_greatest(c)
+    greatest *= max(2.0 + 2.0 * c[7], 4.0)
+    # Gershgorin's bound of the least eigenvalue of n_I . n_J
+    xy, xz, yz = abs(dot(n[0], n[1])), abs(dot(n[0], n[2])), abs(dot(n[1], n[2]))
+    x, y, z = dot(n[0], n[0]) - xy - xz, dot(n[1], n[1]) - xy - yz, dot(n[2], n[2]) - xz - yz
+    frame = max(min(x, min(y, z)), 0.0)
+    size = dot(p[0], p[0]) + dot(p[1], p[1]) + dot(p[2], p[2])
+    of_slopes = left - turning - greatest * largest * largest * size
+    of_modes = 0.5 * least * frame
+    mixed = largest * math.sqrt(dot(t[0], t[0]) + dot(t[1], t[1]) + dot(t[2], t[2]))
+    a = max(mixed - of_slopes, 0.0)
+    b = max(mixed * mixed / max(of_slopes + a, float(LEAST)) - of_modes, 0.0)
+    return a, b
+
+
+@njit(inline="always")
+def _least_and_greatest(c: Eight) -> tuple[float, float]:
+    """Return bounds of the eigenvalues of C in a cell's constants (Smith 1961)."""
+    xx, yy, zz, yz, xz, xy, _, _ = c
+    mean = (xx + yy + zz) / 3.0
+    x, y, z = xx - mean, yy - mean, zz - mean
+    spread = math.sqrt((x * x + y * y + z * z + 2.0 * (yz * yz + xz * xz + xy * xy)) / 6.0)
+    half = 0.5 * (x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz))
+    shape = half / max(spread * spread * spread, float(LEAST))
+    angle = math.acos(min(max(shape, -1.0), 1.0)) / 3.0
+    greatest = mean + 2.0 * spread * math.cos(angle)
+    least = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
+    return max(least, 0.0), greatest

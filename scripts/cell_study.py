@@ -1,0 +1,221 @@
+#!/usr/bin/env python3
+"""Compare bending and twist of few cells with theory and finite elements. Needs scikit-fem.
+
+    scripts/cell_study.py [torsion plate twist strip cantilever ...]
+
+Displacements are small: a table solves K u = f with the Hessian K at rest. An error is that of a
+stiffness in ``torsion`` and of a deflection elsewhere.
+"""
+
+from collections.abc import Callable
+
+import lab
+from lab import percent
+
+import numpy as np
+import skfem
+import trimesh
+from material_study import E, box, factorise, hessian, lattice_of
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+from msmpetsc.lattice.lattice import Lattice
+
+POISSON = (0.0, 0.25, 0.45, 0.499)
+# displacements and forces (n, 3)
+Fields = tuple[np.ndarray, np.ndarray]
+# torsion constant of a square of side 1 [-]
+SQUARE = 0.140577
+# length of a cantilever of thickness 1 m [m]
+LENGTH = 10
+
+
+def shares(lattice: Lattice, *axes: int) -> np.ndarray:
+    """Return the weights (n,) of nodes for an integral over given axes of a box of cells."""
+    x = lattice.nodes
+    ends = np.isclose(x, x.min(axis=0)) | np.isclose(x, x.max(axis=0))
+    return np.where(ends[:, axes], 0.5, 1.0).prod(axis=1)
+
+
+def solve(lattice: Lattice, fixed: np.ndarray, u: np.ndarray, f: np.ndarray) -> Fields:
+    """Return u (n, 3) [m] under forces f (n, 3) [N] and the forces K u (n, 3) [N].
+
+    fixed : (n, 3) mask of the prescribed entries of u
+    """
+    K, free = hessian(lattice), ~fixed.ravel()
+    u = np.where(fixed, u, 0.0).ravel()
+    u[free] = factorise(K[free][:, free])((f.ravel() - K @ u)[free])
+    return u.reshape(-1, 3), (K @ u).reshape(-1, 3)
+
+
+def clamped(lattice: Lattice, force: np.ndarray) -> float:
+    """Return the deflection of a beam clamped at its low end by a unit force at its high end."""
+    x = lattice.nodes - lattice.nodes.min(axis=0)
+    end, weight = np.isclose(x[:, 0], x[:, 0].max()), shares(lattice, 1, 2)
+    f = np.where(end, weight / weight[end].sum(), 0.0)[:, None] * force
+    fixed = np.repeat(np.isclose(x[:, 0], 0)[:, None], 3, axis=1)
+    return float((f * solve(lattice, fixed, np.zeros_like(f), f)[0]).sum())
+
+
+# ---- torsion
+
+
+def torsion_error(across: int, poisson: float) -> float:
+    """Return the error of a square bar's torsional stiffness, from two lengths."""
+    compliance = []
+    for length in (3, 6):
+        lattice = box((length * across, across, across), 1 / across, poisson)
+        x = lattice.nodes
+        left, right = np.isclose(x[:, 0], 0), np.isclose(x[:, 0], length)
+        arm = x - [length, 0.5, 0.5]
+        u = np.where(right[:, None], np.cross([1, 0, 0], arm), 0.0)
+        fixed = np.repeat((left | right)[:, None], 3, axis=1)
+        forces = solve(lattice, fixed, u, np.zeros_like(x))[1]
+        compliance.append(1 / np.cross(arm, forces)[right].sum(axis=0)[0])
+    return 3 / (compliance[1] - compliance[0]) / (SQUARE * E / (2 * (1 + poisson))) - 1
+
+
+def torsion_rows() -> lab.Rows:
+    """Yield the errors of the torsional stiffness of a square bar."""
+    for poisson in POISSON:
+        errors = {f"{n} cells": percent(torsion_error(n, poisson)) for n in (2, 4, 8)}
+        yield {"Poisson's ratio": str(poisson)} | errors
+
+
+# ---- plates
+
+
+def plate_error(through: int, poisson: float, clamp: bool, side: int = 20) -> float:
+    """Return the error of the middle of a square plate of thickness 1 m under a uniform load.
+
+    The reference is Mindlin's plate if it is simply supported, else Timoshenko and
+    Woinowsky-Krieger (1959) with the shear of the simply supported plate.
+    """
+    half = side // 2
+    lattice = box((half * through, half * through, through), 1 / through, poisson)
+    x = lattice.nodes
+    low, high = np.isclose(x, 0), np.isclose(x, half)
+    fixed = np.zeros(x.shape, bool)
+    edge = low[:, 0] | low[:, 1]
+    fixed[:, 2] = edge
+    # symmetry; and a simple support that holds the edge along itself
+    fixed[high[:, 0], 0] = fixed[high[:, 1], 1] = True
+    fixed[low[:, 0], 1] = fixed[low[:, 1], 0] = True
+    if clamp:
+        fixed[edge] = True
+    weight = shares(lattice, 0, 1, 2)
+    f = np.zeros_like(x)
+    f[:, 2] = weight / weight.sum() * half**2
+    w = solve(lattice, fixed, np.zeros_like(x), f)[0][high[:, 0] & high[:, 1], 2].mean()
+    shear = 0.0736713 * side**2 / (5 / 6 * E / (2 * (1 + poisson)))
+    rigidity = E / 12 / (1 - poisson**2)
+    return float(w / ((0.00126532 if clamp else 0.00406235) * side**4 / rigidity + shear) - 1)
+
+
+def plate_rows() -> lab.Rows:
+    """Yield the errors of a plate's deflection."""
+    for poisson in POISSON:
+        row: dict[str, object] = {"Poisson's ratio": str(poisson)}
+        for clamp, name in ((False, "supported"), (True, "clamped")):
+            row |= {f"{name}, {n} through": percent(plate_error(n, poisson, clamp)) for n in (1, 2)}
+        yield row
+
+
+def twist_error(through: int, poisson: float, side: int = 6) -> float:
+    """Return the error of the twist of a plate of thickness 1 m whose edges twist it.
+
+    The displacement k (-y z, -x z, x y) is exact.
+    """
+    lattice = box((side * through, side * through, through), 1 / through, poisson)
+    x, y, z = (lattice.nodes - [side / 2, side / 2, 0.5]).T
+    edge = np.isclose(abs(x), side / 2) | np.isclose(abs(y), side / 2)
+    u = np.stack([-y * z, -x * z, x * y], axis=1)
+    u, forces = solve(lattice, np.repeat(edge[:, None], 3, axis=1), u, np.zeros_like(u))
+    exact = E / (2 * (1 + poisson)) * 4 * side**2 / 12
+    return float(exact / (u * forces).sum() - 1)
+
+
+def twist_rows() -> lab.Rows:
+    """Yield the errors of a plate's twist."""
+    for poisson in POISSON:
+        errors = {f"{n} through": percent(twist_error(n, poisson)) for n in (1, 2, 4)}
+        yield {"Poisson's ratio": str(poisson)} | errors
+
+
+# ---- beams
+
+
+def beam(poisson: float, length: float, width: float, thickness: float) -> float:
+    """Return the tip deflection of Timoshenko's beam under a unit force."""
+    shear = 10 * (1 + poisson) / (12 + 11 * poisson) * E / (2 * (1 + poisson))
+    area = width * thickness
+    return 4 * length**3 / (E * area * thickness**2) + length / (shear * area)
+
+
+def strip_error(thickness: float, poisson: float, length: int = 20, width: int = 3) -> float:
+    """Return the error of a strip in the middle of a layer of cells of 1 m."""
+    mesh = trimesh.creation.box(bounds=np.array([[0, 0, 0], [length, width, thickness]]))
+    lattice = lattice_of(mesh, 1.0, poisson=poisson, offset=(0, 0, (1 - thickness) / 2))
+    tip = clamped(lattice, np.array([0.0, 0.0, 1.0]))
+    return tip / beam(poisson, length, width, thickness) - 1
+
+
+def strip_rows() -> lab.Rows:
+    """Yield the errors of strips thinner than a cell, along the grid."""
+    for poisson in POISSON:
+        errors = {f"{t:g} cells": percent(strip_error(t, poisson)) for t in (1.0, 0.5, 0.25, 0.1)}
+        yield {"Poisson's ratio": str(poisson)} | errors
+
+
+def fem_tip(poisson: float) -> float:
+    """Return a clamped beam's tip deflection by a unit force, from quadratic hexahedra."""
+    x = LENGTH * np.linspace(0, 1, 25) ** 1.5
+    mesh = skfem.MeshHex.init_tensor(x, np.linspace(0, 1, 5), np.linspace(0, 1, 5))
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=4)
+    K = linear_elasticity(*lame_parameters(E, poisson)).assemble(basis)
+    end = mesh.facets_satisfying(lambda x: np.isclose(x[0], LENGTH), boundaries_only=True)
+    face = skfem.FacetBasis(mesh, basis.elem, facets=end, intorder=4)
+    f = skfem.LinearForm(lambda v, _: v[2]).assemble(face)
+    fixed = basis.get_dofs(mesh.facets_satisfying(lambda x: np.isclose(x[0], 0)))
+    u = skfem.solve(*skfem.condense(K, f, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-9))
+    return float(f @ u)
+
+
+def cantilever_error(across: int, poisson: float, exact: float | None = None) -> float:
+    """Return the error of a square cantilever, against hexahedra clamped alike.
+
+    exact : deflection of the hexahedra, computed if None
+    """
+    lattice = box((LENGTH * across, across, across), 1 / across, poisson)
+    exact = exact or fem_tip(poisson)
+    return clamped(lattice, np.array([0.0, 0.0, 1.0])) / exact - 1
+
+
+def cantilever_rows() -> lab.Rows:
+    """Yield the errors of a square cantilever."""
+    for poisson in POISSON:
+        exact = fem_tip(poisson)
+        row: dict[str, object] = {
+            "Poisson's ratio": str(poisson),
+            "hexahedra over Timoshenko": percent(exact / beam(poisson, LENGTH, 1, 1) - 1, 2),
+        }
+        yield row | {
+            f"{n} cells": percent(cantilever_error(n, poisson, exact), 2) for n in (1, 2, 4)
+        }
+
+
+TABLES: dict[str, Callable[[], lab.Rows]] = {
+    "torsion": torsion_rows,
+    "plate": plate_rows,
+    "twist": twist_rows,
+    "strip": strip_rows,
+    "cantilever": cantilever_rows,
+}
+
+
+def main() -> None:
+    """Print the tables that the command line names."""
+    lab.tables(__doc__, TABLES)
+
+
+if __name__ == "__main__":
+    main()

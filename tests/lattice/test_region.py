@@ -45,7 +45,7 @@ def test_a_relative_box_up_to_one_holds_what_sticks_out(tmp_path, cells):
 
 
 def test_the_example_of_tables_runs_as_written(tmp_path, monkeypatch):
-    text = (ROOT / "scripts" / "docs" / "pages" / "from-python.md").read_text()
+    text = (ROOT / "scripts" / "docs" / "pages" / "how-to" / "python.md").read_text()
     (code,) = (
         block.split("```")[0] for block in text.split("```python\n")[1:] if "tables = {" in block
     )

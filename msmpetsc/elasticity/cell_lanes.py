@@ -141,7 +141,7 @@ def _change_lanes(w: Floats, inverse_h4: float) -> None:
         moved, base, s = _strains_in(w, lane), _strains_in(w, lane, RESULT), AT_STATE + lane
         d, f = gradient_of(moved, inverse_h4), gradient_of(base, inverse_h4)
         w[s], w[s + 8] = determinant_and_change(d, f)
-        w[s + 16] = forms_change(w, CONSTANTS + lane, f, d, base, moved)
+        w[s + 16] = forms_change(w, CONSTANTS + lane, d, base, moved, inverse_h4)
 
 
 @njit()

@@ -130,7 +130,8 @@ def _write_changes(
         m, parts[i] = cells.constants[k + 104], 0.0
         if m > 0.0:
             volume = volume_change(j_base + j_change, j_base, j_change, m, cells.constants[k + 112])
-            parts[i] = forms_change(cells.constants, k, f, g, e, d) + cells.h4**2 * volume
+            forms = forms_change(cells.constants, k, g, e, d, 1.0 / cells.h4)
+            parts[i] = forms + cells.h4**2 * volume
 
 
 def _add(

@@ -15,8 +15,8 @@ within the cell (elasticity.assumed_strain).
 - The second variation at rest is not negative, however the cell is cut. For a mean slope G
   it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the squares of W.
 
-The Hessian of a cell, without W, maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G).  F x G is
-the change of cof F. In the singular frame of F, with the singular values s, it splits into blocks:
+But for W the Hessian of a cell maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where
+F x G is the change of cof F. In the singular frame of F, with the singular values s, it splits into blocks:
 
 - 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu];
 - a 3 x 3 block: sum (mu s_i^2 - U' J) y_i^2 + (U'' J^2 + U' J) (sum y_i)^2 with y_i = x_i / s_i.
@@ -275,11 +275,14 @@ def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> t
 
 
 @njit(inline="always")
-def forms_change(c: Floats, k: int, f: Nine, d: Nine, base: Strains, moved: Strains) -> float:
+def forms_change(
+    c: Floats, k: int, d: Nine, base: Strains, moved: Strains, inverse_h4: float
+) -> float:
     """Return the change of E but for U as F changes by d and the strains by ``moved``."""
-    g = _slope_of(moved)
-    own = c[k + 104] * (_inner(_slope_of(base), g) + 0.5 * _inner(g, g))
-    return own + rest_change(rest_constants(c, k), columns(f), columns(d), base, moved)  # type: ignore[no-any-return]
+    g, f = _slope_of(moved), columns(gradient_of(base, inverse_h4))
+    own: float = c[k + 104] * (_inner(_slope_of(base), g) + 0.5 * _inner(g, g))
+    rest = rest_constants(c, k)
+    return own + rest_change(rest, f, columns(d), base, moved, inverse_h4)
 
 
 @njit(inline="always")

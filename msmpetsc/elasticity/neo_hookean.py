@@ -16,7 +16,8 @@ within the cell (elasticity.assumed_strain).
   it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the squares of W.
 
 But for W the Hessian of a cell maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where
-F x G is the change of cof F. In the singular frame of F, with the singular values s, it splits into blocks:
+F x G is the change of cof F. In the singular frame of F, with the singular values s, it splits
+into blocks:
 
 - 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu];
 - a 3 x 3 block: sum (mu s_i^2 - U' J) y_i^2 + (U'' J^2 + U' J) (sum y_i)^2 with y_i = x_i / s_i.

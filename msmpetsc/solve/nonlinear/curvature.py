@@ -235,7 +235,7 @@ class LowestCurvature:
             self.searched = (
                 Compressed() if alarm else Compressed(compression.greatest, compression.total)
             )
-            with self.preconditioner.searching(q, self.functional.problem.contact):
+            with self.preconditioner.searching(q, self.functional.contact_at(q)):
                 found = self._search_at_length(
                     q, hint, EFFORT if alarm is Alarm.HERE else self.effort
                 )
@@ -252,7 +252,7 @@ class LowestCurvature:
         # So near the limit that the next growth would need another search
         is_heavy = MORE * UNSEEN * self.load > LIGHT
         if not np.isfinite(load) or (not is_heavy and (growth > GROWN or load > LIGHT)):
-            with self.preconditioner.searching(q, self.functional.problem.contact):
+            with self.preconditioner.searching(q, self.functional.contact_at(q)):
                 self.load = self._load_factor(q) if self.preconditioner.is_uniform else np.inf
             self.loads, load = ratios, UNSEEN * self.load
         return load
@@ -263,7 +263,7 @@ class LowestCurvature:
         projected = TrueHessian(
             self.unknowns, functional.elasticity, functional.time_step, hessian.contact
         )
-        projected.linearise(q, functional.problem.contact, True)
+        projected.linearise(q, functional.contact_at(q), True)
         known = [] if self.load_mode is None else [self.load_mode[None]]
         start = np.concatenate([*known, self._random(2 - len(known))])
         values, modes = self._iterate(

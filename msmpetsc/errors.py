@@ -66,7 +66,7 @@ EXTRAS = {
     "render": ("pyvista", "scipy", "pydantic", "tomli_w", "trimesh", "igl", "tqdm"),
     "study": ("pandas", "vl_convert", "jinja2", "tomlkit"),
     "contact": ("ipctk",),
-    "movie": ("imageio", "imageio_ffmpeg"),
+    "movie": ("imageio_ffmpeg",),
     "usd": ("pxr",),
     "repair": ("pymeshfix",),
     "cuda": ("cupy",),

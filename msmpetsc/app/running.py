@@ -163,7 +163,6 @@ def finish(
         cost.write(request.measured, request.command, plan.logged, failure)
     left = write_companions(comm, request, whole=not ended.signal and failure is None)
     on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, cost.setup, left))
-    cost.log_hardest()
     if failure:
         raise failure
     if ended.signal:

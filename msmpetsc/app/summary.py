@@ -30,10 +30,6 @@ from msmpetsc.solve.instrumentation import times
 from msmpetsc.solve.petsc.events import FILES, OUTPUT
 from msmpetsc.solve.simulate import TimeLoop
 
-# ratio of a frame's products to the median frame's products [-]; above it the log names
-# the hardest frame
-HARD = 20
-
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
     """Log size, volume and mass of each body, and the counts of cells and nodes (collective)."""
@@ -110,7 +106,7 @@ class Cost:
     setup    : time before the first step [s]
     output   : time to write frames and checkpoints [s]
     stepping : time of the steps [s]
-    products : number of Hessian-vector products by frame
+    products : number of Hessian-vector products
     counts   : cells, nodes, springs and unknowns of all ranks
     """
 
@@ -119,7 +115,7 @@ class Cost:
         self.simulation = simulation
         self.setup = setup
         self.output = self.stepping = 0.0
-        self.products: dict[int, int] = {}
+        self.products = 0
         model = simulation.model
         lattice = model.lattice
         fixed = simulation.environment.anchors.fixed_at(simulation.time_step)[: lattice.owned]
@@ -142,18 +138,7 @@ class Cost:
     def count(self, frame: Frame) -> None:
         """Add the steps since the previous frame."""
         self.stepping += frame.wall_time
-        self.products[frame.index] = frame.products
-
-    def log_hardest(self) -> None:
-        """Log the frame with the most products if they exceed HARD times the median."""
-        working = [products for products in self.products.values() if products]
-        hardest = max(self.products, key=lambda index: self.products[index], default=0)
-        ratio = max(working, default=0) / np.median(working or [1])
-        if ratio > HARD:
-            log.info(
-                "frame %d took %d products with the Hessian, %.0f times those of the median frame",
-                hardest, max(working), ratio,
-            )  # fmt: skip
+        self.products += frame.products
 
     def write(
         self, path: Path, command: str, before: dict[str, float], failure: StepFailed | None = None
@@ -173,7 +158,7 @@ class Cost:
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size,
             "command": command, **self.counts,
             "time": time,
-            "products": sum(self.products.values()),
+            "products": self.products,
             "memory": comm.allreduce(peak_memory()),
             "failure": failure
             and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},

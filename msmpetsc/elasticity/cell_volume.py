@@ -10,7 +10,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_strain import Six, strain
-from msmpetsc.elasticity.springs import Vector, dot, edge
+from msmpetsc.elasticity.springs import Vector, dot, vector
 
 
 class Shapes(NamedTuple):
@@ -34,12 +34,12 @@ def _volume(a: Vector, b: Vector, c: Vector) -> float:
 @njit()
 def least_volume(q: Positions, c: Indices) -> float:
     """Return the smallest of the eight corner volumes of a cell [m^3]."""
-    x0, x1 = edge(q, c[0], c[1]), edge(q, c[3], c[2])
-    x2, x3 = edge(q, c[4], c[5]), edge(q, c[7], c[6])
-    y0, y1 = edge(q, c[0], c[3]), edge(q, c[1], c[2])
-    y2, y3 = edge(q, c[4], c[7]), edge(q, c[5], c[6])
-    z0, z1 = edge(q, c[0], c[4]), edge(q, c[1], c[5])
-    z2, z3 = edge(q, c[2], c[6]), edge(q, c[3], c[7])
+    x0, x1 = vector(q, c[0], c[1]), vector(q, c[3], c[2])
+    x2, x3 = vector(q, c[4], c[5]), vector(q, c[7], c[6])
+    y0, y1 = vector(q, c[0], c[3]), vector(q, c[1], c[2])
+    y2, y3 = vector(q, c[4], c[7]), vector(q, c[5], c[6])
+    z0, z1 = vector(q, c[0], c[4]), vector(q, c[1], c[5])
+    z2, z3 = vector(q, c[2], c[6]), vector(q, c[3], c[7])
     low = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
     v4, v5 = _volume(x2, y2, z0), _volume(x2, y3, z1)
     v6, v7 = _volume(x3, y3, z2), _volume(x3, y2, z3)

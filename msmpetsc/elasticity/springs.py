@@ -123,7 +123,7 @@ class Displacement(NamedTuple):
 
 
 @njit(inline="always")
-def edge(q: Positions, a: int, b: int) -> Vector:
+def vector(q: Positions, a: int, b: int) -> Vector:
     """Return the vector q_b - q_a from node a to node b."""
     return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
 
@@ -136,9 +136,9 @@ def _elastic_change(
     base, moved = displacement
     change = 0.0
     for s in range(first, count, step):
-        before = edge(base, ends[s, 1], ends[s, 0])
+        before = vector(base, ends[s, 1], ends[s, 0])
         # The difference of two springs would lose the digits of a small displacement.
-        d = edge(moved, ends[s, 1], ends[s, 0])
+        d = vector(moved, ends[s, 1], ends[s, 0])
         change += spring_change(before, d, rest_length[s], stiffness[s])
     if first < count:
         sums[first] = change
@@ -202,7 +202,7 @@ def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None
     for s in range(len(ends)):
         a = ends[s, 0]
         b = ends[s, 1]
-        e = edge(q, b, a)
+        e = vector(q, b, a)
         f = force_density(e, rest_length[s], stiffness[s])
         gradient[a, 0] += f * e[0]
         gradient[a, 1] += f * e[1]
@@ -221,7 +221,7 @@ def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> N
     """
     ends, rest_length, stiffness = springs
     for s in range(len(ends)):
-        e = edge(q, ends[s, 1], ends[s, 0])
+        e = vector(q, ends[s, 1], ends[s, 0])
         bound = -2.0 * min(force_density(e, rest_length[s], stiffness[s]), 0.0)
         # A branch around a zero bound would take longer than the addition.
         concavity[ends[s, 0]] += bound
@@ -236,7 +236,7 @@ def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Row
     """
     ends, rest_length, stiffness = springs
     for s in range(len(ends)):
-        e = edge(q, ends[s, 1], ends[s, 0])
+        e = vector(q, ends[s, 1], ends[s, 0])
         block = spring_block(e, rest_length[s], stiffness[s], projected)
         for i in range(4):
             blocks[s, i] = block[i]
@@ -247,7 +247,7 @@ def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
     ends, rest_length, stiffness = springs
     for s in range(len(ends)):
-        e = edge(q, ends[s, 1], ends[s, 0])
+        e = vector(q, ends[s, 1], ends[s, 0])
         c, ex, ey, ez = spring_block(e, rest_length[s], stiffness[s], True)
         for end in range(2):
             add_block(blocks[ends[s, end]], c, 1.0, (ex, ey, ez))
@@ -384,7 +384,7 @@ def _gradient_around(first: int, count: int, step: int, gradient: Rows, springs:
             j = neighbour[s, i]
             if j < 0:
                 break
-            e = edge(q, j, i)
+            e = vector(q, j, i)
             f = force_density(e, lengths[kind[s, i]], stiffness[s, i])
             gx += f * e[0]
             gy += f * e[1]
@@ -406,7 +406,7 @@ def _concavity_around(
             if j < 0:
                 break
             total -= 2.0 * min(
-                force_density(edge(q, j, i), lengths[kind[s, i]], stiffness[s, i]), 0.0
+                force_density(vector(q, j, i), lengths[kind[s, i]], stiffness[s, i]), 0.0
             )
         concavity[i] += total
 
@@ -423,8 +423,8 @@ def _product_around(
             if j < 0:
                 break
             length, k = lengths[kind[s, i]], stiffness[s, i]
-            c, ex, ey, ez = spring_block(edge(q, j, i), length, k, projected)
-            f = block_product(c, (ex, ey, ez), edge(v, j, i))
+            c, ex, ey, ez = spring_block(vector(q, j, i), length, k, projected)
+            f = block_product(c, (ex, ey, ez), vector(v, j, i))
             px += f[0]
             py += f[1]
             pz += f[2]
@@ -442,5 +442,5 @@ def _diagonal_around(first: int, count: int, step: int, blocks: Rows, springs: A
             if j < 0:
                 break
             length, k = lengths[kind[s, i]], stiffness[s, i]
-            c, ex, ey, ez = spring_block(edge(q, j, i), length, k, True)
+            c, ex, ey, ez = spring_block(vector(q, j, i), length, k, True)
             add_block(blocks[i], c, 1.0, (ex, ey, ez))

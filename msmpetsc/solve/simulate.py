@@ -15,7 +15,7 @@ from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.comm import Route
 from msmpetsc.constraints.holders import sums_by
-from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
@@ -359,7 +359,8 @@ class Forces:
         """
         environment, owned = self.environment, self.model.lattice.owned
         problem = step.problem if step else None
-        contact = problem.contact if problem else environment.obstacles.push(time, sides)
+        acting = problem.contact if problem else environment.obstacles.push(time, sides)
+        contact = acting.at(q) if acting else None
         load = environment.forces.at(time)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "reaction" in self.rows:
@@ -381,13 +382,13 @@ class Forces:
         return points
 
     def _holding_forces(
-        self, q: Positions, contact: Contact | None, step: StepResult | None
+        self, q: Positions, contact: ContactAt | None, step: StepResult | None
     ) -> Rows:
         """Return the forces (owned, 3) [N] that hold the nodes in place, without the loads."""
         held, owned = np.zeros_like(q), self.model.lattice.owned
         self.elasticity.add_gradient(q, held)
         if contact:
-            contact.add_gradient(q, held)
+            contact.add_gradient(held)
         held = held[:owned]
         if step and step.viscous is not None:
             held += step.viscous
@@ -399,13 +400,13 @@ class Forces:
             )
         return held
 
-    def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
+    def _pushes(self, q: Positions, contact: ContactAt | None) -> dict[str, Any]:
         """Return the contact forces [N] of obstacles (o, 3) and on bodies (b, 3) of this rank."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
         push = np.zeros((len(self.keys), 3))
-        for state in contact.states if contact else ():
+        for state, pressed in contact.of_obstacles if contact else ():
             gradient = np.zeros_like(q[:owned])
-            state.add_gradient(q[:owned], gradient)
+            state.add_gradient(q[:owned], pressed, gradient)
             push[self.keys.index(state.penalty.obstacle.key)] -= to_host(gradient.sum(axis=0))
         bodies = len(lattice.first_of_body)
         touching = np.zeros((bodies, 3))

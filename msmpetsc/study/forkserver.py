@@ -1,21 +1,18 @@
-"""Fork server of ``msmpetsc`` processes that execute several commands each, without start-up.
+"""Fork server of ``msmpetsc`` processes, which need not import the program.
 
-Start-up (imports, MPI, PETSc) takes most of the time of a small case. A forked process has executed
-other commands before, so its times do not represent a run on its own. Therefore only cases whose
-times are not reported are run in this way.
+Imports take most of the time of a small case. A forked process shares its server's memory, so its
+times and its memory do not represent a run on its own. Therefore only cases whose times are not
+reported are run in this way.
 """
 
 import ctypes
-import gc
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from importlib import import_module
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NoReturn
 
@@ -33,79 +30,48 @@ SERVER.set_forkserver_preload(
 
 
 class Forked:
-    """A forked process, leader of its own session, that executes commands until a command fails.
+    """A forked process, leader of its own session, that executes a command of ``msmpetsc``.
 
+    It has the part of subprocess.Popen's interface that ends a process.
+
+    arguments   : of the command, without the program's name
     environment : all environment variables of the process; it starts in the current folder
+    log         : file to which standard output is appended
+    errors      : file to which standard error is appended; ``log`` if None
     """
 
-    def __init__(self, environment: Mapping[str, str]):
-        self._commands, theirs = SERVER.Pipe()
-        given = (theirs, os.getcwd(), dict(environment))
-        self.process = SERVER.Process(target=_serve, args=given, daemon=True)
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        environment: Mapping[str, str],
+        log: Path,
+        errors: Path | None = None,
+    ):
+        given = (list(arguments), os.getcwd(), dict(environment), (log, errors or log))
+        self.process = SERVER.Process(target=_execute, args=given, daemon=True)
         self.process.start()
-        theirs.close()
         self.pid = int(self.process.pid or 0)
-
-    def begin(
-        self, arguments: Sequence[str], log: Path, errors: Path | None = None, last: bool = False
-    ) -> None:
-        """Send a command of ``msmpetsc`` to the process and return at once.
-
-        log    : file to which standard output is appended
-        errors : file to which standard error is appended; ``log`` if None
-        last   : no command will follow, so PETSc may read options at its start
-        """
-        self._commands.send((list(arguments), (str(log), str(errors or log)), last))
+        self.kill = self.process.kill
 
     def wait(self, timeout: float | None = None) -> int:
-        """Return the exit status of the command begun last. Raises subprocess.TimeoutExpired."""
-        if not self._commands.poll(timeout):
+        """Return the exit status. Raises subprocess.TimeoutExpired."""
+        self.process.join(timeout)
+        if self.process.exitcode is None:
             raise subprocess.TimeoutExpired("msmpetsc", timeout or 0.0)
-        try:
-            return int(self._commands.recv())
-        except EOFError:
-            # the command has ended its process
-            self.process.join()
-            return int(self.process.exitcode or 0)
-
-    def poll(self) -> int | None:
-        """Return the exit status of the process, or None while it runs."""
         return self.process.exitcode
 
-    def kill(self) -> None:
-        """Kill the process."""
-        self.process.kill()
-
-    def close(self) -> None:
-        """Close the connection and wait until the process ends."""
-        self._commands.close()
-        self.process.join()
+    def poll(self) -> int | None:
+        """Return the exit status, or None while the process runs."""
+        return self.process.exitcode
 
 
-def _serve(commands: Connection, folder: str, environment: dict[str, str]) -> None:
+def _execute(
+    arguments: list[str], folder: str, environment: dict[str, str], files: tuple[Path, Path]
+) -> None:
     enter(folder, environment)
-    from mpi4py import MPI
-
-    from msmpetsc.solve.petsc.initialise import start_for_runs
-
-    # the collector then skips the objects of the imports
-    gc.freeze()
-    status = 0
-    # EOFError: the parent has closed the connection
-    with suppress(EOFError):
-        while status == 0:
-            arguments, files, last = commands.recv()
-            redirect_output(files)
-            _forget()
-            if not last:
-                # PETSc starts without options, so that each command gets only its own
-                start_for_runs(MPI.COMM_WORLD, [])
-            sys.argv = ["msmpetsc", *arguments]
-            status = import_module(PROGRAM).main()
-            sys.stdout.flush()
-            ctypes.CDLL(None).fflush(None)
-            commands.send(status)
-    leave(status)
+    redirect_output(files)
+    sys.argv = ["msmpetsc", *arguments]
+    leave(import_module(PROGRAM).main())
 
 
 def enter(folder: str, environment: Mapping[str, str]) -> None:
@@ -141,11 +107,6 @@ def leave(status: int) -> NoReturn:
 
     finalise()
     MPI.Finalize()
+    # multiprocessing ends a forked process without C's own flush
+    ctypes.CDLL(None).fflush(None)
     sys.exit(status)
-
-
-def _forget() -> None:
-    """Collect the garbage of the previous command, and reset Linux's record of the peak memory."""
-    gc.collect()
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")

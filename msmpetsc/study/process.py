@@ -38,15 +38,13 @@ class Processes:
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes] | Forked] = set()
-        # forked processes that wait for another command
-        self._idle: list[Forked] = []
         self.stopped = False
         self._lock = Lock()
 
     def run(self, command: Sequence[str], log: Path, timeout: float, warm: bool = False) -> Ended:
         """Run a command to its end, or for ``timeout`` seconds, with all output in ``log``.
 
-        warm : run in a forked process without start-up, if the command starts ``msmpetsc``
+        warm : fork a command that starts ``msmpetsc`` from a process that has imported it
         """
         process = self._start(command, log, warm and list(command[:3]) == COLD)
         if process is None:
@@ -62,7 +60,9 @@ class Processes:
         except subprocess.TimeoutExpired:
             reason = too_long(timeout)
         finally:
-            self._put_away(process, status)
+            end(process)
+            with self._lock:
+                self._running.discard(process)
         return Ended(status, reason)
 
     def close(self) -> None:
@@ -70,12 +70,8 @@ class Processes:
         with self._lock:
             self.stopped = True
             running = list(self._running)
-            idle = self._idle
-            self._idle = []
         for process in running:
             end(process)
-        for process in idle:
-            process.close()
 
     def _start(
         self, command: Sequence[str], log: Path, warm: bool
@@ -86,8 +82,7 @@ class Processes:
                 return None
             process: subprocess.Popen[bytes] | Forked
             if warm:
-                process = self._idle.pop() if self._idle else Forked(variables)
-                process.begin(command[3:], log)
+                process = Forked(command[3:], variables, log)
             else:
                 process = subprocess.Popen(
                     command,
@@ -99,21 +94,6 @@ class Processes:
                 )
             self._running.add(process)
             return process
-
-    def _put_away(self, process: subprocess.Popen[bytes] | Forked, status: int | None) -> None:
-        """Keep a forked process whose command succeeded for reuse; end any other process."""
-        serves = (
-            isinstance(process, Forked)
-            and status == 0
-            and process.poll() is None
-            and not self.stopped
-        )
-        if not serves:
-            end(process)
-        with self._lock:
-            self._running.discard(process)
-            if isinstance(process, Forked) and serves:
-                self._idle.append(process)
 
 
 def too_long(timeout: float) -> str:

@@ -38,7 +38,7 @@ class Bench:
     """Runner of cases in a folder, which keeps the result files of references.
 
     study  : name of the study, a column of the table
-    warm   : run every case without start-up of the program; points of maps always do, because their
+    warm   : fork every case, without imports; points of maps always are, because their
              times are not reported
     _locks : a lock for each reference, by its id
     """

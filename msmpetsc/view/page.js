@@ -29,20 +29,7 @@ async function inflated(name) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-function predicted(bytes) { // the frames' positions, from what is left of their prediction
-  const n = 3 * points, all = new Uint16Array(frames * n);
-  for (let f = 0; f < frames; f++) {
-    const low = 2 * n * f, high = low + n, at = n * f, p = at - n, q = p - n;
-    for (let k = 0; k < n; k++) {
-      const coded = bytes[low + k] | (bytes[high + k] << 8);
-      const left = coded & 1 ? -((coded + 1) >> 1) : coded >> 1;
-      all[at + k] = (f === 0 ? 0 : f === 1 ? all[p + k] : 2 * all[p + k] - all[q + k]) + left;
-    }
-  }
-  return all;
-}
-
-function summed(bytes) {
-  for (let k = points; k < bytes.length; k++) bytes[k] += bytes[k - points];
-  return bytes;
+function summed(values, length) { // the frames of a length, from their differences
+  for (let k = length; k < values.length; k++) values[k] += values[k - length];
+  return values;
 }

@@ -1,8 +1,8 @@
 """A web page of a result in a single file: the mouse turns the body, a slider plays its frames.
 
 page.html, page.css and page*.js contain layout and drawing; this module supplies the data.
-Positions are 16-bit integers over the box around all frames. A frame is stored as residual of the
-linear extrapolation from the two previous frames, deflated and base64-encoded.
+Positions are 16-bit integers over the box around all frames. A frame is stored as its difference
+from the previous frame, deflated and base64-encoded.
 """
 
 import base64
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions
+from msmpetsc.backend.arrays import Array, Floats, Positions
 from msmpetsc.comm import log
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
@@ -73,7 +73,7 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
     subject = composition.subject
     bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     return {
-        "positions": deflated(residuals(quantised(subject.surface, frames, composition.bounds))),
+        "positions": deflated(changes(quantised(subject.surface, frames, composition.bounds))),
         "colours": deflated(changes(map(composition.colouring.numbers, frames))),
         "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
     }
@@ -81,35 +81,15 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
 
 def quantised(
     points: Callable[[int], Positions], frames: Iterable[int], box: Positions
-) -> Iterator[Indices]:
+) -> Iterator[Array]:
     """Yield the points (v, 3) of each frame as 16-bit integers over a box (2, 3) [m]."""
     scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
     for index in counted(list(frames), "frames packed"):
-        yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
-
-
-def residuals(frames: Iterable[Indices]) -> Iterator[bytes]:
-    """Yield each frame's residual to the linear extrapolation 2 p - q from the frames p, q before.
-
-    A residual r is stored as 2 r, or as -2 r - 1 if negative, so that small values have a zero high
-    byte. The low bytes of a frame precede its high bytes.
-    """
-    p = q = None
-    for frame in frames:
-        if p is None:
-            predicted = np.zeros_like(frame)
-        elif q is None:
-            predicted = p
-        else:
-            predicted = 2 * p - q
-        residual = (frame - predicted + 2**15) % 2**16 - 2**15
-        coded = np.where(residual < 0, -2 * residual - 1, 2 * residual).astype(np.uint16)
-        yield (coded & 255).astype(np.uint8).tobytes() + (coded >> 8).astype(np.uint8).tobytes()
-        p, q = frame, p
+        yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype("<u2")
 
 
 def changes(frames: Iterable[Array]) -> Iterator[bytes]:
-    """Yield the 8-bit differences (v,) between each frame and the previous frame."""
+    """Yield the difference of each frame from the previous frame, in unsigned numbers that wrap."""
     before = None
     for frame in frames:
         yield (frame if before is None else frame - before).tobytes()

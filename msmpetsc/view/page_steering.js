@@ -180,8 +180,8 @@ async function begin() {
   const packed = (await inflated("triangles")).buffer;
   triangles = new (points > 65535 ? Uint32Array : Uint16Array)(packed);
   fixing = await inflated("fixed");
-  all = predicted(await inflated("positions"));
-  numbers = summed(await inflated("colours"));
+  all = summed(new Uint16Array((await inflated("positions")).buffer), 3 * points);
+  numbers = summed(await inflated("colours"), points);
   extent = firstExtent();
   start();
   makeLegend();

@@ -11,7 +11,6 @@ from block_scene import DENSITY, G, block_scene
 from conftest import run
 
 import msmpetsc as msm
-from msmpetsc.app import summary
 from msmpetsc.errors import InputError, StepFailed
 
 FALL = {"gravity": {"acceleration": [0, 0, -G]}, "time": {"step": 0.01, "duration": 0.03}}
@@ -226,18 +225,3 @@ def test_on_ranks_each_has_its_rows(scene: Path, tmp_path: Path):
     for modulus in (1e5, 2e5):
         *_, last = msm.frames(scene, set={"material.young_modulus": modulus})
         assert np.allclose(np.load(tmp_path / f"{modulus:g}.npy"), last.position, atol=1e-9)
-
-
-@pytest.mark.parametrize("limit", [0.9, 1.5])
-def test_a_frame_of_far_more_work_than_the_median_is_named(
-    scene: Path, tmp_path: Path, monkeypatch, caplog, limit
-):
-    monkeypatch.setattr(summary, "HARD", limit)
-    with msm.open(msm.run(scene, tmp_path / "x.h5", set={"material.young_modulus": 1e4})) as result:
-        products = result.frames.products[1:]
-    ratio = products.max() / np.median(products)
-    said = (
-        f"frame {1 + products.argmax()} took {products.max()} products with the Hessian, "
-        f"{ratio:.0f} times"
-    )
-    assert 1 <= ratio < 1.5 and (said in caplog.text) == (ratio > limit)

@@ -65,7 +65,7 @@ def pressed(penalties: list[Penalty]) -> tuple[Contact, np.ndarray, np.ndarray]:
 
 def gradient(contact: Contact, q: np.ndarray) -> np.ndarray:
     total = np.zeros_like(q)
-    contact.add_gradient(q, total)
+    contact.at(q).add_gradient(total)
     return total
 
 
@@ -74,7 +74,7 @@ def hessian(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nodes that any part of it is of, ascending, and the sums of their blocks."""
     total = np.zeros((len(q), 3, 3))
-    parts = list(contact.hessian(q, duals))
+    parts = list(contact.at(q).hessian(duals))
     for nodes, blocks in parts:
         assert len(np.unique(nodes)) == len(nodes)
         total[nodes] += blocks
@@ -145,7 +145,7 @@ def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than
     rounding = 1e-12 * np.abs(above).max()
     assert np.linalg.eigvalsh(true).min() >= -rounding
     assert np.linalg.eigvalsh(above - true).min() >= -rounding
-    bound = contact.bound(q)
+    bound = contact.at(q).bound()
     assert (bound[nodes] >= np.linalg.eigvalsh(above)[:, -1] - rounding).all()
     assert (np.delete(bound, nodes) == 0).all()
 

@@ -69,14 +69,14 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
     sides = np.array([TOP, TOP, TOP, 0], np.int8)
     contact = Contact([Penalty(THIN, 50.0, 0.0, 1.0).during(q, 1.0, 0.1, sides)], len(q))
     push = np.zeros_like(q)
-    contact.add_gradient(q, push)
+    contact.at(q).add_gradient(push)
     depth = np.array([0.301, 0.0001, 0.0009, 0])
     np.testing.assert_allclose(push, -50 * depth[:, None] * [0, 0, 1], atol=1e-12)
     assert contact.energy(q) == pytest.approx(25 * (depth**2).sum())
     deeper = q - [0, 0, 0.01]
     assert contact.change(deeper, q) == pytest.approx(contact.energy(deeper) - contact.energy(q))
-    assert contact.bound(q).tolist() == [50, 50, 50, 0]
-    ((nodes, blocks),) = contact.hessian(q)
+    assert contact.at(q).bound().tolist() == [50, 50, 50, 0]
+    ((nodes, blocks),) = contact.at(q).hessian()
     assert nodes.tolist() == [0, 1, 2] and (blocks == 50 * np.diag([0, 0, 1])).all()
 
 

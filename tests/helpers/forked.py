@@ -30,14 +30,12 @@ def run_forked(
     subprocess.TimeoutExpired."""
     with tempfile.TemporaryDirectory() as folder:
         out, error = Path(folder, "out"), Path(folder, "error")
-        child = Forked(environment)
-        child.begin(arguments, out, error, last=True)
+        child = Forked(arguments, environment, out, error)
         try:
             status = child.wait(timeout)
         except subprocess.TimeoutExpired:
             os.killpg(child.pid, signal.SIGKILL)  # its session: what it started, too
             raise
-        child.close()
         return subprocess.CompletedProcess(
             list(arguments), status, out.read_text(), error.read_text()
         )

@@ -196,7 +196,6 @@ ALLOWED = {
     "app/summary.py": "asks before a run whether it could write",
     "export/formats.py": "under the name that the one way gave",
     "backend/kernel_cache.py": "a cache",
-    "study/forkserver.py": "/proc",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",
     "view/renderer.py": "/dev/null",

@@ -1,7 +1,6 @@
 """The processes of a study: runs that need not start the program, under mpiexec, and with more
 ranks than cores."""
 
-import json
 import os
 import subprocess
 import sys
@@ -41,7 +40,6 @@ def carry_out(
 
 
 def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
-    """Each begins anew: what one was given does not stay for the next."""
     path, frames = block_scene(tmp_path, time=TIME, gravity={"acceleration": [0, 0, -9.81]}), []
     for words, warm in (([], False), (["-ksp_rtol", "1e-5"], True), ([], True)):
         ended, told = carry_out(processes, path, "--overwrite", *words, warm=warm)
@@ -53,24 +51,6 @@ def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
                 and str(path) in file.attrs["command"]
             )
     np.testing.assert_array_equal(frames[2], frames[0])
-
-
-def test_one_process_serves_until_a_command_fails(tmp_path: Path, processes: Processes):
-    path, cost, pids = (
-        block_scene(tmp_path, time=TIME, gravity={"acceleration": [0, 0, -9.81]}),
-        [],
-        [],
-    )
-    for frames, status in (("10", 0), ("1", 0), ("0", 2), ("1", 0)):
-        measure = tmp_path / "cost.json"
-        ended, told = carry_out(
-            processes, path, "--overwrite", "--frames", frames, "--measure", str(measure)
-        )
-        assert ended.status == status, told
-        cost.append(json.loads(measure.read_text()))
-        pids.append([process.pid for process in processes._idle])
-    assert pids[0] == pids[1] and pids[2] == [] and len(pids[3]) == 1
-    assert cost[1]["time"]["local"] < 0.6 * cost[0]["time"]["local"]  # its own, not those of both
 
 
 def test_a_process_alone_takes_no_folder_from_others(

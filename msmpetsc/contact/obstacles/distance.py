@@ -27,17 +27,11 @@ ROUNDED = 1e-14
 
 
 class DistanceSolid(Solid):
-    """A solid given by distances, computed on the CPU and cached for the last positions."""
-
-    def __init__(self) -> None:
-        self._last: tuple[Positions, Floats, Indices] | None = None
+    """A solid given by distances, computed on the CPU."""
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        on_host = to_host(q)
-        if self._last is None or not np.array_equal(self._last[0], on_host):
-            self._last = (on_host.copy(), *self._find(on_host))
-        _, depths, face = self._last
-        return like(q, depths.copy()), like(q, face.copy())
+        depths, face = self._find(to_host(q))
+        return like(q, depths), like(q, face)
 
     def normals(self, q: Positions, face: Indices) -> Rows:
         return like(q, self._behind(to_host(q), to_host(face))[1])
@@ -77,7 +71,6 @@ class FunctionSolid(DistanceSolid):
     """
 
     def __init__(self, function: DistanceFunction, key: str):
-        super().__init__()
         self.function, self.key = function, key
 
     def distances(self, q: Positions) -> tuple[Floats, Rows]:
@@ -137,7 +130,6 @@ class MeshSolid(DistanceSolid):
         # A scene without mesh obstacles starts without igl.
         import igl
 
-        super().__init__()
         mesh = trimesh.Trimesh(surface.points, surface.triangles, process=True, validate=True)
         self.points = np.ascontiguousarray(mesh.vertices, float)
         self.triangles = np.ascontiguousarray(mesh.faces, np.int64)

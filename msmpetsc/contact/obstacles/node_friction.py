@@ -63,14 +63,12 @@ class NodeFriction(Friction):
 class Movers(NamedTuple):
     """The state of an explicit substep.
 
-    q        : (n, 3) positions [m]
     v        : (n, 3) velocities [m/s], which a substep changes
     rows     : nodes that move
     per_mass : (n,) 1 / mass [1/kg]
     gradient : (n or more, 3) grad E [N]
     """
 
-    q: Positions
     v: Rows
     rows: Indices
     per_mass: Floats

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_host
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-from msmpetsc.contact.obstacles.node_friction import Movers, apply_friction
 from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
 from msmpetsc.lattice.lattice import Lattice
@@ -104,27 +103,6 @@ class NodeObstacles:
             )
         return states
 
-    def apply_friction(
-        self,
-        nodes: Movers,
-        time: float,
-        duration: float,
-        substep: tuple[float, float],
-        sides: Indices,
-    ) -> None:
-        """Apply the obstacles' friction at a time, for a ``duration`` [s], to this rank's nodes.
-
-        substep : begin and end of the substep [s], which give an obstacle's velocity
-        """
-        begin, end = substep
-        for p, side in self._pressing(time, sides):
-            if p.friction > 0:
-                carried = like(
-                    nodes.q, p.obstacle.path.displacement_between(begin, end) / (end - begin)
-                )
-                pressed = p.state_at(time, side).pressed(nodes.q)
-                apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
-
     def contact_stiffness_bound(
         self, q: Positions, speed: float, start: float, time: float, sides: Indices
     ) -> Floats:
@@ -143,20 +121,6 @@ class NodeObstacles:
                 depths, _ = p.obstacle.depths(q, start)
                 stiffness += p.stiffness * ((depths > -margin) | (side > 0))
         return stiffness
-
-    def power(self, q: Positions, time: float, begin: float, end: float, sides: Indices) -> float:
-        """Return the power [W] of the penalty forces at ``time`` on this rank's nodes (owned, 3).
-
-        begin, end : the substep [s] that gives an obstacle's velocity
-        """
-        power = 0.0
-        for p, side in self._pressing(time, sides):
-            displacement = p.obstacle.path.displacement_between(begin, end)
-            if displacement.any():
-                _, depth, normal = p.state_at(time, side).pressed(q)
-                work = float(depth @ (normal @ like(q, displacement)))
-                power += p.stiffness / (end - begin) * work
-        return power
 
     def energy_of_new_obstacles(
         self, q: Positions, begin: float, end: float, sides: Indices

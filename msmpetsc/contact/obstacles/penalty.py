@@ -19,7 +19,12 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.friction import STICK, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-from msmpetsc.contact.obstacles.node_friction import NodeFriction, Pressed
+from msmpetsc.contact.obstacles.node_friction import (
+    Movers,
+    NodeFriction,
+    Pressed,
+    apply_friction,
+)
 from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.scene.obstacles import ObstacleTable
 
@@ -143,9 +148,12 @@ class ContactState:
         rows = np.flatnonzero(depths > 0)
         return rows, depths[rows], self.penalty.obstacle.normals_at(q[rows], self.time, face[rows])
 
-    def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add the gradient [N] of penalty and friction at q to ``gradient`` (owned or more, 3)."""
-        rows, depth, normal = self.pressed(q)
+    def add_gradient(self, q: Positions, pressed: Pressed, gradient: Rows) -> None:
+        """Add the gradient [N] of penalty and friction at q to ``gradient`` (owned or more, 3).
+
+        pressed : the nodes that are inside at q
+        """
+        rows, depth, normal = pressed
         gradient[rows] -= (self.penalty.stiffness * depth)[:, None] * normal
         if self.friction:
             self.friction.add_gradient(q, gradient)
@@ -198,18 +206,16 @@ class Contact:
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return the change [J] of the contact energy from base to q, friction included."""
-        return self.change_at_nodes(q, base) + (
-            self.surface.change(q, base) if self.surface else 0.0
-        )
-
-    def change_at_nodes(self, q: Positions, base: Positions) -> float:
-        """Return the change [J] of the obstacles' energy from base to q, friction included."""
         total = 0.0
         for state in self.states:
             total += state.change(q[: self.owned], base[: self.owned])
             if state.friction:
                 total += state.friction.change(q, base)
-        return total
+        return total + (self.surface.change(q, base) if self.surface else 0.0)
+
+    def change_of_friction(self, q: Positions, base: Positions) -> float:
+        """Return the change [J] of the energy of the obstacles' friction from base to q."""
+        return sum(state.friction.change(q, base) for state in self.states if state.friction)
 
     def stopped(self, q: Positions, base: Positions) -> Positions | None:
         """Return q with the nodes that enter obstacles from base stopped; None without them."""
@@ -221,12 +227,9 @@ class Contact:
             stopped[rows] += correction
         return stopped
 
-    def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add the gradient [N] of the contact energy at q to ``gradient`` (owned or more, 3)."""
-        for state in self.states:
-            state.add_gradient(q[: self.owned], gradient)
-        if self.surface:
-            self.surface.add_gradient(q, gradient)
+    def at(self, q: Positions) -> "ContactAt":
+        """Return the contact at q."""
+        return ContactAt(self, q, [state.pressed(q[: self.owned]) for state in self.states])
 
     def friction_limits(self, q: Positions) -> Floats:
         """Return the sum of mu N [N] that this rank's friction uses, and its value at q, (2,)."""
@@ -260,7 +263,37 @@ class Contact:
         ]
         return [*of_nodes, self.surface.duals_after(q, base, duals[-1]) if self.surface else None]
 
-    def hessian(self, q: Positions, duals: Duals | None = None) -> Iterator[tuple[Indices, Rows]]:
+
+@dataclass(frozen=True)
+class ContactAt:
+    """The contact energy of a step at given positions, with its derivatives.
+
+    q       : (owned or more, 3) positions [m]
+    pressed : the nodes inside each obstacle
+    """
+
+    contact: Contact
+    q: Positions
+    pressed: list[Pressed]
+
+    @property
+    def surface(self) -> SurfaceContact | None:
+        """Self-contact of the scene; None if it has none."""
+        return self.contact.surface
+
+    @property
+    def of_obstacles(self) -> Iterator[tuple[ContactState, Pressed]]:
+        """The contact of each obstacle, with the nodes inside."""
+        return zip(self.contact.states, self.pressed, strict=True)
+
+    def add_gradient(self, gradient: Rows) -> None:
+        """Add the gradient [N] of the contact energy to ``gradient`` (owned or more, 3)."""
+        for state, pressed in self.of_obstacles:
+            state.add_gradient(self.q[: self.contact.owned], pressed, gradient)
+        if self.surface:
+            self.surface.add_gradient(self.q, gradient)
+
+    def hessian(self, duals: Duals | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield the nodes (a,) and blocks (a, 3, 3) [N/m] of each obstacle's penalty and friction.
 
         The Hessian is the sum of all blocks, each positive semidefinite. The negative term -k d / r
@@ -268,21 +301,46 @@ class Contact:
 
         duals : duals of friction; None for its true Hessian
         """
-        of_states = duals[:-1] if duals else [None] * len(self.states)
-        for state, known in zip(self.states, of_states, strict=True):
-            rows, _, normal = state.pressed(q[: self.owned])
+        of_states = duals[:-1] if duals else [None] * len(self.pressed)
+        for (state, pressed), known in zip(self.of_obstacles, of_states, strict=True):
+            rows, _, normal = pressed
             yield rows, state.penalty.stiffness * squares(normal)
             if state.friction:
-                yield state.friction.nodes, state.friction.blocks(q, known)
+                yield state.friction.nodes, state.friction.blocks(self.q, known)
 
-    def bound(self, q: Positions) -> Floats:
+    def bound(self) -> Floats:
         """Return an upper bound (owned,) [N/m] of each node's block.
 
         It is constant while the set of nodes in contact is.
         """
-        bound = np.zeros(self.owned, like=q)
-        for state in self.states:
-            bound += state.penalty.stiffness * (state.depths(q[: self.owned])[0] > 0)
+        bound = np.zeros(self.contact.owned, like=self.q)
+        for state, (rows, _, _) in self.of_obstacles:
+            bound[rows] += state.penalty.stiffness
             if state.friction:
                 bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
-        return bound + self.surface.bound(q) if self.surface else bound
+        return bound + self.surface.bound(self.q) if self.surface else bound
+
+    def power(self, begin: float, end: float) -> float:
+        """Return the power [W] of the penalties on this rank's nodes.
+
+        begin, end : the substep [s] that gives an obstacle's velocity
+        """
+        power = 0.0
+        for state, (_, depth, normal) in self.of_obstacles:
+            displacement = state.penalty.obstacle.path.displacement_between(begin, end)
+            if displacement.any():
+                work = float(depth @ (normal @ like(self.q, displacement)))
+                power += state.penalty.stiffness / (end - begin) * work
+        return power
+
+    def apply_friction(self, nodes: Movers, duration: float, begin: float, end: float) -> None:
+        """Apply the obstacles' friction for a ``duration`` [s] to this rank's nodes.
+
+        begin, end : the substep [s] that gives an obstacle's velocity
+        """
+        for state, pressed in self.of_obstacles:
+            p = state.penalty
+            if p.friction > 0:
+                displacement = p.obstacle.path.displacement_between(begin, end)
+                carried = like(self.q, displacement / (end - begin))
+                apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)

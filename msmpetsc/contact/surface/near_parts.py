@@ -13,8 +13,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Positions
 from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.cell_volume import cross
-from msmpetsc.elasticity.springs import Vector, dot
-from msmpetsc.elasticity.springs import edge as between
+from msmpetsc.elasticity.springs import Vector, dot, vector
 
 # Kinds of places.
 VERTICES, EDGE_VERTEX, FACE_VERTEX, EDGES = range(4)
@@ -162,13 +161,13 @@ def add_faces(pairs: Indices, mesh: Mesh, points: Positions, limit: float, parts
     for i in range(pairs.shape[1]):
         face, v, pair = pairs[0, i], pairs[1, i], n
         a, b, c = mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2]
-        normal, area = cross(between(points, a, b), between(points, a, c)), mesh.vertex_areas[v]
-        corners = between(points, v, a), between(points, v, b), between(points, v, c)
+        normal, area = cross(vector(points, a, b), vector(points, a, c)), mesh.vertex_areas[v]
+        corners = vector(points, v, a), vector(points, v, b), vector(points, v, c)
         nearest, nearest_place = _over(*corners, normal), _number(mesh, FACE_VERTEX, face, v, 0)
         for j in range(3):
             edge = mesh.sides[face, j]
             start, end = mesh.edges[edge, 0], mesh.edges[edge, 1]
-            square, where = _to_edge(between(points, start, end), between(points, start, v))
+            square, where = _to_edge(vector(points, start, end), vector(points, start, v))
             if square < limit:
                 place = _place_on_edge(mesh, edge, where, v)
                 shared = _number(mesh, FACE_VERTEX, edge, v, 0)
@@ -192,14 +191,14 @@ def add_edges(
         one, other, pair = pairs[0, i], pairs[1, i], n
         a, b = mesh.edges[one, 0], mesh.edges[one, 1]
         c, d = mesh.edges[other, 0], mesh.edges[other, 1]
-        first, second = between(points, a, b), between(points, c, d)
-        nearest, sine = _crossing(first, second, between(points, a, c))
+        first, second = vector(points, a, b), vector(points, c, d)
+        nearest, sine = _crossing(first, second, vector(points, a, c))
         nearest_place = _number(mesh, EDGES, one, other, CROSSING)
         fading = min(sine / (PARALLEL * mesh.squares[one] * mesh.squares[other]), 1.0)
         for j, vertex in enumerate((a, b, c, d)):
             # A vertex of one edge links pairs of the other edge.
             edge, start, along = (other, c, second) if j < 2 else (one, a, first)
-            square, where = _to_edge(along, between(points, start, vertex))
+            square, where = _to_edge(along, vector(points, start, vertex))
             if square < limit:
                 place = _place_on_edge(mesh, edge, where, vertex)
                 if fading < 1.0:

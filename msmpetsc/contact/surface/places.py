@@ -47,9 +47,6 @@ if TYPE_CHECKING:
 ROUNDING = 1e-9
 # Number of collisions kept for later positions; to make one takes 9 us in Python.
 KEPT = 1 << 15
-# Multiplier of a hash: 2^64 over the golden ratio, as a signed number (Knuth, The Art
-# of Computer Programming, 6.4).
-GOLDEN = -7046029254386353131
 
 
 @dataclass(frozen=True)
@@ -105,15 +102,16 @@ class Places:
         weight, pair = parts.weight[:count], parts.pair[:count]
         links = np.flatnonzero(pair >= 0)
         order = links[np.argsort(-parts.value[links], kind="stable")]
-        _keep_forest(order, pair, _numbered(parts.shared[:count])[0], weight)
+        shared = np.unique(parts.shared[:count], return_inverse=True)[1]
+        _keep_forest(order, pair, shared, weight)
         counted = np.flatnonzero(weight)
-        place, weight = parts.place[counted], weight[counted]
-        of, first = _numbered(place)
-        sums, sizes = (np.bincount(of, some, len(first)) for some in (weight, np.abs(weight)))
-        kept = np.flatnonzero(np.abs(sums) > ROUNDING * sizes)
-        kinds = np.unravel_index(place[first[kept]], self._shape)[0]
-        kept = kept[np.argsort(kinds, kind="stable")]
-        every = list(map(self._collision, place[first[kept]].tolist(), sums[kept].tolist()))
+        # A number begins with the kind, so the places are sorted by kind.
+        places, of = np.unique(parts.place[counted], return_inverse=True)
+        weight = weight[counted]
+        sums, sizes = (np.bincount(of, some, len(places)) for some in (weight, np.abs(weight)))
+        kept = np.abs(sums) > ROUNDING * sizes
+        kinds = np.unravel_index(places[kept], self._shape)[0]
+        every = list(map(self._collision, places[kept].tolist(), sums[kept].tolist()))
         first, second, third = np.cumsum(np.bincount(kinds, minlength=4))[:3]
         found = ipctk.NormalCollisions()
         found.vv_collisions, found.ev_collisions = every[:first], every[first:second]
@@ -177,25 +175,3 @@ def _root(parent: Indices, pair: int) -> int:
         parent[pair] = parent[parent[pair]]
         pair = parent[pair]
     return pair
-
-
-@njit()
-def _numbered(keys: Indices) -> tuple[Indices, Indices]:
-    """Return a number (n,) for each key, counted from 0 on, and where (k,) each number is first.
-
-    Equal keys have equal numbers. The open hash table takes a quarter of the time of ``np.unique``.
-    """
-    numbers, firsts, count = np.empty_like(keys), np.empty_like(keys), 0
-    bits = 2
-    while 1 << bits < 2 * len(keys):
-        bits += 1
-    table = np.full(1 << bits, -1)
-    for i in range(len(keys)):
-        slot = (keys[i] * GOLDEN >> (63 - bits)) & (len(table) - 1)
-        while table[slot] >= 0 and keys[firsts[table[slot]]] != keys[i]:
-            slot = (slot + 1) & (len(table) - 1)
-        if table[slot] < 0:
-            table[slot], firsts[count] = count, i
-            count += 1
-        numbers[i] = table[slot]
-    return numbers, firsts[:count]

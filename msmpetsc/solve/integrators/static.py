@@ -210,7 +210,7 @@ class Static(ImplicitEuler):
         refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
         minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
-        minimum.estimate.linearise(rest)
+        minimum.estimate.linearise(rest, None)
         lowest, _ = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
         if lowest > 0 and not ACCEPTED_LOWEST[0] <= lowest <= ACCEPTED_LOWEST[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))

@@ -30,6 +30,7 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.node_friction import Movers
+from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.springs import crushing_energy
@@ -67,6 +68,7 @@ class Verlet(Integrator):
     """Take steps by the velocity Verlet method; ``time.substep`` may only shorten its substeps.
 
     elastic      : (owned, 3) grad E [N] without contact
+    contact      : contact at the present positions; None without any
     work         : [J] of a step: work of obstacles, varying loads and anchors on this rank's nodes
     springs_work : [J] of a step: work that the springs of this rank's nodes absorb
     gained       : [J] spurious energy of the springs so far, less its dissipation; negative: credit
@@ -93,6 +95,7 @@ class Verlet(Integrator):
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.elastic = self.gradient[:owned]
+        self.contact: ContactAt | None = None
         self.sides = environment.obstacles.no_sides[:, :owned]
         self.damping = environment.damping
         self.work = self.springs_work = self.gained = 0.0
@@ -251,9 +254,10 @@ class Verlet(Integrator):
         self.elasticity.add_gradient(self.position.values, self.gradient)
         self.elastic = self.gradient[: self.lattice.owned]
         contact = self.environment.obstacles.push(time, self.sides)
-        if contact:
+        self.contact = contact.at(self.q) if contact else None
+        if self.contact:
             self.elastic = self.elastic.copy()
-            contact.add_gradient(self.q, self.gradient)
+            self.contact.add_gradient(self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
         """Change v by the forces at ``time`` over ``duration`` [s], with damping and friction.
@@ -271,15 +275,12 @@ class Verlet(Integrator):
                 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
             )
         self._damp(0.5 * duration)
-        self.work += duration * self.environment.obstacles.power(
-            self.q, time, begin, end, self.sides
-        )
-        self.environment.obstacles.apply_friction(
-            self._movers(), time, duration, (begin, end), self.sides
-        )
+        if self.contact:
+            self.work += duration * self.contact.power(begin, end)
+            self.contact.apply_friction(self._movers(), duration, begin, end)
 
     def _movers(self) -> Movers:
-        return Movers(self.q, self.v, self.free, self.per_mass, self.gradient)
+        return Movers(self.v, self.free, self.per_mass, self.gradient)
 
     def _damp(self, duration: float) -> None:
         """Damp the velocities of the free nodes over a duration [s] by exp(-alpha dt)."""

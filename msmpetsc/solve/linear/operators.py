@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scipy.sparse import coo_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
-from msmpetsc.contact.obstacles.penalty import Contact, Duals
+from msmpetsc.contact.obstacles.penalty import ContactAt, Duals
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.elasticity.solid import CellHessians
@@ -48,11 +48,11 @@ class ContactBlocks:
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
-    def linearise(self, contact: Contact | None, q: Positions, duals: Duals | None) -> None:
-        """Compute the blocks at q (l, 3) [m], with the duals of friction if given."""
+    def linearise(self, contact: ContactAt | None, duals: Duals | None) -> None:
+        """Compute the blocks of contact, with the duals of friction if given."""
         self.parts = []
         with CONTACT:
-            for nodes, blocks in contact.hessian(q, duals) if contact else ():
+            for nodes, blocks in contact.hessian(duals) if contact else ():
                 free = np.flatnonzero(self.row[nodes] >= 0)
                 if len(free):
                     self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
@@ -115,11 +115,11 @@ class TrueHessian:
     def linearise(
         self,
         q: Positions,
-        contact: Contact | None,
+        contact: ContactAt | None,
         projected: bool = False,
         duals: Duals | None = None,
     ) -> None:
-        """Linearise about positions q (l, 3) [m].
+        """Linearise about positions q (l, 3) [m], with the contact there.
 
         projected : project out the negative curvature of each spring (elasticity.springs)
         duals     : duals of friction, which replace its true curvature (contact.friction)
@@ -127,7 +127,7 @@ class TrueHessian:
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             if self.contact:
-                self.contact.linearise(contact, q, duals)
+                self.contact.linearise(contact, duals)
             self.surface = None
             if contact and contact.surface:
                 surface_duals = duals[-1] if duals else None

@@ -102,7 +102,7 @@ class Unknowns:
 
     def collect(self, nodes: Rows, columns: Rows) -> None:
         """Copy the free owned rows of ``nodes`` (>= owned, 3) to ``columns`` (3, m)."""
-        _collect(self.size, nodes, self.rows, columns)
+        columns[:] = nodes[self.free].T
 
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b of arrays (l, 3) of nodal values to a vector of unknowns."""
@@ -173,13 +173,6 @@ def _spread(first: int, count: int, step: int, columns: Rows, rows: Indices, nod
     for i in range(first, count, step):
         for c in range(3):
             nodes[rows[i], c] = columns[c, i]
-
-
-@kernel
-def _collect(first: int, count: int, step: int, nodes: Rows, rows: Indices, columns: Rows) -> None:
-    for i in range(first, count, step):
-        for c in range(3):
-            columns[c, i] = nodes[rows[i], c]
 
 
 class Terms(NamedTuple):

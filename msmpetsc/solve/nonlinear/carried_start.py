@@ -156,7 +156,7 @@ class CarriedStart:
             raise StepStopped("stopped by a signal")
         unknowns.from_nodes(q, x)
         functional.evaluate(x, f)
-        self.jacobian.linearise(q, contact, True, contact.no_duals())
+        self.jacobian.linearise(q, contact.at(q), True, contact.no_duals())
         forces = self.jacobian.hessian.forces(fixed)
         contact.surface.add_change_of_gradient(q, obstacles, forces)
         unknowns.scaled_sum(np.zeros_like(q), functional.t2, forces, change)

@@ -178,7 +178,7 @@ class LowestCurvature:
             self.searched = (
                 Compressed() if alarm else Compressed(compression.greatest, compression.total)
             )
-            with self.preconditioner.searching(q, self.functional.problem.contact):
+            with self.preconditioner.searching(q, self.functional.contact_at(q)):
                 found = self._search_at_length(
                     q, hint, EFFORT if alarm is Alarm.HERE else self.effort
                 )

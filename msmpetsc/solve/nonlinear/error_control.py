@@ -155,9 +155,7 @@ class ErrorControl:
             self.functional.distance(iterate.q),
         )
         stays = residual > STAYS * before.residual
-        at_rounding = self.rounding.explains(
-            iterate, self.functional.problem.contact if stays else None
-        )
+        at_rounding = self.rounding.explains(iterate, stays)
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(
             before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm

@@ -21,6 +21,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions
 from msmpetsc.checkpoint import ANY, Range
+from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
@@ -125,7 +126,7 @@ class ErrorEstimate:
         self.acceptable, self.missing = acceptable, None
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
-            self.linearise(iterate.q)
+            self.linearise(iterate.q, iterate.contact)
             if self.needs_probe:
                 self._probe()
             self.ksp.solve(iterate.f, self.correction)
@@ -149,10 +150,10 @@ class ErrorEstimate:
         """Whether P^(-1) H may have an eigenvalue far below all Ritz values."""
         return self.preconditioner.is_uniform and np.isinf(self.floor)
 
-    def linearise(self, q: Positions) -> None:
+    def linearise(self, q: Positions, contact: ContactAt | None) -> None:
         """Linearise the Hessian and the preconditioner at positions q (l, 3) [m]."""
-        self.preconditioner.prepare(q, self.functional.problem.contact)
-        self.hessian.linearise(q, self.functional.problem.contact)
+        self.preconditioner.prepare(q, contact)
+        self.hessian.linearise(q, contact)
         self.operator.assemble()
 
     def _converged(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:

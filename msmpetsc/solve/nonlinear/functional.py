@@ -14,7 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest, like, to_host
-from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.obstacles.penalty import Contact, ContactAt
 from msmpetsc.contact.surface.term import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError, StepFailed
@@ -66,14 +66,16 @@ class StepProblem:
 class Iterate:
     """Position of a step with its residual.
 
-    x : unknowns; no method writes to them
-    q : positions (l, 3) [m], ghosts included
-    f : F [kg m]
+    x       : unknowns; no method writes to them
+    q       : positions (l, 3) [m], ghosts included
+    f       : F [kg m]
+    contact : contact at q; None without any
     """
 
     x: PETSc.Vec
     q: Positions
     f: PETSc.Vec
+    contact: ContactAt | None
 
 
 class StepFunctional:
@@ -121,11 +123,17 @@ class StepFunctional:
             gradient[:] = 0
             self.elasticity.add_gradient(q, gradient)
             gradient[:owned] -= problem.load
+            contact = None
             if problem.contact:
                 with CONTACT:
-                    problem.contact.add_gradient(q, gradient)
+                    contact = problem.contact.at(q)
+                    contact.add_gradient(gradient)
             self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
-        return Iterate(x, q, f)
+        return Iterate(x, q, f, contact)
+
+    def contact_at(self, q: Positions) -> ContactAt | None:
+        """Return the step's contact at positions q (l, 3) [m]; None without contact."""
+        return self.problem.contact.at(q) if self.problem.contact else None
 
     def at(self, q: Positions) -> Iterate:
         """Return the iterate whose free nodes are at q (l, 3) [m]."""
@@ -153,7 +161,8 @@ class StepFunctional:
         moved = q[owned] - problem.y[owned]
         acting = self.elasticity.energy(q) - float(np.vdot(moved, problem.load))
         if problem.contact:
-            acting += problem.contact.change_at_nodes(q, problem.y)
+            acting += problem.contact.energy(q)
+            acting += problem.contact.change_of_friction(q, problem.y)
             if met and problem.contact.surface:
                 acting += problem.contact.surface.change(q, problem.q)
         inertia = 0.5 * self._inner(moved, moved)
@@ -270,18 +279,17 @@ class Rounding:
                 "check gravity, force and their units"
             )
 
-    def explains(self, iterate: Iterate, contact: Contact | None) -> bool:
+    def explains(self, iterate: Iterate, with_contact: bool) -> bool:
         """Return whether F is rounding alone.
 
         Rows are tested one by one, since soft parts have less rounding than stiff parts.
 
-        contact : whose stiffness at the iterate counts; None to leave contact out, which costs less
+        with_contact : whether the stiffness of contact counts; without it the test costs less
         """
         functional, known = self.functional, self.rows
-        if contact:
-            known = known + np.tile(
-                ROUNDINGS * functional.t2 * contact.bound(iterate.q)[functional.unknowns.free], 3
-            )
+        if with_contact and iterate.contact:
+            bound = iterate.contact.bound()[functional.unknowns.free]
+            known = known + np.tile(ROUNDINGS * functional.t2 * bound, 3)
         rows = np.abs(functional.memory.read(iterate.f)) / (
             known * max(functional.extent, np.finfo(float).tiny)
         )

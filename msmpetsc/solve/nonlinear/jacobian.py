@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, greatest
-from msmpetsc.contact.obstacles.penalty import Contact, Duals
+from msmpetsc.contact.obstacles.penalty import Contact, ContactAt, Duals
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import (
     ContactBlocks,
@@ -117,12 +117,12 @@ class Jacobian:
     def linearise(
         self,
         q: Positions,
-        contact: Contact | None,
+        contact: ContactAt | None,
         projected: bool,
         duals: Duals | None,
         known: bool = False,
     ) -> None:
-        """Linearise H and contact at positions q (l, 3) [m]; A is constant (collective).
+        """Linearise H at positions q (l, 3) [m], and contact; A is constant (collective).
 
         projected : leave out the negative parts of H
         duals     : of friction; None for its true curvature
@@ -131,7 +131,7 @@ class Jacobian:
         if self.preset.true_hessian and not known:
             self.hessian.linearise(q, contact, projected, duals)
         elif self.blocks:
-            self.blocks.linearise(contact, q, contact.no_duals() if contact else None)
+            self.blocks.linearise(contact, contact.contact.no_duals() if contact else None)
         changed = self.preconditioner.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()

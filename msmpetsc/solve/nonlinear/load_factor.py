@@ -56,7 +56,7 @@ class LoadFactor:
         # So near the limit that the next growth would need another search
         is_heavy = MORE * UNSEEN * self.value > LIGHT
         if not np.isfinite(bound) or (not is_heavy and (growth > GROWN or bound > LIGHT)):
-            with preconditioner.searching(q, self.functional.problem.contact):
+            with preconditioner.searching(q, self.functional.contact_at(q)):
                 self.value = self._computed(q) if preconditioner.is_uniform else np.inf
             self.loads, bound = ratios, UNSEEN * self.value
         return bound
@@ -67,7 +67,7 @@ class LoadFactor:
         projected = TrueHessian(
             functional.unknowns, functional.elasticity, functional.time_step, hessian.contact
         )
-        projected.linearise(q, functional.problem.contact, True)
+        projected.linearise(q, functional.contact_at(q), True)
         known = [] if self._mode is None else [self._mode[None]]
         start = np.concatenate([*known, self.search.random(2 - len(known))])
         values, modes = self.search.lowest(

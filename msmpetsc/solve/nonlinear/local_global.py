@@ -109,7 +109,7 @@ class LocalGlobal(StepMethod):
         """Linearise contact at x and set the initial guess of the linear solve (SNESJacobian)."""
         with LOCAL:
             self.base = self.functional.positions(x)
-            self.jacobian.linearise(self.base, self.functional.problem.contact, False, None)
+            self.jacobian.linearise(self.base, self.functional.contact_at(self.base), False, None)
         if self.preset.start_from_b:
             # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
             z = snes.getSolutionUpdate()
@@ -122,9 +122,11 @@ class LocalGlobal(StepMethod):
         if its > 0 or not self.has_npc:
             x = snes.getSolution()
             # With an NPC, ``f`` is of another x
-            iterate = Iterate(x, self.functional.positions(x), self.own if self.has_npc else self.f)
+            q = self.functional.positions(x)
             if self.has_npc:
-                self.functional.evaluate(x, self.own, iterate.q)
+                iterate = self.functional.evaluate(x, self.own, q)
+            else:
+                iterate = Iterate(x, q, self.f, self.functional.contact_at(q))
             self.outcome = self.control.judge(iterate, self.outcome)
         reason = self.reason_to_end(its, self.outcome)
         if not reason:

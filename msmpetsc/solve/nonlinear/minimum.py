@@ -83,7 +83,7 @@ class Minimum:
         if examined is None:
             examined = at
             first.set(0.0)
-        estimate.linearise(examined.q)
+        estimate.linearise(examined.q, examined.contact)
         estimate.residual.aypx(-1.0, examined.f)
         # Change of F that H at the iterate does not predict
         bent = functional.dual_norm(estimate.residual)

@@ -134,9 +134,7 @@ class Newton(StepMethod):
         """
         known = outcome.corrected and not projected
         with LOCAL:
-            self.jacobian.linearise(
-                now.q, self.functional.problem.contact, projected, self.friction.duals, known
-            )
+            self.jacobian.linearise(now.q, now.contact, projected, self.friction.duals, known)
             if self.slopes is not None and not (known or projected):
                 self.jacobian.hessian.take_slopes(self.slopes)
             self.slopes = None

@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows, like
 from msmpetsc.comm import log
-from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.operators import Block
@@ -70,7 +70,7 @@ class Preconditioner:
         self.own = unknowns.memory.read(self.vector).copy()
         self.added = np.zeros_like(self.own)
 
-    def prepare(self, q: Positions, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: ContactAt | None) -> bool:
         """Add the bound of contact at positions q (l, 3) [m] (collective).
 
         Return whether the matrix changed.
@@ -78,7 +78,7 @@ class Preconditioner:
         if not self.touches:
             return False
         lattice = self.unknowns.lattice
-        bound = (contact.bound(q) if contact else np.zeros(lattice.owned, like=q))[
+        bound = (contact.bound() if contact else np.zeros(lattice.owned, like=q))[
             self.unknowns.free
         ]
         changed = bool(lattice.table.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR))
@@ -136,16 +136,16 @@ class LatticePreconditioner:
         self.excess = 0.0
         self.is_stale, self.is_new, self.is_free = True, False, False
 
-    def prepare(self, q: Positions, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: ContactAt | None) -> bool:
         """Build a hierarchy at positions q (l, 3) [m] if it is due; return whether it was."""
         self.is_free, is_due = self._is_free(q, contact), self.is_stale
         self.is_new = is_due
         if is_due:
             surface = contact.surface.hessian(q, True) if contact and contact.surface else None
-            self._build(q.copy(), self._blocks(q, contact), surface)
+            self._build(q.copy(), self._blocks(contact), surface)
         return is_due
 
-    def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+    def balance(self, q: Positions, contact: ContactAt | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Translate free bodies to the balance of their forces, from positions q with residual f.
 
         q : positions (l, 3) [m] of the unknowns x, which are changed
@@ -188,7 +188,7 @@ class LatticePreconditioner:
         self.excess = 0.0
         self.is_first = self.is_stale = False
 
-    def _is_free(self, q: Positions, contact: Contact | None) -> bool:
+    def _is_free(self, q: Positions, contact: ContactAt | None) -> bool:
         """Return whether no obstacle presses on a node at positions q (l, 3) [m].
 
         Translations are then resisted by mass alone.
@@ -202,17 +202,17 @@ class LatticePreconditioner:
         # The self-contact of a lone body moves its centre no more than springs do
         if surface and not alone and surface.presses(q):
             return False
-        pressed = any(len(nodes) for nodes, _ in contact.hessian(q))
+        pressed = any(len(nodes) for nodes, _ in contact.hessian())
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
-    def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """Return the Hessian (owned, 9) of obstacles at q, with the secant of friction.
+    def _blocks(self, contact: ContactAt | None) -> Rows:
+        """Return the Hessian (owned, 9) of obstacles, with the secant of friction.
 
         Return (0, 9) without contact.
         """
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
-        for nodes, added in contact.hessian(q, contact.no_duals()) if contact else ():
+        for nodes, added in contact.hessian(contact.contact.no_duals()) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
         return blocks
 
@@ -291,7 +291,7 @@ class StepPreconditioner:
         assert chosen is not None
         return chosen
 
-    def prepare(self, q: Positions, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: ContactAt | None) -> bool:
         """Prepare for positions q (l, 3) [m]; return whether the preconditioner changed."""
         if (
             self.chooses
@@ -318,7 +318,7 @@ class StepPreconditioner:
         )
 
     @contextmanager
-    def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
+    def searching(self, q: Positions, contact: ContactAt | None) -> Iterator[None]:
         """Switch to multigrid, built at positions q (l, 3) [m], for a long search.
 
         Smooth modes, which converge last with Jacobi's, then converge at once. The hierarchy is

@@ -258,7 +258,7 @@ class Stepper:
         """Return an iterate whose free bodies are translated to the balance of forces."""
         x = self.functional.vectors.take()
         now.x.copy(x)
-        multigrid.balance(now.q, self.functional.problem.contact, now.f, x)
+        multigrid.balance(now.q, now.contact, now.f, x)
         balanced = self.functional.iterate(x)
         share = self.functional.free_share(now.q, balanced.q)
         return (

@@ -323,7 +323,7 @@ def test_other_presets_fail_and_say_so(method: str, name: str, words: str):
 
 
 RESCUED = [
-    ("substep", ["cages.cell_size=0.25", "material.poisson_ratio=0.35"]),
+    ("substep", ["cages.cell_size=0.25", "material.poisson_ratio=0.4"]),
     ("fallback", ["material.poisson_ratio=0.3"]),
 ]
 

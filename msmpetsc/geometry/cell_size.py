@@ -71,13 +71,16 @@ def estimated_size(bodies: Sequence[BodySurface], count: float) -> float:
 
 
 def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float) -> None:
-    """Warn of bodies too stiff in bending: their mean thickness 2 V / A is less than a cell [m]."""
+    """Warn of bodies with a mean thickness 2 V / A of less than a cell [m].
+
+    They may be too stiff in bending.
+    """
     for number, body in enumerate(bodies):
         thickness = 2 * abs(body.report.volume) / body.report.area
         if body.report.closed and thickness < cell_size:
             advised = thickness / ACROSS
             log.warning(
-                "%s is %.3g m thick on average (2 V / A), %.2g of a cell, and so too stiff in "
+                "%s is %.3g m thick on average (2 V / A), %.2g of a cell, and may be too stiff in "
                 "bending: cages.count = %d or cages.cell_size = %.2g puts %d cells there",
                 f"body.{number}" if len(bodies) > 1 else "the body",
                 thickness, thickness / cell_size,

@@ -81,13 +81,13 @@ for count in cells_across:
 # %% [markdown]
 # It prints:
 #
-#     2 cells across: 1.53 mm, +2.85%
-#     4 cells across: 1.48 mm, -0.15%
-#     6 cells across: 1.48 mm, -0.63%
+#     2 cells across: 1.46 mm, -1.49%
+#     4 cells across: 1.47 mm, -1.19%
+#     6 cells across: 1.47 mm, -1.09%
 #
-# Four cells across are within a percent of theory. The beam stays a little too stiff
-# because a pinned section can neither shrink nor warp, unlike the section in theory.
-# The error of the cells themselves is the distance between the lattices.
+# Two cells across are within 2% of theory. The beam stays a little too stiff because a
+# pinned section can neither shrink nor warp, unlike the section in theory. The error of
+# the cells themselves is the distance between the lattices: 0.4%.
 
 # %%
 assert abs(errors[-1]) < 0.02, "six cells across should be within 2% of theory"

@@ -20,6 +20,14 @@ from msmpetsc.lattice.material import lame_constants
 from msmpetsc.scene.body import Material
 
 RNG = np.random.default_rng(30)
+
+
+@pytest.fixture(autouse=True)
+def same_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Begin each test with the same noise, whatever tests its worker ran before."""
+    monkeypatch.setitem(globals(), "RNG", np.random.default_rng(30))
+
+
 YOUNG, H = 3e4, 0.1
 
 

@@ -41,6 +41,7 @@ class Lattice:
     cell_fill   : (c,) fraction of each of ``cells`` that lies inside the surface [-]
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
     solid       : constants of a neo-Hookean solid; None if the law is springs
+    volumetric  : name of a solid's volumetric energy (elasticity.neo_hookean)
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
     """
 
@@ -62,6 +63,7 @@ class Lattice:
     cell_fill: Floats = field(default_factory=lambda: np.empty(0))
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
     solid: SolidCells | None = None
+    volumetric: str = "quadratic"
     viscous: float = 0.0
 
     @property
@@ -136,4 +138,5 @@ def build_lattice(
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid and SolidCells(*(rows[kept] for rows in law.solid)),
+        volumetric=material.volume,
     )

@@ -153,6 +153,12 @@ MISTAKES = [  # what is changed, into what, the key that is named, and its line
         "material.poisson_ratio",
         16,
     ),
+    (
+        "density = 1000",
+        'density = 1000\nlaw = "linear"\nvolume = "log"',
+        "material.volume",
+        16,
+    ),
     ("[material]", "[materail]", "materail", 12),
     ("step = 0.0166667", 'step = "1e-3"', "time.step", 17),
     ("duration = 2.0", "duration = 0.001", "time.duration", 18),

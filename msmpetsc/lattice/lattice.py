@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, to_host
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.lattice.mass_and_stiffness import SolidCells, law_of_solid, law_of_springs
@@ -89,6 +89,12 @@ class Lattice:
         """Return the greatest stiffness [N/m] of a spring, or of a solid's cell (collective)."""
         stiffness = self.stiffness if self.solid is None else self.cell_stiffness
         return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
+
+    def longest_side(self) -> float:
+        """Return the longest side [m] of the bounding box of all nodes at rest (collective)."""
+        own = [to_host(self.nodes.min(axis=0)), to_host(self.nodes.max(axis=0))]
+        low, high = np.array(self.table.comm.allgather(own)).transpose(1, 0, 2)
+        return float((high.max(axis=0) - low.min(axis=0)).max())
 
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool pinned, too."""

@@ -27,6 +27,7 @@ from scipy.sparse import csr_array
 from msmpetsc.backend.arrays import Positions, Rows, like, to_host
 from msmpetsc.checkpoint import COUNT, LENGTH, Checkpoint, Range
 from msmpetsc.comm import log
+from msmpetsc.constraints.loads import AT_EVENT
 from msmpetsc.errors import StepFailed
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
@@ -42,7 +43,7 @@ LOWEST, HIGHEST = -10, 6
 # number of step lengths whose integrators are kept; neighbouring lengths alternate
 KEPT = 4
 # end of a step before an event, over the event's time; the event must not act yet
-JUST_BEFORE = 1 - 1e-10
+JUST_BEFORE = 1 - 0.5 * AT_EVENT
 # averages over neighbours in a local error; they remove waves as short as a cell
 SWEEPS = 4
 # part of the saved credit that a step may spend; savings must last for an impact
@@ -348,13 +349,18 @@ class Adaptive(Integrator):
                 return self._accepted(replace(result, cost=cost), before, after, level)
 
     def _start_of(self, state: State, level: int, restarts: bool) -> State:
-        """Return the state from which a step of a level starts; ``restarts`` drops the history."""
-        v = state.velocity(self.time_step)
+        """Return the state from which a step of a level starts; ``restarts`` drops the history.
+
+        The history of another level has the mean acceleration a of the last step. So loads change
+        its velocity in proportion to their impulse in that step (Bdf2).
+        """
+        q, v, t, span = state.q, state.velocity(self.time_step), self._length(level), None
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
-            s = 1 - 2.0 ** (level - self.last)
-            history = between(*history, state.q, v, self._length(self.last), s)
-        return replace(state, q_previous=state.q - self._length(level) * v, history=history)
+            span = self._length(self.last)
+            a = (v - history[1]) / span
+            history = q - t * v + 0.5 * t**2 * a, v - t * a
+        return replace(state, q_previous=q - t * v, history=history, span=span)
 
     def _end_time(self, tick: int) -> float:
         """Return the end time [s] of a step that ends at a tick: just before an event there."""

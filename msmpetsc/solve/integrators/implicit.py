@@ -366,9 +366,9 @@ class Bdf2(ImplicitEuler):
         begin, forces = time - self.time_step, self.environment.forces
         forces.begin_step(q, v, begin)
         load = forces.mean(begin, time)
-        history = state.history
+        history, begun_error = state.history, 0.0
         if history is None:
-            history, work_before = self._history(state, load, time)
+            history, begun_error, work_before = self._history(state, load, time)
         else:
             before = forces.mean(begin - (state.span or self.time_step), begin)
             load = load if before is load else 1.5 * load - 0.5 * before
@@ -386,7 +386,7 @@ class Bdf2(ImplicitEuler):
             self.stepper.lattice.pinned,
         )
         cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
-        result = replace(result, previous=previous, cost=cost, work=work)
+        result = replace(result, previous=previous, cost=cost, work=work, begun_error=begun_error)
         if before is not previous:
             struck = (before != previous).any(axis=1)[:, None]
             v_after = (result.position - before - a) / self.time_step
@@ -396,13 +396,31 @@ class Bdf2(ImplicitEuler):
 
     def _history(
         self, state: State, load: Rows, time: float
-    ) -> tuple[tuple[Positions, Rows], Work]:
-        """Return a history for a state without history, and the work of finding the history.
+    ) -> tuple[tuple[Positions, Rows], float, Work]:
+        """Return a history for a state without history, its error, and the work of finding it.
 
-        The history leads to q and v with the acceleration of an implicit Euler step of length tau.
-        The error of this acceleration is of first order.
+        The history leads to q and v with the acceleration a of an implicit Euler step of length
+        tau. The error of this acceleration is of first order.
+
+        A mode of frequency w has a = a_n / (1 + (tau w)^2), with the acceleration a_n at q. The
+        BDF2 step then moves it as if its acceleration were constant. The error [m sqrt(kg)] is
+        nearly tau^2 |a|_M (1 - |a|_M^2 / a_n^T M a).
         """
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
         result, _ = self._solve(state, q + self._carried(tau) * v, load, time - t + tau, tau)
         a = ((result.position - q) / tau - v) / tau
-        return (q - t * v + t**2 / 2 * a, v - t * a), result.cost
+        history = q - t * v + t**2 / 2 * a, v - t * a
+        return history, self._begun_error(result), result.cost
+
+    def _begun_error(self, result: StepResult) -> float:
+        """Return the error [m sqrt(kg)] of the history that an implicit Euler step leads to."""
+        functional, problem = self.stepper.functional, result.problem
+        assert problem is not None
+        moved = functional.vectors.take()
+        self.stepper.unknowns.from_nodes(result.position - problem.y, moved)
+        functional.begin(replace(problem, y=problem.q, prescribed=None))
+        # With y = q, F is -tau^2 M a_n.
+        at_start = -functional.at(problem.q).f.dot(moved)
+        length = functional.norm(moved)
+        functional.vectors.give_back(moved)
+        return length * (1 - min(length**2 / at_start, 1.0)) if at_start > 0 else length

@@ -105,7 +105,8 @@ def step_of(scene: Path | str) -> float:
     return load_scene(lab.file_of(scene)).time.step
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Print the tables."""
     lab.tables(
         __doc__,
         {
@@ -113,3 +114,7 @@ if __name__ == "__main__":
             "euler": lambda: rows("implicit-euler", (0.1,), [*BOXES]),
         },
     )
+
+
+if __name__ == "__main__":
+    main()

@@ -241,6 +241,34 @@ def test_a_fork_is_the_same_on_any_number_of_ranks(tmp_path: Path):
     np.testing.assert_allclose(q[0], q[1], atol=1e-8)
 
 
+def test_two_free_forks_move_as_each_alone(tmp_path: Path):
+    """Multigrid separates free bodies by other keys; their coarse copies follow."""
+    fork(0.3).export(tmp_path / "fork.ply")
+    spin = {"velocity": [0.0, 0.0, 0.0], "spin": [0.0, 0.0, 4.0]}
+    scene = {
+        "cages": {"cell_size": H},
+        "material": {
+            "young_modulus": YOUNG, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3,
+        },
+        "time": {"step": 0.05, "duration": 0.1},
+        "solver": {"preset": "newton-multigrid", "error": 1e-8},
+        "output": {"surface": False},
+    }  # fmt: skip
+    bodies = [
+        {"mesh": {"source": "fork.ply", "base": base}, "start": spin}
+        for base in ([0, 0, 0], [0, 3, 0])
+    ]
+    ends = []
+    for name, some in (("two", bodies), ("one", bodies[:1])):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(tomli_w.dumps(scene | {"body": some}))
+        model, frames = play(path)
+        ends.append((frames[-1].position - model.lattice.nodes, len(model.lattice.mass)))
+    (two, _), (one, nodes) = ends
+    np.testing.assert_allclose(two[:nodes], one, atol=1e-7)
+    np.testing.assert_allclose(two[nodes:], one, atol=1e-7)
+
+
 def sheet_opening(folder: Path, gap: float) -> float:
     """How far the free ends of a folded sheet move apart [m]."""
     folder.mkdir()

@@ -165,7 +165,7 @@ class GalerkinSum:
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
         corners, self.springs, self.nodes, self.cells = _by_cell(
-            unknowns, elasticity, decode_morton(keys), offsets, copies.of(0, keys)
+            unknowns, elasticity, decode_morton(keys), offsets, copies.of(0, keys + offsets)
         )
         self.weights, self.full = (like(lattice.nodes, a) for a in (t2**0.5 * WEIGHTS, SYMMETRIC))
         of_springs = OF_SPRINGS._replace(factor=t2 * OF_SPRINGS.factor)

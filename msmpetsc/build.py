@@ -196,12 +196,13 @@ def build_model(comm: MPI.Comm, scene: Scene, geometry: Geometry | None = None) 
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
     points = geometry.nearest if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
+    held = {t.key: masks[t.key][:, None] & np.array(t.table.held) for t in held_by(scene)}
     lattice = lattice.pin(
-        reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned)
+        reduce(np.logical_or, (held[pin.key] for pin in scene.tables("pin")), lattice.held)
     )
-    holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
-    anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
-    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
+    holders = Holders.of_masks(held, lattice)
+    anchors = _anchors(scene.tables("anchor"), lattice, held, holders)
+    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.held)
     outside = geometry.outside(lattice.nodes) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -241,7 +242,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
             lattice,
             nodes=send(lattice.nodes),
             mass=send(lattice.mass),
-            pinned=send(lattice.pinned),
+            held=send(lattice.held),
             local_cells=send(lattice.local_cells),
             solid=solid and solid._replace(forms=send(solid.forms)),
         ),
@@ -324,16 +325,18 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
 
 
 def _anchors(
-    tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders
+    tables: Iterable[OfBody], lattice: Lattice, held: Regions, holders: Holders
 ) -> list[Anchor]:
-    """Return the anchors (collective). A node follows its pin, or else the first of its anchors.
+    """Return the anchors (collective). A component follows its pin, else its first anchor.
+
+    held : components (l, 3) in the region of each table
 
     Raises InputError if pins and anchors leave no node to move.
     """
     anchors = []
-    prescribed = lattice.pinned
+    prescribed = lattice.held
     for anchor in tables:
-        where = masks[anchor.key] & ~prescribed
+        where = held[anchor.key] & ~prescribed
         center_of_mass = holders.centers[holders.keys.index(anchor.key)]
         center = center_of_mass if anchor.table.center is None else np.array(anchor.table.center)
         path = Motion.through(anchor.table.path, center)

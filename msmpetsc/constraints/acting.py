@@ -81,9 +81,9 @@ class Anchors:
         return [anchor for anchor in self.all if anchor.acts_at(time)]
 
     def fixed_at(self, time: float) -> Mask:
-        """Return the mask (l,) of nodes that are pinned or anchored at a time [s]: no unknowns."""
+        """Return the mask (l, 3) of components that are held at a time [s]: no unknowns."""
         return reduce(
-            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.pinned
+            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.held
         )
 
     def prescribed(
@@ -98,5 +98,5 @@ class Anchors:
             return None
         for anchor in anchors:
             pose = (1 - share) * anchor.path.value_at(begin) + share * anchor.path.value_at(time)
-            q = np.where(anchor.where[:, None], anchor.path.moved(self.lattice.nodes, pose), q)
+            q = np.where(anchor.where, anchor.path.moved(self.lattice.nodes, pose), q)
         return q

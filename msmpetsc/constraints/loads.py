@@ -129,7 +129,7 @@ class Timed:
 class Anchor(Timed):
     """Nodes with a prescribed displacement along a path, until the anchor releases them.
 
-    where : (l,) bool, the nodes, ghosts included
+    where : (l, 3) bool, the prescribed components of the nodes, ghosts included
     """
 
     where: Mask

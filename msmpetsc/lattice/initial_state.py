@@ -20,7 +20,7 @@ def initial_state(
     """Return initial positions and velocities of nodes from their bodies' starts (collective).
 
     starts : the start of each body; None for a body at rest
-    held   : (l,) bool, nodes that stay at rest in their rest positions
+    held   : (l, 3) bool, components that stay at rest in their rest positions
     bounds : (b, 2, 3) bounding box of each body at rest [m]
     """
     velocity = np.zeros_like(lattice.nodes)
@@ -32,7 +32,7 @@ def initial_state(
             own = np.flatnonzero(body == number)
             owned = int((own < lattice.owned).sum())
             q[own] = moved(start, lattice.nodes[own], lattice.global_numbers[own], bounds[number])
-            q[own[held[own]]] = lattice.nodes[own[held[own]]]
+            q[own] = np.where(held[own], lattice.nodes[own], q[own])
             mass = lattice.mass[own[:owned]]
             total: Floats = comm.allreduce(np.append(mass @ q[own[:owned]], mass.sum()))
             centre_of_mass = total[:3] / total[3]

@@ -9,6 +9,7 @@ from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.suggestions import TAGS
 from msmpetsc.scene.values import (
+    Components,
     Direction,
     FunctionName,
     ListOf,
@@ -94,7 +95,22 @@ Path = Annotated[ListOf[Pose], AfterValidator(_ascending)]
 PATH = "poses, interpolated linearly from rest at time 0; the last pose is kept"
 
 
-class Pin(Table):
+class Holder(Table):
+    """Nodes of which some components are no unknowns."""
+
+    fix: Components = Field(
+        ("x", "y", "z"),
+        description='global components that are held, for example ["x"] for a roller or a plane '
+        "of symmetry [-]",
+    )
+
+    @property
+    def held(self) -> tuple[bool, ...]:
+        """Return whether each component is held."""
+        return tuple(axis in self.fix for axis in "xyz")
+
+
+class Pin(Holder):
     """Nodes that stay at their rest positions."""
 
     region: Region = Field(description="the pinned nodes")
@@ -155,7 +171,7 @@ class Force(Table):
         return any(map(any, values))
 
 
-class AnchorTable(Table):
+class AnchorTable(Holder):
     """Nodes that move along a prescribed path as a rigid body."""
 
     region: Region = Field(description="the nodes that move along the path")

@@ -31,7 +31,7 @@ from typing import SupportsFloat
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
@@ -113,7 +113,7 @@ class EnergyBalance:
         free = ~environment.anchors.fixed_at(time)[owned]
         sums = self._sums(
             0.5 * np.vdot(momenta, v),
-            0.5 * np.vdot(momenta * free[:, None], v),
+            0.5 * np.vdot(momenta * free, v),
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
             -np.vdot(environment.forces.given(time), at),
@@ -157,18 +157,17 @@ class EnergyBalance:
         pressing, dragged = self.environment.obstacles.way_of_pressing(
             (result.position[owned], after.sides), time, time_step
         )
-        is_held = self.environment.anchors.fixed_at(time)[owned].any()
+        is_held = self.environment.anchors.fixed_at(time)[owned].any(axis=0)
         sums = self._sums(
             lattice.mass.sum(),
             pressing,
-            is_held,
+            *to_host(is_held),
             *dragged,
             *(lattice.mass @ displacement / time_step),
         )
-        mass, pressing, is_held = sums[:3]
-        momentum = sums[6:]
+        mass, pressing, is_held, momentum = sums[0], sums[1], sums[2:5], sums[8:]
         if pressing > 0:
-            frame = sums[3:6] / (pressing * time_step)
+            frame = sums[5:8] / (pressing * time_step)
         else:
             frame = np.where(is_held, 0.0, momentum / mass)
         start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
@@ -285,7 +284,7 @@ class EnergyBalance:
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
         sums = self._sums(
-            0.5 * np.vdot((lattice.mass * free)[:, None] * (v - drift), v - drift),
+            0.5 * np.vdot(lattice.mass[:, None] * free * (v - drift), v - drift),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned] + shift) if contact else 0.0,
             np.vdot(environment.forces.at(time), result.position[owned] - q[owned] - shift)

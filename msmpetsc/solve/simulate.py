@@ -24,7 +24,7 @@ from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import ProbePoints, probe_points
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.schema import Solver, held_by
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, TrueErrors
@@ -75,6 +75,12 @@ def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
         raise InputError(
             f"contact of surfaces needs one of newton's presets, not {scene.solver.preset}"
         )
+    rolls = [table.key for table in held_by(scene) if not all(table.table.held)]
+    if rolls and not all(preset.true_hessian for preset, _ in solvers.values()):
+        raise InputError(
+            f"{rolls[0]}.fix: single components need one of newton's presets, not "
+            f"{scene.solver.preset}: the matrix A of the others holds whole nodes"
+        )
     if scene.time.error and true_error:
         raise InputError("true errors need steps of constant length: leave out time.error")
     if "" not in solvers and true_error:
@@ -123,7 +129,7 @@ class TimeLoop:
         self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
         sides = self.environment.obstacles.contact_faces(
-            q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0)
+            q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0).all(axis=1)
         )
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
         # The first solve reads options that the set-up leaves unread.
@@ -364,7 +370,7 @@ class Forces:
         load = environment.forces.at(time)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "reaction" in self.rows:
-            fixed = environment.anchors.fixed_at(time)[:owned, None]
+            fixed = environment.anchors.fixed_at(time)[:owned]
             held = (self._holding_forces(q, contact, step) - load) * fixed
             sums["reaction"] = self.model.holders.totals(held)
             sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))

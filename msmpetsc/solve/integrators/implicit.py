@@ -234,7 +234,7 @@ class ImplicitEuler(Integrator):
             result.position,
             result.previous,
             StepTaken(time, time_step, sides),
-            self.stepper.lattice.pinned,
+            self.stepper.lattice.held,
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
@@ -369,7 +369,7 @@ class Bdf2(ImplicitEuler):
             result.position,
             previous,
             StepTaken(time, self.time_step, sides),
-            self.stepper.lattice.pinned,
+            self.stepper.lattice.held,
         )
         cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
         result = replace(result, previous=previous, cost=cost, work=work)

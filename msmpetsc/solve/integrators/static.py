@@ -170,10 +170,10 @@ class LoadPath:
         if reached == share_before:
             return q
         functional = self.stepper.functional
-        pinned = self.stepper.lattice.pinned[:, None]
+        held = self.stepper.lattice.held
         ahead = q + (share - reached) / (reached - share_before) * (q - before)
         functional.begin(problem)
-        values = [functional.value(np.where(pinned, problem.fixed, guess)) for guess in (q, ahead)]
+        values = [functional.value(np.where(held, problem.fixed, guess)) for guess in (q, ahead)]
         return ahead if values[1] < values[0] else q
 
 
@@ -267,19 +267,22 @@ class Static(ImplicitEuler):
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError if a body is free to move or fewer than three nodes are held (collective).
+    """Raise InputError if a body is free to move or too little of it is held (collective).
 
-    A part that no spring joins with the rest counts as a body.
+    A part that no spring joins with the rest counts as a body. Two nodes hold six components.
     """
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
     support = "held at a point or two, about which it turns"
-    if bodies.free.any():
-        support = "held by nothing"
-    elif lattice.table.total - unknowns.total > 2:
+    free = bodies.free.any(axis=1)
+    held = unknowns.comm.allreduce(int(lattice.held[: lattice.owned].sum()))
+    if free.any():
+        along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
+        support = f"held by nothing along {', '.join(along)}"
+    elif held > 6:
         return
     subject = "the body"
     if len(bodies.free) > 1:
-        number = int(np.argmax(bodies.free))
+        number = int(np.argmax(free))
         rows = np.flatnonzero(bodies.number[: lattice.owned] == number)
         own = to_host(lattice.nodes[: lattice.owned])[rows]
         sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))

@@ -103,8 +103,7 @@ class Verlet(Integrator):
         self.end = 0.0
         self.known: Floats | None = None
         self.anchors: int | None = None
-        self.fixed = environment.anchors.fixed_at(self.time_step)[:owned]
-        self.free = np.flatnonzero(~self.fixed)
+        self._fix(environment.anchors.fixed_at(self.time_step)[:owned])
         self.unstable_energy = UNSTABLE * comm.allreduce(crushing_energy(self.lattice))
 
     def save(self, checkpoint: Checkpoint) -> None:
@@ -167,7 +166,7 @@ class Verlet(Integrator):
             if before is not None:
                 before = before[:, : self.lattice.owned]
             self.sides = self.environment.obstacles.contact_faces(
-                self.q, self.q, start, 0.0, before, self.fixed
+                self.q, self.q, start, 0.0, before, self.fixed.all(axis=1)
             )
             self._update_gradient(start)
             self.highest.squared = 0.0
@@ -195,7 +194,7 @@ class Verlet(Integrator):
         """Add half the work [J] of the present forces to the work of springs and of anchors.
 
         moved : (owned, 3) [m] displacements of the substep
-        held  : (owned,) bool, nodes that anchors move against all forces
+        held  : (owned, 3) bool, components that anchors move against all forces
         """
         # The energy balance takes the load at the end of the step.
         self.springs_work += 0.5 * np.vdot(self.elastic, moved)
@@ -233,8 +232,8 @@ class Verlet(Integrator):
 
     def _squared_acceleration(self, time: float) -> float:
         """Return |M^(-1) (f_ext - grad E)|_M^2 [J/s^2] of this rank's free nodes."""
-        force = (self.environment.forces.at(time) - self.gradient[: self.lattice.owned])[self.free]
-        return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
+        force = self.environment.forces.at(time) - self.gradient[: self.lattice.owned]
+        return float(self.per_mass @ (~self.fixed * force**2).sum(axis=1))
 
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
         """Return the result of a step of ``count`` substeps, and the state after it (collective).
@@ -264,6 +263,7 @@ class Verlet(Integrator):
 
         begin, end : times [s] of the substep whose motion the obstacles have
         """
+        kept = self.v[self.partly]
         self._damp(0.5 * duration)
         beyond = self.environment.forces.beyond(time, self.end)
         load = self.environment.forces.at(time)
@@ -271,13 +271,12 @@ class Verlet(Integrator):
         kick(len(self.free), load, duration, self._movers())
         # A kick by f changes the kinetic energy by duration f . (v- + v+) / 2.
         if beyond is not None and before is not None:
-            self.work += (
-                0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
-            )
+            self.work += 0.5 * duration * float(np.vdot(beyond * ~self.fixed, before + self.v))
         self._damp(0.5 * duration)
         if self.contact:
             self.work += duration * self.contact.power(begin, end)
             self.contact.apply_friction(self._movers(), duration, begin, end)
+        self.v[self.partly] = kept
 
     def _movers(self) -> Movers:
         return Movers(self.v, self.free, self.per_mass, self.gradient)
@@ -293,19 +292,21 @@ class Verlet(Integrator):
         drift(len(self.free), self.q, end - begin, self._movers())
         prescribed = self.environment.anchors.prescribed(self.position.values, end)
         if prescribed is not None:
-            anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
-            freed = anchored[~self.environment.anchors.fixed_at(self.end)[anchored]]
+            owned = self.lattice.owned
+            moved = self.fixed & ~self.lattice.held[:owned]
+            anchored = components(moved)
+            freed = moved & ~self.environment.anchors.fixed_at(self.end)[:owned]
             self.work -= self._kinetic(freed)
-            self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
-            self.q[anchored] = prescribed[anchored]
+            self.v[anchored] = (prescribed[:owned] - self.q)[anchored] / (end - begin)
+            self.q[anchored] = prescribed[:owned][anchored]
             self.work += self._kinetic(freed)
         if self.environment.obstacles.strikes or self.environment.obstacles.has_sides:
             self._strike(begin, end)
         self.position.update()
 
-    def _kinetic(self, nodes: Indices) -> float:
-        """Return the kinetic energy [J] of this rank's ``nodes`` (k,)."""
-        return 0.5 * float(self.lattice.mass[nodes] @ (self.v[nodes] ** 2).sum(axis=1))
+    def _kinetic(self, where: Mask) -> float:
+        """Return the kinetic energy [J] of this rank's components ``where`` (owned, 3)."""
+        return 0.5 * float(self.lattice.mass @ (where * self.v**2).sum(axis=1))
 
     def _strike(self, begin: float, end: float) -> None:
         """Find the contact faces of a substep and reflect the nodes that strike an obstacle.
@@ -314,7 +315,7 @@ class Verlet(Integrator):
         """
         start = self.q - (end - begin) * self.v
         self.sides = self.environment.obstacles.contact_faces(
-            start, self.q, end, end - begin, self.sides, self.fixed
+            start, self.q, end, end - begin, self.sides, self.fixed.all(axis=1)
         )
         step = StepTaken(end, end - begin, self.sides)
         after, before, work = self.environment.obstacles.strike(self.q, start, step, self.fixed)
@@ -329,9 +330,14 @@ class Verlet(Integrator):
         anchors = len(self.environment.anchors.acting(time))
         if anchors != self.anchors:
             self.anchors = anchors
-            self.fixed = self.environment.anchors.fixed_at(time)[: self.lattice.owned]
-            self.free = np.flatnonzero(~self.fixed)
+            self._fix(self.environment.anchors.fixed_at(time)[: self.lattice.owned])
             self.highest.hold(self.fixed)
+
+    def _fix(self, fixed: Mask) -> None:
+        """Set the held components (owned, 3), the nodes that move, and their held components."""
+        pinned = fixed.all(axis=1)
+        self.fixed, self.free = fixed, np.flatnonzero(~pinned)
+        self.partly = components(fixed & ~pinned[:, None])
 
     def _contact_bound(self, start: float, time: float) -> float:
         """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
@@ -367,6 +373,12 @@ class Verlet(Integrator):
     def destroy(self) -> None:
         for field in (self.position, self.velocity, self.highest):
             field.destroy()
+
+
+def components(where: Mask) -> tuple[Indices, Indices]:
+    """Return the nodes (k,) and components (k,) of a mask (n, 3)."""
+    flat = np.flatnonzero(where)
+    return flat // 3, flat % 3
 
 
 @kernel

@@ -111,7 +111,7 @@ class CarriedStart:
     def _carry(self, contacts: Contacts, end: float) -> Positions:
         """Return the start at s = 1 by Newton's directions. Raises StepFailed."""
         functional, problem, begin = self.functional, self.functional.problem, contacts.begin
-        is_fixed, still = functional.lattice.pinned[:, None], np.zeros((1, 3))
+        is_fixed, still = functional.lattice.held, np.zeros((1, 3))
         q, s, gained = problem.q, 0.0, 1.0
         while gained > PROGRESS:
             begun = s

@@ -207,9 +207,8 @@ class StepFunctional:
         lattice, free = self.lattice, to_host(self.unknowns.free)
         numbers = lattice.global_numbers[: lattice.owned][free]
         seeds = lattice.table.total * np.arange(count)
-        return like(
-            self.mass, np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
-        )
+        noise = [uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds]
+        return self.unknowns.projected(like(self.mass, np.stack(noise)))
 
     def _inner(self, a: Rows, b: Rows) -> float:
         """Return a^T M b of this rank's (owned, 3); 0 in statics."""

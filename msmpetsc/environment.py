@@ -36,7 +36,7 @@ class Environment:
         self.lattice = model.lattice
         self.damping = model.damping
         self.retardation = model.retardation
-        self.forces = ActingForces(model.lattice, model.loads, model.own_forces)
+        self.forces = ActingForces(model.lattice, model.loads, model.own_forces, model.pressures)
         self.anchors = Anchors(model.lattice, model.anchors)
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]

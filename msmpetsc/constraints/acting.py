@@ -7,16 +7,24 @@ from itertools import compress
 import numpy as np
 
 from msmpetsc.backend.arrays import Mask, Positions, Rows, like, to_host
-from msmpetsc.constraints.loads import Anchor, Load, OwnForce
+from msmpetsc.constraints.loads import Anchor, Load, OwnForce, Pressure, Timed
+from msmpetsc.elasticity.pressure import Pressures
 from msmpetsc.lattice.lattice import Lattice
 
 
 class ActingForces:
     """External forces on the nodes of a rank. Local positions (l, 3) [m] include ghosts."""
 
-    def __init__(self, lattice: Lattice, loads: Sequence[Load], own_forces: Sequence[OwnForce]):
+    def __init__(
+        self,
+        lattice: Lattice,
+        loads: Sequence[Load],
+        own_forces: Sequence[OwnForce],
+        pressures: Sequence[Pressure] = (),
+    ):
         self.lattice, self.loads, self.own_forces = lattice, loads, own_forces
-        self.all: list[Load | OwnForce] = [*loads, *own_forces]
+        self.pressures = pressures
+        self.all: list[Timed] = [*loads, *own_forces, *pressures]
         self._own = [np.zeros((0, 3))] * len(own_forces)
         self._states_of_loads: list[bool | tuple[float, ...]] = []
         self._load = np.zeros((lattice.owned, 3), like=lattice.nodes)
@@ -53,6 +61,13 @@ class ActingForces:
             for load in compress(self.loads, states):
                 self._load += load.force_at(time)
         return self._load
+
+    def pressures_at(self, time: float) -> Pressures:
+        """Return the pressures at a time [s]."""
+        values = [
+            float(p.total.value_at(time)[0]) if p.acts_at(time) else 0.0 for p in self.pressures
+        ]
+        return Pressures([p.part for p in self.pressures], values)
 
     def beyond(self, time: float, end: float) -> Rows | None:
         """Return f(time) - f(end) (owned, 3) [N] of time-dependent forces that act at both times.

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import ForceFunction
+from msmpetsc.lattice.embedded_surface import SurfacePart
 from msmpetsc.scene.motion import ForceTable, Pose
 from msmpetsc.scene.values import Vector
 
@@ -97,11 +98,11 @@ class Motion(Lines):
         return (x - center) @ rotation.T + center + by
 
 
-def total_of(total: Vector | ForceTable) -> Lines:
-    """Return the total [N] of a scene's force over time; a constant force has a single time."""
+def total_of(total: Vector | ForceTable | float) -> Lines:
+    """Return a scene's load over time, [N] or [Pa]; a constant load has a single time."""
     if isinstance(total, ForceTable):
-        return Lines(np.array(total.times), np.array(total.values))
-    return Lines(np.zeros(1), np.array([total]))
+        return Lines(np.array(total.times), np.array(total.values).reshape(len(total.times), -1))
+    return Lines(np.zeros(1), np.array(total, ndmin=1)[None])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,19 +138,10 @@ class Anchor(Timed):
 
 
 @dataclass(frozen=True)
-class Load(Timed):
-    """A force on nodes, a share of a total. Gravity is the acceleration times the mass.
+class Varying(Timed):
+    """A load with a total over time."""
 
-    share : (owned, 1) share of each node in the total [-]; for gravity, its mass [kg]
-    total : total force [N]; for gravity, the acceleration [m/s^2]
-    """
-
-    share: Rows
     total: Lines
-
-    def force_at(self, time: float) -> Rows:
-        """Return the force (owned, 3) [N] on the nodes at a time [s]."""
-        return self.share * like(self.share, self.total.value_at(time))
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
         """Return the total at a time [s]; False if the force does not act."""
@@ -159,6 +151,29 @@ class Load(Timed):
     def events(self) -> list[float]:
         """Return the times [s] at which the force begins, ends or changes its slope."""
         return [*super().events, *self.total.times.tolist()]
+
+
+@dataclass(frozen=True)
+class Load(Varying):
+    """A force on nodes, a share of a total.
+
+    share : (owned, 1) share of each node in the total [-]; mass [kg] of gravity, area [m^2] of
+            tractions
+    total : total force [N]; the acceleration [m/s^2] of gravity, a traction [Pa]
+    """
+
+    share: Rows
+
+    def force_at(self, time: float) -> Rows:
+        """Return the force (owned, 3) [N] on the nodes at a time [s]."""
+        return self.share * like(self.share, self.total.value_at(time))
+
+
+@dataclass(frozen=True)
+class Pressure(Varying):
+    """A pressure [Pa] on a part of the surface, positive if it pushes into the body."""
+
+    part: SurfacePart
 
 
 @dataclass(frozen=True)

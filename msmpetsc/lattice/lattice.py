@@ -6,6 +6,7 @@ ends. Global node numbers follow Morton order, so they do not depend on the numb
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -43,6 +44,7 @@ class Lattice:
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
     solid       : constants of a neo-Hookean solid; None if the law is springs
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
+    pressed     : surfaces under pressure (lattice.embedded_surface.SurfacePart)
     """
 
     table: SortedKeys
@@ -64,6 +66,7 @@ class Lattice:
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
     solid: SolidCells | None = None
     viscous: float = 0.0
+    pressed: tuple[Any, ...] = ()
 
     @property
     def owned(self) -> int:

@@ -120,10 +120,10 @@ class ForceTable(Table):
     """A force that is piecewise linear in time, and constant before and after the table."""
 
     times: ListOf[NotNegative] = Field(description="ascending times [s]")
-    values: ListOf[Vector] = Field(description="total force at each time [N]")
+    values: ListOf[Vector] = Field(description="force [N] or traction [Pa] at each time")
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "ForceTable":
+    def _fits_together(self) -> Self:
         if any(a >= b for a, b in pairwise(self.times)):
             raise rule("must have ascending times")
         if not self.times or len(self.times) != len(self.values):
@@ -131,6 +131,12 @@ class ForceTable(Table):
                 f"has {len(self.times)} times and {len(self.values)} values: one value a time"
             )
         return self
+
+
+class PressureTable(ForceTable):
+    """A pressure that is piecewise linear in time, and constant before and after the table."""
+
+    values: ListOf[float] = Field(description="pressure at each time [Pa]")  # type: ignore[assignment]
 
 
 # a tagged union: a plain union would report the problems of both alternatives
@@ -169,6 +175,49 @@ class Force(Table):
             return True
         values = self.total.values if isinstance(self.total, ForceTable) else (self.total,)
         return any(map(any, values))
+
+
+class SurfaceLoad(Table):
+    """A load on the surface triangles of a region, by their centroids."""
+
+    region: Region = Field(
+        description="the triangles of the surface that the load acts on, by their centroids or by "
+        "their group"
+    )
+    start: float = Field(0.0, description="time from which the load acts [s]")
+    stop: float | None = Field(
+        None, description="time until which the load acts [s]; to the end if absent"
+    )
+
+    _after_start = field_validator("stop")(after_start)
+
+    @field_validator("region")
+    @classmethod
+    def _has_triangles(cls, region: Region) -> Region:
+        if region.painted is not None:
+            raise rule("must be a box, sphere, half_space or group: points choose no triangles")
+        return region
+
+
+class Traction(SurfaceLoad):
+    """A dead load: a force on each area of the surface at rest, of constant direction."""
+
+    value: Total = Field(
+        description="traction: a constant vector, or { times = [s], values = [Pa] }, interpolated "
+        "linearly [Pa]"
+    )
+
+
+class Pressure(SurfaceLoad):
+    """A pressure that follows the surface. The surface must be closed, or its edge be held."""
+
+    value: Annotated[
+        Annotated[float, Tag(TAGS[0])] | Annotated[PressureTable, Tag(TAGS[1])],
+        Discriminator(lambda value: TAGS[isinstance(value, dict | PressureTable)]),
+    ] = Field(
+        description="pressure, positive if it pushes into the body: a number, or "
+        "{ times = [s], values = [Pa] }, interpolated linearly [Pa]"
+    )
 
 
 class AnchorTable(Holder):

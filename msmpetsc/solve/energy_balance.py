@@ -116,7 +116,8 @@ class EnergyBalance:
             0.5 * np.vdot(momenta * free, v),
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
-            -np.vdot(environment.forces.given(time), at),
+            environment.forces.pressures_at(time).change(q, lattice.nodes)
+            - np.vdot(environment.forces.given(time), at),
             *(lattice.mass @ v),
         )
         return Energies(
@@ -283,6 +284,9 @@ class EnergyBalance:
         shift, drift = like(lattice.nodes, along), like(lattice.nodes, along / time_step)
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
+        # Explicit steps count the work of pressures themselves.
+        pressures = environment.forces.pressures_at(time)
+        pressed = 0.0 if result.explicit else pressures.change(result.position, q)
         sums = self._sums(
             0.5 * np.vdot(lattice.mass[:, None] * free * (v - drift), v - drift),
             0.0 if known else self.elasticity.energy(q),
@@ -292,6 +296,7 @@ class EnergyBalance:
                 (q[owned], sides), ended, time, time_step, along
             )
             + result.viscous_work
+            - pressed
             + (surface.of_obstacles(result.position, along)[1] / self.comm.size if surface else 0.0)
             + (pressing.released(result.position) if pressing else 0.0),
             result.work,

@@ -20,7 +20,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Positions, Rows, to_host
+from msmpetsc.backend.arrays import Mask, Positions, Rows, to_host
 from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
@@ -266,19 +266,31 @@ class Static(ImplicitEuler):
         return result, path
 
 
+def _rigid_rank(unknowns: Unknowns, held: Mask) -> int:
+    """Return how many rigid motions the few held components (owned, 3) prevent (collective)."""
+    lattice = unknowns.lattice
+    node, component = np.nonzero(held)
+    x = to_host(lattice.nodes)[node] / lattice.cell_size
+    # rotations about each axis, along the component
+    turns = np.cross(np.eye(3), x[:, None])[np.arange(len(node)), :, component]
+    rows = np.concatenate(unknowns.comm.allgather(np.hstack([np.eye(3)[component], turns])))
+    return int(np.linalg.matrix_rank(rows))
+
+
 def refuse_free_bodies(unknowns: Unknowns) -> None:
     """Raise InputError if a body is free to move or too little of it is held (collective).
 
-    A part that no spring joins with the rest counts as a body. Two nodes hold six components.
+    A part that no spring joins with the rest counts as a body.
     """
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
     support = "held at a point or two, about which it turns"
     free = bodies.free.any(axis=1)
-    held = unknowns.comm.allreduce(int(lattice.held[: lattice.owned].sum()))
+    held = to_host(lattice.held[: lattice.owned])
+    count = unknowns.comm.allreduce(int(held.sum()))
     if free.any():
         along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
         support = f"held by nothing along {', '.join(along)}"
-    elif held > 6:
+    elif count > 6 or _rigid_rank(unknowns, held) == 6:
         return
     subject = "the body"
     if len(bodies.free) > 1:

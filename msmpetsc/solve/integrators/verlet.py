@@ -232,7 +232,7 @@ class Verlet(Integrator):
 
     def _squared_acceleration(self, time: float) -> float:
         """Return |M^(-1) (f_ext - grad E)|_M^2 [J/s^2] of this rank's free nodes."""
-        force = self.environment.forces.at(time) - self.gradient[: self.lattice.owned]
+        force = self._load(time) - self.gradient[: self.lattice.owned]
         return float(self.per_mass @ (~self.fixed * force**2).sum(axis=1))
 
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
@@ -266,17 +266,28 @@ class Verlet(Integrator):
         kept = self.v[self.partly]
         self._damp(0.5 * duration)
         beyond = self.environment.forces.beyond(time, self.end)
-        load = self.environment.forces.at(time)
-        before = None if beyond is None else self.v.copy()
+        load = self._load(time)
+        pressed = load - self.environment.forces.at(time) if self.lattice.pressed else None
+        before = self.v.copy()
         kick(len(self.free), load, duration, self._movers())
         # A kick by f changes the kinetic energy by duration f . (v- + v+) / 2.
-        if beyond is not None and before is not None:
-            self.work += 0.5 * duration * float(np.vdot(beyond * ~self.fixed, before + self.v))
+        for force in (beyond, pressed):
+            if force is not None:
+                self.work += 0.5 * duration * float(np.vdot(force * ~self.fixed, before + self.v))
         self._damp(0.5 * duration)
         if self.contact:
             self.work += duration * self.contact.power(begin, end)
             self.contact.apply_friction(self._movers(), duration, begin, end)
         self.v[self.partly] = kept
+
+    def _load(self, time: float) -> Rows:
+        """Return the force (owned, 3) [N] of loads and pressures at a time [s] (collective)."""
+        load = self.environment.forces.at(time)
+        if not self.lattice.pressed:
+            return load
+        load = -load
+        self.environment.forces.pressures_at(time).add_gradient(self.position.values, load)
+        return -load
 
     def _movers(self) -> Movers:
         return Movers(self.v, self.free, self.per_mass, self.gradient)

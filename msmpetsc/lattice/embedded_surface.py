@@ -14,6 +14,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import Route, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.geometry.surface import Surface, compact, first_of_equal, joined
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder, groups_named
@@ -192,7 +193,17 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
             f"{table.key}.region holds the centre of no triangle of the surface"
             f"{finder.extents(table)}"
         )
-    points = [surface.points for surface in surfaces]
+    points, grids = [surface.points for surface in surfaces], finder.cages.grids
+    keys = [
+        encode_morton(np.floor(grid.to_cells(x)).astype(np.int64).clip(0) + grids.first(number))
+        for number, (grid, x) in enumerate(zip(grids.grids, points, strict=True))
+    ]
+    missing = finder.cages.table.find(np.concatenate(keys)) < 0
+    if comm.allreduce(int(missing.sum())):
+        raise InputError(
+            f"{table.key}.region: its triangles leave the cells: mesh.prepare has changed the "
+            "surface, but not the group; give a box, a sphere or a half_space"
+        )
     return SurfacePart(
         comm,
         lattice,

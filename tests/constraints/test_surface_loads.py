@@ -230,3 +230,23 @@ def test_bad_input_is_one_line(tmp_path: Path, kind: str, table: dict, message: 
         **{kind: [table | {"region": region}]},
     )  # fmt: skip
     assert message in command_error("run", scene)
+
+
+def test_a_group_has_its_own_triangles(tmp_path: Path):
+    """The group of an OBJ is the end of a block."""
+    box = trimesh.creation.box(bounds=[[0, 0, 0], SIDES])
+    is_end = np.isclose(box.triangles_center[:, 0], SIDES[0])
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices]
+    for name, where in (("rest", ~is_end), ("end", is_end)):
+        lines += [f"g {name}", *(f"f {a} {b} {c}" for a, b, c in 1 + box.faces[where])]
+    (tmp_path / "grouped.obj").write_text("\n".join(lines))
+    scene = block_scene(
+        tmp_path, mesh={"source": "grouped.obj"}, material=SOLID, pin=CORNER, time=STATIC,
+        traction=[{"region": {"group": "end"}, "value": [10, 0, 0]}],
+    )  # fmt: skip
+    model, frames = play(scene)
+    np.testing.assert_allclose(frames[-1].surface_load, [[10 * 0.125, 0, 0]], rtol=1e-12)
+    ends = model.lattice.nodes[model.loads[-1].share[:, 0] > 1e-12]
+    assert (ends[:, 0] == SIDES[0]).all()
+    message = "traction.0.region.group: the mesh has no group 'and'"
+    assert message in command_error("run", scene, "--set", 'traction.0.region.group="and"')

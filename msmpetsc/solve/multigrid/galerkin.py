@@ -6,6 +6,7 @@ weights (8,) of the cell's corners at end a of a spring, or 0 if the end is pinn
 
 - a spring with block B: (w_a - w_b)(w_a - w_b)^T (x) t^2 B
 - a node of mass m with contact block C: w w^T (x) (m I + t^2 C)
+- a held component of a node that is held in part: a spring to the ground, HELD as stiff as the node
 - a solid cell: its Hessian in the strains of the coarse corners (elasticity.neo_hookean)
 """
 
@@ -42,6 +43,9 @@ from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 PINNED = 27
 # the upper triangle in a 3 x 3 block, and the diagonal in the upper triangle
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
+# stiffness of the spring that holds a component on coarse levels, over its node's [-];
+# the coarse matrix must not be much softer than the components that move
+HELD = 100.0
 # entries of a row of ``_write_coarse`` [-]
 COARSE = 41
 # pairs (36, 2) of corners: the upper triangle of a cell's matrix
@@ -144,6 +148,7 @@ class GalerkinSum:
 
     ijk     : (l, 3) grid index of each local node
     offsets : (l,) offset of each node's body along the first axis (free_bodies.Bodies.offsets)
+    stiff   : (owned,) stiffness of each node at rest [N/m]
     matrix  : AIJ of block size 3; it has values after the first ``update``
     """
 
@@ -155,6 +160,7 @@ class GalerkinSum:
         grid: CoarseGrid,
         ijk: Indices,
         offsets: Indices,
+        stiff: Floats,
     ):
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
@@ -165,6 +171,12 @@ class GalerkinSum:
             Products(*(like(lattice.nodes, part) for part in products))
             for products in (of_springs, OF_NODES)
         )
+        # Matrix of single nodes [kg] without contact
+        self.own = np.zeros((lattice.owned, 6), like=lattice.nodes)
+        self.own[:, DIAGONAL] = unknowns.ballast[:, None]
+        rollers = lattice.rollers[lattice.rollers < 3 * lattice.owned]
+        node, component = rollers // 3, like(rollers, np.array(DIAGONAL))[rollers % 3]
+        self.own[node, component] += HELD * t2 * stiff[node]
         first, second, places = self._pairs(grid, keys)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)
@@ -216,10 +228,7 @@ class GalerkinSum:
         if self.elasticity.springs:
             of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
             add_springs(count, q, of_springs, self.elasticity.springs.owned)
-        own = np.zeros((self.unknowns.lattice.owned, 6), like=q)
-        own[:, DIAGONAL] = self.unknowns.ballast[:, None]
-        if len(contact):
-            own += self.t2 * contact[:, UPPER]
+        own = self.own + self.t2 * contact[:, UPPER] if len(contact) else self.own
         add_nodes(count, own, PairSum(symmetric, self.places, self.nodes, self.of_nodes))
         into = CellSum(symmetric[:, self.full], self.places, self.cells, self.weights)
         scratch = np.empty((1 if on_host(q) else count, 8, COARSE), like=q)

@@ -44,7 +44,7 @@ from msmpetsc.geometry.surface import (
     examine,
     joined,
 )
-from msmpetsc.lattice.embedded_surface import refuse_open, surface_part
+from msmpetsc.lattice.embedded_surface import surface_part
 from msmpetsc.lattice.initial_state import InitialState, ReadState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
@@ -407,7 +407,7 @@ def _surface_loads(
 ) -> tuple[list[Load], list[Pressure]]:
     """Return the tractions and the pressures (collective).
 
-    Raises InputError for a region without triangles, or a pressure on an open surface.
+    Raises InputError for a region without triangles, or a pressure without a potential.
     """
     tractions, pressures = [], []
     for table in surface_loads(scene):
@@ -416,7 +416,6 @@ def _surface_loads(
         if isinstance(load, Traction):
             tractions.append(Load(share=part.areas(), **acts))
         else:
-            refuse_open(table, part, lattice)
             pressures.append(Pressure(part=part, **acts))
     return tractions, pressures
 

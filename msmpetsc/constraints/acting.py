@@ -63,13 +63,16 @@ class ActingForces:
                 q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time)
             )
 
-    def at(self, time: float) -> ExternalForces:
-        """Return the external forces at a time [s]."""
-        return self._all(lambda load: load.state_at(time))
+    def at(self, time: float, users: bool = True) -> ExternalForces:
+        """Return the external forces at a time [s].
+
+        users : whether with the users' functions, the part without a potential
+        """
+        return self._with(lambda load: load.state_at(time), users)
 
     def mean(self, begin: float, end: float) -> ExternalForces:
         """Return the means of the external forces from begin to end [s]."""
-        return self._all(lambda load: load.mean(begin, end))
+        return self._with(lambda load: load.mean(begin, end))
 
     def ahead(self, before: float, begin: float, end: float) -> ExternalForces:
         """Return (3 f - f') / 2 with the means f from begin to end, f' from before to begin [s]."""
@@ -78,23 +81,10 @@ class ActingForces:
             mean = load.mean(begin, end)
             return mean + 0.5 * (mean - load.mean(before, begin))
 
-        return self._all(total)
+        return self._with(total)
 
-    def given(self, time: float) -> ExternalForces:
-        """Return the external forces without the users' functions: the part with a potential."""
-        return self._given(lambda load: load.state_at(time))
-
-    def _all(self, total: Callable[[Varying], Floats]) -> ExternalForces:
+    def _with(self, total: Callable[[Varying], Floats], users: bool = True) -> ExternalForces:
         """Return the external forces with these totals of each load."""
-        given = self._given(total)
-        force = given.force
-        for load, own in zip(self.own_forces, self._own, strict=True):
-            share = float(total(load)[0])
-            if share and len(own):
-                force = force + share * own
-        return given._replace(force=force)
-
-    def _given(self, total: Callable[[Varying], Floats]) -> ExternalForces:
         totals = [tuple(total(load).tolist()) for load in self.loads]
         if totals != self._totals:
             self._totals = totals
@@ -102,8 +92,13 @@ class ActingForces:
             for load, vector in zip(self.loads, totals, strict=True):
                 if any(vector):
                     self._load += load.share * like(load.share, np.array(vector))
+        force = self._load
+        for function, own in zip(self.own_forces, self._own, strict=True):
+            share = float(total(function)[0])
+            if users and share and len(own):
+                force = force + share * own
         values = [float(total(pressure)[0]) for pressure in self.pressures]
-        return ExternalForces(self._load, Pressures([p.part for p in self.pressures], values))
+        return ExternalForces(force, Pressures([p.part for p in self.pressures], values))
 
 
 class Anchors:

@@ -16,7 +16,7 @@ reactions + loads + pushes = sum of m a.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain
@@ -72,34 +72,28 @@ class Holders:
 
     def totals(self, forces: Rows) -> Rows:
         """Return the sum (a, 3) of ``forces`` (owned, 3) over each holder's nodes on this rank."""
-        return np.array([to_host(part.sum(axis=0)) for part in self._parts(forces)])
+        return sums_by(self.number, forces, len(self.keys))
 
     def torques(self, q: Positions, forces: Rows, points: Positions) -> Rows:
         """Return the torque (a, 3) [N m] of ``forces`` (owned, 3) on each holder's owned nodes.
 
         points : (a, 3) reference point of each holder [m]
         """
-        return np.array(
-            [
-                to_host(np.cross(q - like(q, point), part).sum(axis=0))
-                for point, part in zip(points, self._parts(forces), strict=True)
-            ]
-        )
-
-    def _parts(self, forces: Rows) -> Iterator[Rows]:
-        """Yield the components of ``forces`` (owned, 3) that each holder takes."""
-        for holder in range(len(self.keys)):
-            yield np.where(self.number == holder, forces, 0.0)
+        torques = np.zeros((len(self.keys), 3))
+        for holder, point in enumerate(points):
+            taken = np.where(self.number == holder, forces, 0.0)
+            torques[holder] = to_host(np.cross(q - like(q, point), taken).sum(axis=0))
+        return torques
 
 
 def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
     """Return the sum (count, k) of vectors (n, k) for each number below count.
 
-    number : (n,) number of each vector, on the same device
+    number : (n, 1) number of each vector, or (n, k) of its components, on the same device
     """
     sums = np.zeros((count, vectors.shape[1]))
     for which in range(count):
-        sums[which] = to_host(vectors[number == which].sum(axis=0))
+        sums[which] = to_host(np.where(number == which, vectors, 0.0).sum(axis=0))
     return sums
 
 

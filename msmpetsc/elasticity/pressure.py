@@ -32,7 +32,7 @@ class Pressures:
             start, way = part(base), part(q - base)
             ends = doubled_areas(start) + doubled_areas(start + way)
             mean = (ends + 4 * doubled_areas(start + 0.5 * way)) / 6
-            change += pressure / 6 * float(np.vdot(mean, way.sum(axis=1)))
+            change += pressure / 6 * float(np.vdot(mean, way.sum(axis=0)))
         return change
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
@@ -47,10 +47,8 @@ class Pressures:
         corners = [(part, pressure, part(q)) for part, pressure in self._acting()]
 
         def add_product(v: Array, product: Array) -> None:
-            for part, pressure, (a, b, c) in (
-                (part, pressure, at.transpose(1, 0, 2)) for part, pressure, at in corners
-            ):
-                u, w, x = part(v).transpose(1, 0, 2)
+            for part, pressure, (a, b, c) in corners:
+                u, w, x = part(v)
                 turned = np.cross(w - u, c - a) + np.cross(b - a, x - u)
                 _add(part, pressure / 6 * turned, product)
 
@@ -64,10 +62,9 @@ class Pressures:
         """
         for part, pressure in self._acting():
             at = part(q)
-            edges = np.linalg.norm(np.roll(at, -1, axis=1) - np.roll(at, 1, axis=1), axis=2)
-            rows = 3 * edges + edges.sum(axis=1)[:, None]
-            bounds = part.bounds(abs(pressure) / 12 * rows)
-            concavity[: len(bounds)] += bounds
+            edges = np.linalg.norm(np.roll(at, -1, axis=0) - np.roll(at, 1, axis=0), axis=2)
+            rows = 3 * edges + edges.sum(axis=0)
+            _add(part, abs(pressure) / 12 * rows[:, :, None], concavity[:, None])
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add nothing: multigrid leaves pressure out."""
@@ -83,6 +80,6 @@ class Pressures:
 
 
 def _add(part: SurfacePart, forces: Rows, rows: Rows) -> None:
-    """Add the forces (f, 3) on each corner of triangles to the owned rows of ``rows`` (l, 3)."""
-    of_nodes = part.to_nodes(np.repeat(forces[:, None], 3, axis=1))
+    """Add forces (f, k) on each corner, or (3, f, k), to the owned rows of ``rows`` (l, k)."""
+    of_nodes = part.to_nodes(forces)
     rows[: len(of_nodes)] += of_nodes

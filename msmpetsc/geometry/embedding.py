@@ -42,7 +42,7 @@ def embed(
     nodes  : node numbers of the lattice by grid key
     kind, smoothing : see ``stencil_weights``
 
-    Raises ValueError if a point lies in no valid cell.
+    Raises ValueError on all ranks if a point lies in no valid cell.
     """
     comm = cages.table.comm
     total = comm.allreduce(sum(map(len, points)))
@@ -50,6 +50,8 @@ def embed(
     cell_keys, cell = np.unique(encode_morton(ijk), return_inverse=True)
     around = decode_morton(cell_keys)[:, None, :]
     neighbours = cages.table.find(encode_morton(around + CELLS_AROUND)) >= 0
+    if not all(comm.allgather(bool(neighbours[:, MIDDLE].all()))):
+        raise ValueError("a point lies in a cell that is not valid")
     numbers = nodes.find(encode_morton(around + NODES_AROUND))
 
     def entries(part: slice) -> tuple[Indices, Indices, Floats]:

@@ -107,9 +107,9 @@ class Lattice:
         return pinned
 
     @cached_property
-    def rollers(self) -> Indices:
-        """Index 3 n + c (h,) of each held component c of a node n that is held in part."""
-        return np.flatnonzero(self.held & ~self.pinned[:, None])
+    def rollers(self) -> tuple[Indices, ...]:
+        """Nodes (h,) and components (h,) that are held of nodes that are held in part."""
+        return np.nonzero(self.held & ~self.pinned[:, None])
 
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes (l,) or components (l, 3) ``where`` held, too."""

@@ -109,7 +109,7 @@ class EnergyBalance:
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
         at, v = q[owned], v[owned]
-        contact, given = environment.obstacles.push(time, sides), environment.forces.given(time)
+        contact, given = environment.obstacles.push(time, sides), environment.forces.at(time, False)
         momenta = lattice.mass[:, None] * v
         free = ~environment.anchors.fixed_at(time)[owned]
         sums = self._sums(

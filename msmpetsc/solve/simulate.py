@@ -121,11 +121,8 @@ class TimeLoop:
             take = self.adaptive.advance
         self.recovery = Recovery(scene, self._make, self.balance, take)
         self.monitors, self.true_errors = Monitors(self.environment, self.time_step), TrueErrors()
-        self.surface = (
-            None
-            if model.embedding is None
-            else EmbeddedPoints(comm, model.lattice, model.embedding)
-        )
+        w = model.embedding
+        self.surface = None if w is None else EmbeddedPoints(comm, model.lattice, w)
         self.forces = Forces(model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
@@ -335,13 +332,13 @@ class Forces:
         self.keys = [obstacle.key for obstacle in model.obstacles]
         bodies = len(model.lattice.first_of_body) if model.collision else 0
         holders = len(model.holders.keys)
-        self.tractions = model.tractions
+        self.tractions = model.loads[len(model.loads) - model.tractions :]
         rows = {
             "reaction": holders,
             "torque": holders,
             "push": len(model.obstacles),
             "contact_push": bodies,
-            "surface_load": self.tractions + len(model.pressures),
+            "surface_load": model.tractions + len(model.pressures),
         }
         self.rows = {name: count for name, count in rows.items() if count}
 
@@ -362,9 +359,8 @@ class Forces:
         load = loads.at(q)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "surface_load" in self.rows:
-            sums["surface_load"] = np.concatenate(
-                [self._tractions(time), loads.pressures.resultants(q)], axis=0
-            )
+            dead = [float(load.share.sum()) * load.state_at(time) for load in self.tractions]
+            sums["surface_load"] = np.array([*dead, *loads.pressures.resultants(q)])
         if "reaction" in self.rows:
             fixed = environment.anchors.fixed_at(time)[:owned]
             held = (self._holding_forces(q, contact, step) - load) * fixed
@@ -375,12 +371,6 @@ class Forces:
             for name in sums
             if name == "load" or name in self.rows
         }
-
-    def _tractions(self, time: float) -> Rows:
-        """Return the force (t, 3) [N] of each traction on this rank's nodes at a time [s]."""
-        loads = self.model.loads[len(self.model.loads) - self.tractions :]
-        acting = [float(load.share.sum()) * load.state_at(time) for load in loads]
-        return np.array(acting).reshape(-1, 3)
 
     def _torque_points(self, time: float) -> Positions:
         """Return the reference points (a, 3) [m] of the torques of pins and anchors."""
@@ -423,5 +413,5 @@ class Forces:
             push[contact.surface.contacts.obstacles.numbers] += obstacles / self.comm.size
             own = np.zeros_like(q[:owned])
             contact.surface.add_gradient(q, own)
-            touching -= sums_by(lattice.body[:owned], own, bodies)
+            touching -= sums_by(lattice.body[:owned, None], own, bodies)
         return {"push": push, "contact_push": touching}

@@ -103,7 +103,7 @@ def test_a_closed_pressure_has_the_potential_p_times_volume(tmp_path: Path):
     base, q = (rest + 0.02 * rng.standard_normal(rest.shape) for _ in range(2))
 
     def volume(at: np.ndarray) -> float:
-        a, b, c = part(at).transpose(1, 0, 2)
+        a, b, c = part(at)
         return (np.cross(a, b) * c).sum() / 6
 
     assert volume(rest) == pytest.approx(VOLUME, rel=1e-12)
@@ -144,6 +144,20 @@ def test_a_free_body_under_pressure_stays_and_keeps_its_energy(tmp_path: Path, i
     if integrator == "verlet":
         assert np.abs(total).max() < 2e-2 * pressed
     assert sum(f.energy_gained for f in frames) < 2e-3 * pressed
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_a_step_takes_the_mean_of_a_pressure(tmp_path: Path, integrator: str):
+    """In the last half of the step, the ramp from 0 to 6e3 Pa: a quarter of 6e3 Pa over all."""
+    time = {"step": 0.01, "duration": 0.01, "integrator": integrator}
+    ramp = {"value": {"times": [0.005, 0.01], "values": [0, 6e3]}, "start": 0.005}
+    (_, ramped), (_, constant) = (
+        play(pressed_block(tmp_path, time=time, pressure=[{"region": ALL} | load]))
+        for load in (ramp, {"value": 1.5e3})
+    )
+    size = np.abs(constant[-1].position - constant[0].position).max()
+    np.testing.assert_allclose(ramped[-1].position, constant[-1].position, atol=1e-7 * size)
+    assert size > 1e-4
 
 
 def test_a_half_takes_the_pressure_of_the_whole(tmp_path: Path):

@@ -108,14 +108,8 @@ class ContactFaces:
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
         prescribed = environment.anchors.prescribed(self.q, time)
-        return StepProblem(
-            self.q,
-            self.y,
-            self.load.force,
-            self.contact,
-            prescribed,
-            pressures=self.load.pressures.values,
-        )
+        load, pressures = self.load.force, self.load.pressures.values
+        return StepProblem(self.q, self.y, load, self.contact, prescribed, None, pressures)
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the result of ``step`` with settled contacts. Raises StepFailed."""

@@ -25,7 +25,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest
+from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -295,7 +295,7 @@ class Verlet(Integrator):
         if prescribed is not None:
             owned = self.lattice.owned
             moved = self.fixed & ~self.lattice.held[:owned]
-            anchored = components(moved)
+            anchored = np.nonzero(moved)
             freed = moved & ~self.environment.anchors.fixed_at(self.end)[:owned]
             self.work -= self._kinetic(freed)
             self.v[anchored] = (prescribed[:owned] - self.q)[anchored] / (end - begin)
@@ -338,7 +338,7 @@ class Verlet(Integrator):
         """Set the held components (owned, 3), the nodes that move, and their held components."""
         pinned = fixed.all(axis=1)
         self.fixed, self.free = fixed, np.flatnonzero(~pinned)
-        self.partly = components(fixed & ~pinned[:, None])
+        self.partly = np.nonzero(fixed & ~pinned[:, None])
 
     def _contact_bound(self, start: float, time: float) -> float:
         """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
@@ -374,12 +374,6 @@ class Verlet(Integrator):
     def destroy(self) -> None:
         for field in (self.position, self.velocity, self.highest):
             field.destroy()
-
-
-def components(where: Mask) -> tuple[Indices, Indices]:
-    """Return the nodes (k,) and components (k,) of a mask (n, 3)."""
-    flat = np.flatnonzero(where)
-    return flat // 3, flat % 3
 
 
 @kernel

@@ -56,12 +56,11 @@ class Unknowns:
         first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]
         self.total = comm.allreduce(self.size)
         refuse_unknowns(self.total)
-        rollers = lattice.rollers
-        self.is_held = self.total < lattice.table.total or comm.allreduce(len(rollers)) > 0
-        self.held = rollers // 3, rollers % 3
+        self.held = lattice.rollers
+        self.is_held = self.total < lattice.table.total or comm.allreduce(len(self.held[0])) > 0
         own = np.full(lattice.owned, -1, np.int64)
         own[to_host(self.free)] = first + np.arange(self.size)
-        node, component = np.divmod(to_host(rollers[rollers < 3 * lattice.owned]), 3)
+        node, component = (to_host(rows[self.held[0] < lattice.owned]) for rows in self.held)
         self._held_rows = like(self.free, component * self.size + own[node] - first)
         self.numbers = lattice.table.with_ghosts(lattice.ghosts, own)
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)

@@ -62,7 +62,7 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
     held = np.zeros((table.total, 3), bool)
     ends = springs[either & ~both]
     held[number[ends[moves[ends]]]] = True
-    node, component = np.divmod(to_host(lattice.rollers), 3)
+    node, component = map(to_host, lattice.rollers)
     held[number[node], component] = True
     comm.Allreduce(MPI.IN_PLACE, held, MPI.LOR)
     return Bodies(number, ~held)

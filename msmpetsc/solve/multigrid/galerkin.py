@@ -174,9 +174,8 @@ class GalerkinSum:
         # Matrix of single nodes [kg] without contact
         self.own = np.zeros((lattice.owned, 6), like=lattice.nodes)
         self.own[:, DIAGONAL] = unknowns.ballast[:, None]
-        rollers = lattice.rollers[lattice.rollers < 3 * lattice.owned]
-        node, component = rollers // 3, like(rollers, np.array(DIAGONAL))[rollers % 3]
-        self.own[node, component] += HELD * t2 * stiff[node]
+        node, component = (rows[lattice.rollers[0] < lattice.owned] for rows in lattice.rollers)
+        self.own[node, like(node, np.array(DIAGONAL))[component]] += HELD * t2 * stiff[node]
         first, second, places = self._pairs(grid, keys)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)

@@ -325,7 +325,7 @@ IN_A_BODY = [
     ("body.1.mesh.source=../bar.ply", "is not in the scene's folder"),
     (
         'time={ step = 0.01, duration = 1, integrator = "static" }',
-        "body: body.0.start may have no velocity or spin",
+        "body: body.0.start may have no velocity, spin",
     ),
 ]
 

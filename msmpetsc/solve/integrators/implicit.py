@@ -104,7 +104,8 @@ class ContactFaces:
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
         prescribed = environment.anchors.prescribed(self.q, time)
-        return StepProblem(self.q, self.y, environment.forces.at(time), self.contact, prescribed)
+        load, watch = environment.forces.at(time), environment.watch
+        return StepProblem(self.q, self.y, load, self.contact, prescribed, watch=watch)
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the result of ``step`` with settled contacts. Raises StepFailed."""

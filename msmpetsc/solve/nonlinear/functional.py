@@ -7,7 +7,9 @@ Implicit Euler has y = 2 q_n - q_(n-1) (paper Eq. 10-12).
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -47,6 +49,7 @@ class StepProblem:
     prescribed : q_n with anchored nodes where they are after the step (l, 3) [m]; None if they stay
     rates      : two positions (l, 3) [m] whose difference gives the strain rates of a viscous solid
                  (elasticity.viscosity.Viscosity.begin)
+    watch      : called with the first iterate of a solve and its Jacobian; None for no call
     """
 
     q: Positions
@@ -55,6 +58,7 @@ class StepProblem:
     contact: Contact | None = None
     prescribed: Positions | None = None
     rates: tuple[Positions, Positions] | None = None
+    watch: Callable[[Any, Any], None] | None = None
 
     @property
     def fixed(self) -> Positions:

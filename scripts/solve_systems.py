@@ -3,8 +3,7 @@
 
     scripts/solve_systems.py out/systems/*/step_1 --options "-pc_type gamg" "-pc_type hypre"
 
-A solve is CG from 0 to |F - H y| = 1e-8 |F|, unless its options say otherwise. BDDC needs mpiexec
-with the ranks of the export. `-o FOLDER` writes the table and the report of a study.
+CG ends at |F - H y| = 1e-8 |F|. BDDC needs mpiexec with the ranks of the export.
 """
 
 import json
@@ -19,6 +18,7 @@ from petsc4py import PETSc
 from msmpetsc.study.report import write_report
 from msmpetsc.study.table import write_table
 
+COLUMNS, ENDS = ("ksp_its", "time_setup", "time_frame", "status", "distance"), ("failed", "ok")
 USUAL = "-ksp_type cg -ksp_rtol 1e-8 -ksp_norm_type unpreconditioned -ksp_max_it 5000 "
 
 
@@ -34,50 +34,41 @@ def solve(folder, options):
     if "bddc" in options:
         own = folder / f"subdomain_{PETSc.COMM_WORLD.rank}.bin"
         part, rows = read(own, PETSc.Mat(), PETSc.IS(), comm=PETSc.COMM_SELF)
-        numbers = PETSc.LGMap().create(rows.indices)
-        matrix = PETSc.Mat().createIS(matrix.getSizes(), numbers, numbers)
+        matrix = PETSc.Mat().createIS(matrix.getSizes(), *[PETSc.LGMap().create(rows.indices)] * 2)
         matrix.setISLocalMat(part)
         matrix.assemble()
     f, exact = (read(folder / f"{n}.bin", PETSc.Vec())[0] for n in ("residual", "correction"))
     modes = read(folder / "rigid_modes.bin", *(PETSc.Vec() for _ in range(6)))
     matrix.setNearNullSpace(PETSc.NullSpace().create(vectors=modes))
-    ksp, y, begun = PETSc.KSP().create(), exact.duplicate(), perf_counter()
+    ksp, y, times = PETSc.KSP().create(), exact.duplicate(), [perf_counter()]
     ksp.setOperators(matrix)
     ksp.setFromOptions()
-    ksp.setUp()
-    ready = perf_counter()
-    ksp.solve(f, y)
-    times = ready - begun, perf_counter() - ready
+    for work in (ksp.setUp, lambda: ksp.solve(f, y)):
+        times.append(work() or perf_counter())
     PETSc.Options().clear()
-    return ksp.its, *times, ksp.reason > 0, (y - exact).norm() / exact.norm()
+    figures = ksp.its, times[1] - times[0], times[2] - times[1], ksp.reason > 0
+    return *figures, (y - exact).norm() / exact.norm()
 
 
 def main():
-    parser, table = (
-        ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter),
-        [],
-    )
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, metavar="DIR/step_N")
     parser.add_argument("--options", nargs="+", default=[], help="a string for each solver")
-    parser.add_argument("-o", "--output", type=Path)
-    args, names = (
-        parser.parse_args(),
-        ("ksp_its", "time_setup", "time_frame", "status", "distance"),
-    )
+    parser.add_argument("-o", "--output", type=Path, help="folder of a study's table and report")
+    args, rows, is_root = parser.parse_args(), [], PETSc.COMM_WORLD.rank == 0
     for folder in args.folders:
+        if not (folder / "system.json").is_file():
+            parser.error(f"{folder} is no folder step_N of --export")
         ours = json.loads((folder / "system.json").read_text())["multigrid"]
-        found = {"our multigrid": [*ours.values(), 0.0]} | {
-            o: solve(folder, o) for o in args.options
-        }
-        for label, values in found.items():
-            table.append(
-                {"scene": f"{folder}", "label": label} | dict(zip(names, values, strict=True))
-            )
-            table[-1]["status"] = "ok" if table[-1]["status"] else "failed"
-            print(*table[-1].values(), sep="  ") if PETSc.COMM_WORLD.rank == 0 else None
-    if args.output and PETSc.COMM_WORLD.rank == 0:
+        for label in ("our multigrid", *args.options):
+            figures = solve(folder, label) if label in args.options else (*ours.values(), 0.0)
+            row = dict(zip(COLUMNS, figures, strict=True))
+            own = {"scene": f"{folder}", "label": label, "status": ENDS[row["status"]]}
+            rows.append(row | own)
+            print(*rows[-1].values(), sep="  ") if is_root else None
+    if args.output and is_root:
         args.output.mkdir(parents=True, exist_ok=True)
-        write_table(args.output, table)
+        write_table(args.output, rows)
         print(write_report(args.output))
 
 

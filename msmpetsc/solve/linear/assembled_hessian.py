@@ -131,6 +131,7 @@ def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> Blocks:
             nodes=np.arange(nodes.size, dtype=nodes.dtype).reshape(nodes.shape),
             which=to_host(blocks.which)[:owned],
             constants=to_host(blocks.constants),
+            around=np.empty((8, 0), np.int64),
         ),
         to_host(part.state)[:owned],
     )

@@ -131,7 +131,7 @@ def _solved(now: Iterate, jacobian: Jacobian, rtol: float, y: PETSc.Vec) -> dict
         "iterations": ksp.its,
         "set_up": ready - began,
         "seconds": perf_counter() - ready,
-        "converged": ksp.reason > 0,
+        "status": "ok" if ksp.reason > 0 else "failed",
     }
     ksp.destroy()
     operator.destroy()

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from msmpetsc.study.report import write_report
 from msmpetsc.study.table import write_table
 
-COLUMNS = ("ksp_its", "time_setup", "time_frame", "status", "distance")
+OURS, COLUMNS = "our multigrid", ("ksp_its", "time_setup", "time_frame", "status", "distance")
 USUAL = "-ksp_type cg -ksp_rtol 1e-8 -ksp_norm_type unpreconditioned -ksp_max_it 5000 "
 
 
@@ -46,13 +46,8 @@ def solve(folder, options):
     for name in PETSc.Options().getAll():
         PETSc.Options().delValue(name)
     ends = "ok" if ksp.reason > 0 else "failed"
-    return (
-        ksp.its,
-        times[1] - times[0],
-        times[2] - times[1],
-        ends,
-        (y - exact).norm() / exact.norm(),
-    )
+    error = (y - exact).norm() / exact.norm()
+    return ksp.its, times[1] - times[0], times[2] - times[1], ends, error
 
 
 def main():
@@ -65,10 +60,9 @@ def main():
         if not (folder / "system.json").is_file():
             parser.error(f"{folder} is no folder step_N of --export")
         ours = json.loads((folder / "system.json").read_text())["multigrid"]
-        for label in ("our multigrid", *args.options):
-            figures = solve(folder, label) if label in args.options else (*ours.values(), 0.0)
-            row = dict(zip(COLUMNS, figures, strict=True))
-            rows.append(row | {"scene": f"{folder}", "label": label})
+        for label in (OURS, *args.options):
+            figures = (*ours.values(), 0.0) if label == OURS else solve(folder, label)
+            rows.append(dict(zip(COLUMNS, figures, strict=True), scene=f"{folder}", label=label))
             print(*rows[-1].values(), sep="  ") if is_root else None
     if args.output and is_root:
         args.output.mkdir(parents=True, exist_ok=True)

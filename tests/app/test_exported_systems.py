@@ -31,18 +31,29 @@ LINEAR = {"material": {"law": "linear", "young_modulus": 1e5, "density": 1000.0}
 EXACT = 1e-9
 
 
-def read(path: Path, kind: type) -> PETSc.Object:
+def read(path: Path, *kinds: type) -> list[PETSc.Object]:
+    """The objects of a file; the block size that lies beside it is no option of later runs."""
     viewer = PETSc.Viewer().createBinary(str(path), "r", PETSc.COMM_SELF)
-    return kind().create(PETSc.COMM_SELF).load(viewer)
+    found = [kind().create(PETSc.COMM_SELF).load(viewer) for kind in kinds]
+    for name in ("matload_block_size", "vecload_block_size"):
+        PETSc.Options().delValue(name)
+    return found
+
+
+def vectors(path: Path, count: int) -> np.ndarray:
+    return np.array([each.array for each in read(path, *[PETSc.Vec] * count)])
 
 
 def vector(folder: Path, name: str) -> np.ndarray:
-    return read(folder / f"{name}.bin", PETSc.Vec).array.copy()
+    return vectors(folder / f"{name}.bin", 1)[0]
+
+
+def rows_of(matrix: PETSc.Mat) -> csr_array:
+    return csr_array(matrix.getValuesCSR()[::-1])
 
 
 def matrix(path: Path) -> csr_array:
-    begin, columns, values = read(path, PETSc.Mat).getValuesCSR()
-    return csr_array((values, columns, begin))
+    return rows_of(*read(path, PETSc.Mat))
 
 
 @pytest.mark.parametrize("law", ["neo-hookean", "linear"])
@@ -125,10 +136,7 @@ def test_rigid_modes_are_those_of_the_free_body(tmp_path: Path):
     folder = tmp_path / "step_1"
     hessian = matrix(folder / "hessian.bin")
     mass = np.repeat(build_model(MPI.COMM_SELF, load_scene(path)).lattice.mass, 3)
-    viewer = PETSc.Viewer().createBinary(str(folder / "rigid_modes.bin"), "r", PETSc.COMM_SELF)
-    modes = np.array(
-        [PETSc.Vec().create(PETSc.COMM_SELF).load(viewer).array.copy() for _ in range(6)]
-    )
+    modes = vectors(folder / "rigid_modes.bin", 6)
     np.testing.assert_allclose(modes @ modes.T, np.eye(6), atol=1e-12)
     stiff = np.abs(hessian.diagonal()).max()
     np.testing.assert_allclose(hessian @ modes.T, (mass * modes).T, rtol=0, atol=1e-10 * stiff)
@@ -147,15 +155,11 @@ def test_ranks_write_the_same_system(tmp_path: Path):
     largest = np.abs(hessian.data).max()
     summed = csr_array(hessian.shape)
     for rank in range(2):
-        viewer = PETSc.Viewer().createBinary(
-            str(two / f"subdomain_{rank}.bin"), "r", PETSc.COMM_SELF
-        )
-        part = PETSc.Mat().create(PETSc.COMM_SELF).load(viewer)
-        rows = PETSc.IS().create(PETSc.COMM_SELF).load(viewer).indices
-        begin, columns, values = part.getValuesCSR()
-        placed = csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))),
-                           shape=(len(hessian.indptr) - 1, len(rows)))  # fmt: skip
-        summed = summed + placed @ csr_array((values, columns, begin)) @ placed.T
+        part, numbers = read(two / f"subdomain_{rank}.bin", PETSc.Mat, PETSc.IS)
+        own = numbers.indices
+        placed = csr_array((np.ones(len(own)), (own, np.arange(len(own)))),
+                           shape=(hessian.shape[0], len(own)))  # fmt: skip
+        summed = summed + placed @ rows_of(part) @ placed.T
     for other in (matrix(two / "hessian.bin"), summed):
         assert np.abs((other - hessian).toarray()).max() < 1e-12 * largest
     for name in ("residual", "correction"):
@@ -212,6 +216,31 @@ def test_an_export_that_cannot_be_is_one_line(
     monkeypatch.chdir(tmp_path)
     assert said in command_error("run", path, "-o", "x.h5", *words)
     assert not Path("x.h5").exists()
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "static"])
+def test_an_export_changes_no_frame_and_no_count(tmp_path: Path, integrator: str):
+    path = clamped_beam(tmp_path, material=SOLID, time=SWING | {"integrator": integrator})
+    exports = {"export": tmp_path / "y", "export_steps": "1,3"}
+    results = [
+        msmpetsc.run(path, tmp_path / f"{n}.h5", quiet=True, **given)
+        for n, given in enumerate(({}, exports if integrator != "static" else {"export": tmp_path}))
+    ]
+    with h5py.File(results[0]) as plain, h5py.File(results[1]) as exported:
+        for name in ("position", "iterations", "ksp_its", "products"):
+            expected = plain["frames"][name][:]
+            np.testing.assert_array_equal(exported["frames"][name][:], expected, name)
+            assert expected.any()
+
+
+def test_a_resumed_run_exports_the_steps_that_are_left(tmp_path: Path, caplog):
+    """From the checkpoint of step 20 on."""
+    path = clamped_beam(tmp_path, material=SOLID, time={"step": 0.05, "duration": 1.05})
+    first = msmpetsc.run(path, tmp_path / "x.h5", frames=20, checkpoint_every=20, quiet=True)
+    longer = {"set": {"time.duration": 1.05}, "force": True}
+    msmpetsc.run(resume=first, export=tmp_path / "y", export_steps="1,21", **longer)
+    assert [each.name for each in (tmp_path / "y").iterdir()] == ["step_21"]
+    assert "no linear system was solved in step 1" in caplog.text
 
 
 def test_a_step_without_a_solve_is_told(tmp_path: Path, caplog):

@@ -21,7 +21,7 @@ from msmpetsc.app.checks import (
     checked_path,
     refuse_other_format,
 )
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
 from msmpetsc.scene.toml import overrides_of
 from msmpetsc.solve.petsc.words import words_of
 
@@ -118,6 +118,17 @@ class RunRequest:
             "write the cost of the run: times, products, memory, machine", "OUT.json", checked_file
         ),
     )
+    export: File | None = given(
+        None,
+        Option(
+            "write the first linear system of chosen steps into DIR/step_N, for other solvers",
+            "DIR",
+            checked_path,
+        ),
+    )
+    export_steps: str = given(
+        "", Option("steps whose systems --export writes; default: 1", "1,5,20")
+    )
     petsc_options: str | Mapping[str, Any] = given(
         "",
         Option(
@@ -146,6 +157,9 @@ class RunRequest:
                 raise InputError(f"{flag_of(name)} is {' or '.join(option.choices)}, not {value!r}")
         refuse_other_format("-o", self.output, RESULT_NAMES)
         refuse_other_format("--measure", self.measure, MEASURE_NAMES)
+        if self.export_steps and not self.export:
+            raise InputError("--export-steps chooses steps of --export DIR, which is missing")
+        steps_in(self.export_steps)
         differs = (
             self.output is not None
             and self.resume is not None
@@ -175,6 +189,11 @@ class RunRequest:
         return Path(self.measure) if self.measure else None
 
     @property
+    def exported(self) -> tuple[int, ...]:
+        """Return the numbers of the steps whose linear systems are exported."""
+        return steps_in(self.export_steps) if self.export else ()
+
+    @property
     def overrides(self) -> list[str]:
         """Return the changes of the scene as values of ``--set``."""
         given = {"solver.preset": self.preset, "solver.error": self.error}
@@ -201,6 +220,17 @@ class RunRequest:
     def petsc_words(self) -> list[str]:
         """Return the PETSc options as words. Raises InputError for an invalid option."""
         return words_of(self.petsc_options)
+
+
+def steps_in(text: str) -> tuple[int, ...]:
+    """Return the numbers of steps in a text like "1,5,20"; the first step for "".
+
+    Raises InputError.
+    """
+    words = [word.strip() for word in str(text or 1).split(",")]
+    if not all(word.isdecimal() and 0 < int(word) < 10**9 for word in words):
+        raise InputError(f"--export-steps takes numbers like 1,5,20, not {printable(text, 40)!r}")
+    return tuple(map(int, words))
 
 
 def flag_of(name: str) -> str:

@@ -17,6 +17,7 @@ from petsc4py import PETSc
 from msmpetsc import __version__
 from msmpetsc.app.checkpoint_writer import Checkpoints
 from msmpetsc.app.ending import ending_together
+from msmpetsc.app.exported_systems import ExportedSystems
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
 from msmpetsc.app.signals import Signals
@@ -89,7 +90,7 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
         PETSc.Log.begin()
         logged = event_times()
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
-    refuse_bad_options(scene, request.true_error)
+    refuse_bad_options(scene, request.true_error, request.exported)
     on_root(comm, lambda: refuse_unwritable(request.measured))
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
     return RunPlan(request, scene, resumed, began, logged)
@@ -101,7 +102,10 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
     Returns the checkpoints with the signal that stopped the run, the cost, and the failure of a
     step that ended the run.
     """
-    failure = None
+    failure, request = None, plan.request
+    systems = None
+    if request.export:
+        systems = ExportedSystems(comm, plan.scene, Path(request.export), request.exported)
     if kernel_cache.is_empty():
         once = "once" if kernel_cache.writable() else "as no folder can keep them (NUMBA_CACHE_DIR)"
         log.info("compiling kernels, %s, about a minute", once)
@@ -110,7 +114,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
         begun(SETUP) as set_up,
         open_output(comm, plan) as file,
         TimeLoop(
-            comm, plan.scene, model := described_model(comm, plan), plan.request.true_error
+            comm, plan.scene, model := described_model(comm, plan), plan.request.true_error, systems
         ) as simulation,
     ):
         try:
@@ -144,6 +148,8 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
         # the frames before the failure are kept
         except StepFailed as error:
             failure = error
+        if systems and not checkpoints.signal:
+            systems.sum_up()
         file.close(trim=not checkpoints.signal)
     return checkpoints, cost, failure
 

@@ -1,6 +1,6 @@
 """Time loop of a run: take its steps and yield the stored steps as frames."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
@@ -31,6 +31,8 @@ from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
+from msmpetsc.solve.nonlinear.functional import Iterate
+from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
@@ -66,8 +68,13 @@ def solvers_of(scene: Scene, true_error: int | None = None) -> dict[str, tuple[P
     return solvers
 
 
-def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
-    """Raise InputError if the scene cannot use the preset or the measurement of true errors."""
+def refuse_bad_options(
+    scene: Scene, true_error: int | None = None, exported: Collection[int] = ()
+) -> None:
+    """Raise InputError if the scene cannot use the preset, measure true errors or export systems.
+
+    exported : numbers of the steps whose linear systems are exported
+    """
     solvers = solvers_of(scene, true_error)
     if scene.touching and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(
@@ -83,6 +90,13 @@ def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
         raise InputError("true errors need steps of constant length: leave out time.error")
     if "" not in solvers and true_error:
         raise InputError("true errors need steps that are solved: verlet has none")
+    if exported and not ("" in solvers and solvers[""][0].true_hessian):
+        method = scene.solver.preset if "" in solvers else "verlet"
+        raise InputError(f"--export writes systems of newton's presets; {method} solves none")
+    if exported and max(exported) > scene.time.steps:
+        raise InputError(
+            f"--export-steps {max(exported)}: the last step of the run is {scene.time.steps}"
+        )
 
 
 class TimeLoop:
@@ -91,17 +105,25 @@ class TimeLoop:
     state  : state after the last step
     step   : number of steps taken, of ``steps``
     stored : number of frames of the whole run; ``stored_until(step)`` of its first steps
+    watch  : called with the number of a step, the first iterate of a solve and its Jacobian
     saved  : checkpoint of the last ``REMEMBERED``-th step, from which the run may resume
     """
 
-    def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, true_error: int | None = None):
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        scene: Scene,
+        model: Model,
+        true_error: int | None = None,
+        watch: Callable[[int, Iterate, Jacobian], None] | None = None,
+    ):
         model = to_device(model, sender(comm))
         if model.collision and not on_host(model.lattice.nodes):
             raise InputError("contact of surfaces is computed on CPUs: --device cpu")
         if model.pressures and not on_host(model.lattice.nodes):
             raise InputError("pressure is computed on CPUs: --device cpu")
         self.comm, self.model = comm, model
-        self.true_error, self.time_step = true_error, scene.time.step
+        self.true_error, self.time_step, self.watch = true_error, scene.time.step, watch
         self.steps, self.every = scene.time.steps, scene.output.every
         self.step = 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
@@ -170,6 +192,7 @@ class TimeLoop:
         """Take the next step; return its frame if it is stored (collective). Raises StepFailed."""
         time = index * self.time_step
         self.monitors.overlaps(index, time, self.state.q)
+        self.environment.watch = partial(self.watch, index) if self.watch else None
         begin = perf_counter()
         try:
             result, self.state = self.recovery.step(self.state, time)

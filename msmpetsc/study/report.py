@@ -16,6 +16,7 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.curves import growth_charts, pareto_charts, size_charts
 from msmpetsc.study.charts.plot import Chart, curve_styles, save_png, svg_text
+from msmpetsc.study.charts.profile import profile_charts
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.metrics import counted
 from msmpetsc.study.table import (
@@ -52,6 +53,7 @@ def write_report(folder: Path) -> Path:
         *stability_charts(table, study),
         *size_charts(sweeps, styles),
         *pareto_charts(sweeps, styles),
+        *profile_charts(sweeps, styles),
         *growth_charts(sweeps, styles),
     ]
     for chart in charts:

@@ -25,12 +25,14 @@ from conftest import WORKERS, python, run
 from mpi4py import MPI
 from petsc4py import PETSc
 from pretend_gpu import pretended
+from scipy.sparse import csr_array
 from stopped_runs import assert_goes_on_exactly
 
 import msmpetsc
 from msmpetsc.build import build_model
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -168,6 +170,34 @@ def test_frames_are_those_of_the_cpu(tmp_path: Path, case: str, on_gpu):
         energies = [[getattr(frame, name) for frame in frames] for frames in (there, here)]
         np.testing.assert_allclose(*energies, rtol=1e-5, atol=1e-9)
     assert [frame.inverted for frame in there] == [frame.inverted for frame in here]
+
+
+@on_a_gpu
+@pytest.mark.parametrize(
+    "case",
+    ["pressed and rubbed", pytest.param("solid, pressed, viscous", marks=pytest.mark.slow)],
+)
+def test_an_exported_hessian_is_that_of_the_cpu(tmp_path: Path, case: str, on_gpu):
+    scene = load_scene(block_scene(tmp_path, **CASES[case]))
+
+    def second_hessian() -> np.ndarray:
+        found = []
+
+        def keep(step, _, jacobian):
+            if step == 2:
+                found.append(assembled(jacobian.unknowns, blocks_of(jacobian.hessian)))
+
+        model = build_model(MPI.COMM_SELF, scene)
+        with TimeLoop(MPI.COMM_SELF, scene, model, watch=keep) as simulation:
+            for _ in simulation.advance():
+                if found:
+                    return csr_array(found[0].getValuesCSR()[::-1]).toarray()
+        raise AssertionError("no system was solved")
+
+    here = second_hessian()
+    with on_gpu():
+        there = second_hessian()
+    np.testing.assert_allclose(there, here, rtol=0, atol=1e-8 * np.abs(here).max())
 
 
 @on_a_gpu
@@ -318,6 +348,7 @@ ON_GPUS = """
 import sys, petsc4py
 petsc4py.init([])
 from pretend_gpu import pretended
+from scipy.sparse import csr_array
 from msmpetsc.cli.main import main
 with pretended():
     sys.exit(main(sys.argv[1:]))

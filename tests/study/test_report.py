@@ -21,6 +21,7 @@ from msmpetsc.study.charts.curves import (
     size_charts,
 )  # fmt: skip
 from msmpetsc.study.charts.plot import RING, Axes, Chart, curve_styles
+from msmpetsc.study.charts.profile import comparable, profile_charts, ratios
 from msmpetsc.study.report import write_report
 from msmpetsc.study.table import read_table, succeeded, typed
 
@@ -276,8 +277,8 @@ def test_curves_of_one_label_are_told_apart_by_what_varies():
 
 
 def test_the_page_is_well_formed_and_png_files_stand_beside_it(study: Path, text: str):
-    assert Balance(text).open == [] and len(svgs(text)) == 2
-    names = {"pareto_block.png", "growth_bunny_0.01.png"}
+    assert Balance(text).open == [] and len(svgs(text)) == 3
+    names = {"pareto_block.png", "growth_bunny_0.01.png", "profile.png"}
     assert {path.name for path in study.glob("*.png")} == names
     assert all((study / name).read_bytes().startswith(b"\x89PNG") for name in names)
     ids = re.findall(r"""\sid=["']([^"']+)["']""", text)
@@ -289,7 +290,8 @@ def test_the_page_is_well_formed_and_png_files_stand_beside_it(study: Path, text
 
 def test_every_point_tells_its_numbers(text: str):
     tips = tooltips(text)
-    assert len(tips) == (4 + 5) + 4 * 6  # pareto's panels, growth's panels
+    # pareto's panels, growth's panels; the ends and jumps of two profiles
+    assert len(tips) == (4 + 5) + 4 * 6 + (4 + 3)
     for row in (row for row in ERRORS + SWEEP if row["status"] == "ok"):
         assert any(row["label"] in tip and row["command"] in tip for tip in tips), row
     assert any("true error 3e-5\ntime frame 80 ms\ntime step 10 ms\n" in tip for tip in tips)
@@ -366,3 +368,50 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
     (chart,) = size_charts(table, curve_styles(table["label"]))
     (rings,) = [layer for layer in chart.panels[0].layers if layer["mark"].get("shape") == RING]
     assert [value["y"] for value in rings["data"]["values"]] == [0.2, 0.05, 0.01]
+
+
+# Performance profiles
+
+# seconds of each method on five problems; None for a failure
+PROFILED = {
+    "newton": (1.0, 2.0, 3.0, 4.0, None),
+    "anderson": (3.0, 1.0, 1.5, None, None),
+}
+
+
+def profiled() -> list[dict[str, str]]:
+    rows = []
+    for label, times in PROFILED.items():
+        for n, time in enumerate(times):
+            failed = {"status": "timeout", "cells": ""} if time is None else {}
+            given = {"error": 1e-3, "cells": 1000 * (n + 1), "time_frame": time or ""} | failed
+            rows.append(row_of(label, **given))
+    # the last problem is solved by a third method's budget alone, which is no comparison
+    return [*rows, row_of("newton", max_iterations=1, time_frame=1e-9, cells=1000)]
+
+
+def test_a_profile_is_the_share_within_each_factor():
+    """Factors of newton: 1, 2, 2, 1; of anderson: 3, 1, 1, fails. All fail on the fifth problem,
+    whose cells nobody has counted."""
+    table = typed(profiled())
+    (chart,) = profile_charts(table, curve_styles(table["label"]))
+    (problems,) = comparable(table)
+    found = ratios(problems, "time_frame")
+    expected = {"newton": [1, 2, 2, 1, np.inf], "anderson": [3, 1, 1, np.inf, np.inf]}
+    assert found.to_dict("list") == expected
+    (panel,) = chart.panels
+    assert panel.title == "by seconds", "no products were counted"
+    line = panel.layers[0]["data"]["values"]
+    steps = {label: [(p["x"], p["y"]) for p in line if p["curve"] == label] for label in PROFILED}
+    right = pytest.approx(1.1 * 3)
+    assert steps["newton"] == [(1, 0.4), (2, 0.8), (right, 0.8)]
+    assert steps["anderson"] == [(1, 0.4), (3, 0.6), (right, 0.6)]
+    (lines,) = chart.findings.values()
+    assert lines[0] == "newton: 40% at 1, 80% at 2, 80% at 5, 80% in all."
+
+
+def test_a_profile_needs_three_problems_with_the_same_methods():
+    table = typed(row for row in profiled() if row["cells"] in ("1000", "2000"))
+    assert not profile_charts(table, curve_styles(table["label"]))
+    alone = typed(row for row in profiled() if row["label"] == "newton")
+    assert not profile_charts(alone, curve_styles(alone["label"]))

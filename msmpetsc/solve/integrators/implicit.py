@@ -109,7 +109,10 @@ class ContactFaces:
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
         prescribed = environment.anchors.prescribed(self.q, time)
         load, pressures = self.load.force, self.load.pressures.values
-        return StepProblem(self.q, self.y, load, self.contact, prescribed, None, pressures)
+        return StepProblem(
+            self.q, self.y, load, self.contact, prescribed,
+            pressures=pressures, watch=environment.watch,
+        )  # fmt: skip
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the result of ``step`` with settled contacts. Raises StepFailed."""

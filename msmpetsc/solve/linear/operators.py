@@ -94,6 +94,7 @@ class TrueHessian:
 
     products : number of products so far
     elastic  : Hessian of E at the last positions; None before ``linearise``
+    at       : last positions (l, 3) [m], and whether the Hessian is projected
     """
 
     def __init__(
@@ -110,6 +111,7 @@ class TrueHessian:
         self.v = np.zeros_like(lattice.nodes)
         self.product = np.empty_like(lattice.nodes)
         self.elastic: Hessian | None = None
+        self.at = lattice.nodes, False
         self.surface: SurfaceHessian | None = None
         self.products = 0
 
@@ -125,6 +127,7 @@ class TrueHessian:
         projected : project out the negative curvature of each spring (elasticity.springs)
         duals     : duals of friction, which replace its true curvature (contact.friction)
         """
+        self.at = q, projected
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             if self.contact:

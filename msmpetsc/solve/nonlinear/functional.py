@@ -7,7 +7,9 @@ Implicit Euler has y = 2 q_n - q_(n-1) (paper Eq. 10-12).
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -48,6 +50,7 @@ class StepProblem:
     rates      : two positions (l, 3) [m] whose difference gives the strain rates of a viscous solid
                  (elasticity.viscosity.Viscosity.begin)
     pressures  : pressures on the lattice's surfaces [Pa]
+    watch      : called with the first iterate of a solve and its Jacobian; None for no call
     """
 
     q: Positions
@@ -57,6 +60,7 @@ class StepProblem:
     prescribed: Positions | None = None
     rates: tuple[Positions, Positions] | None = None
     pressures: tuple[float, ...] = ()
+    watch: Callable[[Any, Any], None] | None = None
 
     @property
     def fixed(self) -> Positions:

@@ -90,6 +90,8 @@ class Newton(StepMethod):
         projected, asks, its = self.preset.projected, False, 0
         while not (reason := self._reason(snes, its, now, outcome)):
             self._linearise(now, outcome, projected > 0)
+            if its == 0 and (watch := self.functional.problem.watch):
+                watch(now, self.jacobian)
             if not self._solve(now, outcome, its):
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break

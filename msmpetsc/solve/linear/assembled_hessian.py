@@ -1,0 +1,164 @@
+"""The Hessian of a step as a PETSc matrix, for solvers that need one.
+
+A row of the matrix belongs to a coordinate of a free node: x, y and z of a node in sequence.
+Products with all other operators need no matrix (solve.linear.operators).
+"""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import csr_array, eye_array, kron
+
+from msmpetsc.backend.arrays import Indices, Rows, to_host
+from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.elasticity.solid import CellHessians
+from msmpetsc.elasticity.springs import Springs, elastic_hessian
+from msmpetsc.solve.linear.operators import TrueHessian
+from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
+from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
+
+
+class Blocks(NamedTuple):
+    """Blocks of this rank that add up to the Hessian over all ranks.
+
+    first, second : (k,) global numbers of the nodes of rows and columns, -1 if pinned
+    values        : (k, 3, 3) [kg]
+    """
+
+    first: Indices
+    second: Indices
+    values: Rows
+
+
+def blocks_of(hessian: TrueHessian) -> Blocks:
+    """Return the blocks of the Hessian of the last ``linearise`` at free nodes (collective)."""
+    whole = [np.concatenate(part) for part in zip(*_parts(hessian), strict=True)]
+    is_free = (whole[0] >= 0) & (whole[1] >= 0)
+    return Blocks(*(part[is_free] for part in whole))
+
+
+def assembled(unknowns: Unknowns, blocks: Blocks) -> PETSc.Mat:
+    """Return the Hessian as an AIJ of block size 3 in CPU memory (collective).
+
+    Raises InputError if the nonzeros exceed PETSc's integers.
+    """
+    refuse_nonzeros(unknowns.comm, blocks.values.size)
+    return _summed(unknowns.comm, (3 * unknowns.size, 3 * unknowns.total), blocks)
+
+
+def subdomain(blocks: Blocks) -> tuple[PETSc.Mat, PETSc.IS]:
+    """Return the sum of this rank's blocks alone, and the global numbers of its rows.
+
+    The sum over the ranks is the Hessian: BDDC needs the summands. A summand has no Dirichlet
+    condition at the border to other ranks.
+    """
+    ends = np.stack([blocks.first, blocks.second])
+    nodes, places = np.unique(ends, return_inverse=True)
+    first, second = places.reshape(ends.shape)
+    size = 3 * len(nodes)
+    matrix = _summed(PETSc.COMM_SELF, (size, size), Blocks(first, second, blocks.values))
+    return matrix, PETSc.IS().createBlock(3, nodes.astype(PETSc.IntType), PETSc.COMM_SELF)
+
+
+def _summed(comm: MPI.Comm, size: tuple[int, int], blocks: Blocks) -> PETSc.Mat:
+    """Return the sum of blocks as a matrix whose rows and columns have this size."""
+    row, column = np.arange(3)[:, None], np.arange(3)
+    rows, columns = np.broadcast_arrays(
+        3 * blocks.first[:, None, None] + row, 3 * blocks.second[:, None, None] + column
+    )
+    matrix = PETSc.Mat().create(comm=comm)
+    matrix.setSizes((size, size), bsize=3)
+    matrix.setType(PETSc.Mat.Type.AIJ)
+    preallocate_coo(matrix, rows.ravel(), columns.ravel())
+    set_values_coo(matrix, blocks.values.ravel())
+    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return matrix
+
+
+def _parts(hessian: TrueHessian) -> Iterator[Blocks]:
+    """Yield the blocks of inertia, springs, cells and contact."""
+    unknowns, t2, numbers = hessian.unknowns, hessian.t2, hessian.unknowns.numbers
+    own = numbers[to_host(unknowns.free)]
+    inertia = to_host(unknowns.inertia)[to_host(unknowns.free)]
+    yield Blocks(own, own, inertia[:, None, None] * np.eye(3))
+    if hessian.elasticity.springs:
+        yield from _of_springs(hessian)
+    for part in hessian.elastic.parts if hessian.elastic else ():
+        if isinstance(part, CellHessians):
+            yield _of_cells(part, numbers, t2)
+    for rows, blocks in hessian.contact.parts if hessian.contact else ():
+        at = own[to_host(rows)]
+        yield Blocks(at, at, to_host(blocks))
+    if hessian.surface:
+        yield _of_surface(hessian.surface, unknowns, t2)
+
+
+def _of_springs(hessian: TrueHessian) -> Iterator[Blocks]:
+    """Yield the blocks t^2 (c I + e e^T) of this rank's springs."""
+    lattice = hessian.unknowns.lattice
+    given = lattice.springs, lattice.rest_length, lattice.stiffness
+    springs = Springs(*(to_host(part)[: lattice.springs_owned] for part in given))
+    q, projected = hessian.at
+    found = np.empty((len(springs.ends), 4))
+    elastic_hessian(to_host(q), springs, projected, found)
+    c, e = found[:, :1, None], found[:, 1:]
+    blocks = hessian.t2 * (c * np.eye(3) + e[:, :, None] * e[:, None, :])
+    a, b = hessian.unknowns.numbers[springs.ends].T
+    for first, second, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+        yield Blocks(first, second, sign * blocks)
+
+
+def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> Blocks:
+    """Return the blocks of the cells that this rank owns, summed over the cells.
+
+    Products with unit vectors give the matrices of all cells at once, because in the copy here
+    each cell has eight nodes of its own.
+    """
+    blocks, owned = part.blocks, part.blocks.owned
+    nodes = to_host(blocks.nodes)[:owned]
+    corners = numbers[nodes.reshape(-1, 8)]
+    span = int(corners.max(initial=0)) + 1
+    first, second = corners[:, :, None], corners[:, None, :]
+    pairs = np.where((first >= 0) & (second >= 0), first * span + second, -1)
+    found, place = np.unique(pairs, return_inverse=True)
+    place = place.reshape(-1, 8, 8)
+    alone = CellHessians(
+        blocks._replace(
+            nodes=np.arange(nodes.size, dtype=nodes.dtype).reshape(nodes.shape),
+            which=to_host(blocks.which)[:owned],
+            constants=to_host(blocks.constants),
+            around=np.empty((8, 0), np.int64),
+        ),
+        to_host(part.state)[:owned],
+    )
+    sums, v = np.zeros((len(found), 3, 3)), np.zeros((corners.size, 3))
+    for corner, component in product(range(8), range(3)):
+        v[:] = 0
+        v[corner::8, component] = t2
+        forces = np.zeros_like(v)
+        alone(v, forces)
+        np.add.at(sums[:, :, component], place[:, :, corner], forces.reshape(-1, 8, 3))
+    return Blocks(found // span, found % span, sums)
+
+
+def _of_surface(surface: SurfaceHessian, unknowns: Unknowns, t2: float) -> Blocks:
+    """Return the blocks t^2 W^T H_c W in this rank's rows (collective)."""
+    weights = csr_array(surface.weights[:, unknowns.free])
+    own = unknowns.numbers[unknowns.free]
+    placed = csr_array(
+        (weights.data, own[weights.indices], weights.indptr),
+        shape=(weights.shape[0], unknowns.total),
+    )
+    # The order of the ranks makes the sum reproducible
+    whole = sum(unknowns.comm.allgather(placed))
+    coordinates = eye_array(3)
+    joined = kron(weights, coordinates, "csr").T @ (
+        surface.points @ kron(whole, coordinates, "csr")
+    )
+    blocks = joined.tobsr((3, 3))
+    first = np.repeat(own, np.diff(blocks.indptr))
+    return Blocks(first, blocks.indices.astype(np.int64), t2 * blocks.data)

@@ -1,0 +1,121 @@
+"""Performance profiles: the share of problems that a method solves within a factor of the best.
+
+Source: Dolan and More 2002, Benchmarking optimization software with performance profiles, Math.
+Program. 91, 201-213.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from pandas import DataFrame
+
+from msmpetsc.backend.arrays import Floats
+from msmpetsc.study.charts.plot import Chart, Styles, channel, nominal
+from msmpetsc.study.table import ONCE_NOTE, is_repeated, measured, succeeded
+
+PROFILE = "Performance profile"
+CAPTION = (
+    "The share of problems that a method solves within a factor of the best method of each "
+    "problem; higher is better. The left end shows how often a method is the best, the right end "
+    "how often it solves a problem at all. A problem is a scene with its cells, time step and "
+    "error asked for. Runs with a budget of iterations reach no such error and are left out."
+)
+# columns that define a problem; its rows differ in their label
+PROBLEM = ["scene", "time_step", "error", "cells"]
+# fewest problems of a profile
+FEWEST = 3
+# title of a panel by its column
+COSTS = {"time_frame": "seconds", "products": "products with the Hessian"}
+# factors whose shares are told, and the longest axis [-]
+FACTORS, FARTHEST = (1, 2, 5), 100.0
+
+
+def profile_charts(table: DataFrame, styles: Styles) -> list[Chart]:
+    """Return a chart for each set of methods that FEWEST or more problems have in common."""
+    return [
+        profile_chart(f"profile_{number}" if number > 1 else "profile", problems, styles)
+        for number, problems in enumerate(comparable(table), 1)
+    ]
+
+
+def comparable(table: DataFrame) -> Iterator[list[DataFrame]]:
+    """Yield the rows of each problem that the same methods, at least two, were run on."""
+    rows = with_cells(table[~(table["max_iterations"] > 0)])
+    by_methods: dict[frozenset[str], list[DataFrame]] = {}
+    for _, group in rows.groupby(PROBLEM, sort=False, dropna=False):
+        by_methods.setdefault(frozenset(group["label"]), []).append(group)
+    for methods, problems in by_methods.items():
+        if len(methods) > 1 and len(problems) >= FEWEST:
+            yield problems
+
+
+def with_cells(rows: DataFrame) -> DataFrame:
+    """Return the rows with the cells of runs that were killed before they had counted them.
+
+    A killed run has the cells that other methods have counted and its own method lacks.
+    """
+    rows = rows.copy()
+    for _, group in rows.groupby(PROBLEM[:-1], sort=False, dropna=False):
+        sizes = group["cells"].dropna().unique()
+        for _, own in group.groupby("label", sort=False):
+            lost = own.index[own["cells"].isna()]
+            lacking = [cells for cells in sizes if cells not in set(own["cells"])]
+            count = min(len(lost), len(lacking))
+            rows.loc[lost[:count], "cells"] = lacking[:count]
+    return rows
+
+
+def ratios(problems: list[DataFrame], cost: str) -> DataFrame:
+    """Return the cost over the least cost of the problem: a row a problem, a column a method.
+
+    An entry is infinite if the method did not solve the problem.
+    """
+    found = []
+    for rows in problems:
+        costs = measured(succeeded(rows), cost).groupby("label")[cost].min()
+        found.append(costs / costs.min())
+    labels = dict.fromkeys(label for rows in problems for label in rows["label"])
+    return DataFrame(found, columns=list(labels)).fillna(np.inf).reset_index(drop=True)
+
+
+def profile_chart(name: str, problems: list[DataFrame], styles: Styles) -> Chart:
+    """Return the chart of problems, with a panel for each cost that was measured."""
+    labels = dict.fromkeys(label for rows in problems for label in rows["label"])
+    own = {label: styles[label] for label in labels}
+    chart = Chart(name, PROFILE, f"{PROFILE}: {len(problems)} problems", CAPTION, own, columns=2)
+    for cost, title in COSTS.items():
+        factors = ratios(problems, cost)
+        if np.isfinite(factors).any(axis=None):
+            draw_profile(chart, title, factors)
+            lines = [line_of(label, factors[label].to_numpy()) for label in labels]
+            once = cost == "time_frame" and not all(map(is_repeated, problems))
+            chart.findings[f"Solved within a factor of the fewest {title}"] = lines + (
+                [ONCE_NOTE] if once else []
+            )
+    return chart
+
+
+def draw_profile(chart: Chart, title: str, factors: DataFrame) -> None:
+    """Draw the share of problems over the factor as a step function for each method."""
+    known = factors.to_numpy(float)
+    right = min(max(1.1 * float(known[np.isfinite(known)].max()), 2.0), FARTHEST)
+    ticks = [tick for tick in (1, 2, 5, 10, 20, 50, 100) if tick <= right]
+    x = channel("factor", "format(datum.value, '~g')", ticks, type="log", domain=[1, right])
+    y = channel("problems", "format(datum.value, '.0%')", np.arange(5) / 4, domain=[0, 1])
+    panel = chart.panel(f"by {title}", x, y)
+    values = []
+    for label, column in zip(factors, known.T, strict=True):
+        for n, end in enumerate(np.unique([1.0, *column[column <= right], right]).tolist()):
+            share = float((column <= end).mean())
+            tip = f"{label}\n{share:.0%} within {end:.3g}"
+            values.append({"x": end, "y": share, "curve": label, "tip": tip, "n": n})
+    own = {"color": nominal(chart.styles, "color"), "strokeDash": nominal(chart.styles, "dash")}
+    line = {"type": "line", "interpolate": "step-after", "strokeWidth": 1.6}
+    panel.draw(values, line, order={"field": "n"}, **own)
+    panel.mark(values)
+
+
+def line_of(label: str, factors: Floats) -> str:
+    """Return a sentence with the shares of a method: newton: 50% at 1, 75% at 2, 100% in all."""
+    shares = [f"{(factors <= factor).mean():.0%} at {factor}" for factor in FACTORS]
+    return f"{label}: {', '.join(shares)}, {np.isfinite(factors).mean():.0%} in all."

@@ -11,25 +11,37 @@ Seconds are of the steps of a run, without its set-up.
 import math
 import sys
 import tomllib
-from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import lab
 
 import numpy as np
+from mpi4py import MPI
 
 import msmpetsc
+from msmpetsc.app.request import RunRequest
+from msmpetsc.build import build_model
 from msmpetsc.fields import FRAME_FIELDS
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 
 FOLDER = lab.SCENES / "studies" / "yardstick"
 CHART = FOLDER / "yardstick.png"
 # |error| shown as "exact", that of the solver in most cases [-]
 EXACT = 1e-6
+# cells that give the stress at a place: their distance [cells], their fill [-]
+NEAR, WHOLE = 3.0, 0.99
+INTRODUCTION = """
+Values, errors and costs stand from coarse to fine. An error is relative, *exact* below 1e-6. The
+order is observed: by the differences of three sizes, or the errors of two. Seconds are of the steps
+on one core, without set-up. Products are with the Hessian.
+
+![Errors over seconds and over cells](../../scenes/studies/yardstick/yardstick.png)"""
 
 
 @dataclass(frozen=True)
@@ -39,7 +51,6 @@ class Value:
     ours      : Python expression of the names that ``names_of`` returns
     reference : number, or Python expression of the case's constants
     within    : largest |error| of the finest fast size; the tests assert it
-    scale     : the error is (ours - reference) / scale; |reference| if absent
     note      : cause of a deviation over 2% at the finest size
     """
 
@@ -47,17 +58,15 @@ class Value:
     ours: str
     reference: float | str
     within: float
-    scale: float | str = ""
     note: str = ""
 
 
 @dataclass(frozen=True)
 class Peer:
-    """Published values of another program: degrees of freedom and values of one quantity."""
+    """Another program's published values of a case's first quantity, by numbers of cells."""
 
     name: str
-    quantity: str
-    freedoms: Sequence[float]
+    cells: Sequence[float]
     values: Sequence[float]
 
 
@@ -85,6 +94,7 @@ class Case:
     value: Sequence[Value]
     fast: int = 1
     let: dict[str, float | str] = field(default_factory=dict)
+    modes: int = 0
     own: bool = False
     peer: Sequence[Peer] = ()
 
@@ -102,8 +112,7 @@ class Case:
 
     def error(self, value: Value, ours: float) -> float:
         """Return the relative error of a value."""
-        exact = self.reference(value)
-        return (ours - exact) / abs(float(evaluated(value.scale or exact, self.constants)))
+        return (ours - self.reference(value)) / abs(self.reference(value))
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,6 @@ class Run:
 
     size: float
     cells: int
-    nodes: int
     seconds: float
     products: int
     ours: Sequence[float]
@@ -144,28 +152,34 @@ def measured(case: Case, size: float) -> Run:
     """Run a case at a size."""
     keys = {key: evaluated(text, case.constants | {"n": size}) for key, text in case.keys.items()}
     print(case.name, keys, file=sys.stderr, flush=True)
-    scene = Scene.load(FOLDER / f"{case.scene}.toml", keys)
-    simulation = msmpetsc.Simulation(scene)
-    frames = list(simulation.frames())
-    assert simulation.model is not None
-    lattice = simulation.model.lattice
-    names = case.constants | names_of(scene, frames) | vars(lattice)
-    return Run(
-        size,
-        len(lattice.cells),
-        len(lattice.nodes),
-        sum(frame.wall_time for frame in frames),
-        sum(frame.products for frame in frames),
-        [float(evaluated(value.ours, names)) for value in case.value],
-    )
+    file = FOLDER / f"{case.scene}.toml"
+    scene = Scene.load(file, keys)
+    names = case.constants
+    if case.modes:
+        begin = perf_counter()
+        modes = find_modes(MPI.COMM_SELF, RunRequest(file, set=keys), case.modes)
+        seconds, products = perf_counter() - begin, 0
+        lattice = build_model(MPI.COMM_SELF, scene).lattice
+        names |= {"frequencies": modes.frequencies, "np": np}
+    else:
+        simulation = msmpetsc.Simulation(scene)
+        frames = list(simulation.frames())
+        assert simulation.model is not None
+        lattice = simulation.model.lattice
+        seconds = sum(frame.wall_time for frame in frames)
+        products = sum(frame.products for frame in frames)
+        names |= vars(lattice) | names_of(scene, frames, lattice)
+    ours = [float(evaluated(value.ours, names)) for value in case.value]
+    return Run(size, len(lattice.cells), seconds, products, ours)
 
 
-def names_of(scene: Scene, frames: list[msmpetsc.Frame]) -> dict[str, Any]:
+def names_of(scene: Scene, frames: list[msmpetsc.Frame], lattice: Lattice) -> dict[str, Any]:
     """Return names for expressions: fields of all frames (T, ...), and functions.
 
-    at(probe)    : its positions (T, 3) [m]
-    moved(probe) : its displacements (T, 3) [m] from the start
-    peaks(y)     : times and heights (k, 2) of the local maxima of y (T,)
+    at(probe)     : its positions (T, 3) [m]
+    moved(probe)  : its displacements (T, 3) [m] from the start
+    peaks(y)      : times and heights (k, 2) of the local maxima of y (T,)
+    stress_at(*x) : stress (6,) [Pa] of the last frame at a place at rest
     """
     fields = {
         name: np.array([getattr(frame, name) for frame in frames])
@@ -183,7 +197,16 @@ def names_of(scene: Scene, frames: list[msmpetsc.Frame]) -> dict[str, Any]:
     def peaks(y: np.ndarray) -> np.ndarray:
         return np.array([*maxima(fields["time"], y)]).reshape(-1, 2)
 
-    return fields | {"np": np, "norm": np.linalg.norm, "at": at, "moved": moved, "peaks": peaks}
+    def stress_at(*place: float) -> np.ndarray:
+        # a plane through the stresses of whole cells near the place
+        distance = lattice.nodes[lattice.cells].mean(axis=1) - place
+        near = np.linalg.norm(distance, axis=1) < NEAR * lattice.cell_size
+        near &= lattice.cell_fill > WHOLE
+        plane = np.column_stack([np.ones(near.sum()), distance[near]])
+        return np.linalg.lstsq(plane, fields["cell_stress"][-1][near])[0][0]
+
+    functions = {"at": at, "moved": moved, "peaks": peaks, "stress_at": stress_at}
+    return fields | functions | {"np": np, "norm": np.linalg.norm}
 
 
 def maxima(t: np.ndarray, y: np.ndarray) -> Iterator[tuple[float, float]]:
@@ -247,18 +270,15 @@ def notes(number: int, case: Case) -> Iterator[str]:
     """Yield the set-up of a case, its source and the causes of deviations."""
     scene = f"../../scenes/studies/yardstick/{case.scene}.toml"
     yield f"{number}. **{case.name}** ([scene]({scene})). {case.setup} *Reference:* {case.source}"
+    within = " and ".join(sorted({f"{100 * value.within:.2g}%" for value in case.value}))
+    yield f"    *Bound at {case.sizes[case.fast - 1]}:* {within}. {case.theory}"
     for value in case.value:
         if value.note:
-            yield f"    - *{value.name}*: {value.note}"
-
-
-def largest(case: Case, run: Run) -> float:
-    """Return the largest error of a run."""
-    return max(abs(case.error(v, x)) for v, x in zip(case.value, run.ours, strict=True))
+            yield f"    *Deviation of {value.name}:* {value.note}"
 
 
 def chart(found: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
-    """Draw errors over seconds, and over freedoms beside the peers' published values."""
+    """Draw errors over seconds, and over cells beside the peers' published values."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -267,42 +287,37 @@ def chart(found: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
     figure, (time, size) = pyplot.subplots(1, 2, figsize=(12, 6), layout="constrained")
     colours = pyplot.get_cmap("tab20")(range(20))
     for number, (case, runs) in enumerate(found.values(), 1):
-        errors = [max(largest(case, run), EXACT) for run in runs]
+        values = [zip(case.value, run.ours, strict=True) for run in runs]
+        errors = [max(EXACT, *(abs(case.error(*pair)) for pair in pairs)) for pairs in values]
         style: dict[str, Any] = {"color": colours[number % 20], "marker": "o", "ms": 4}
         time.loglog([max(run.seconds, 1e-3) for run in runs], errors, **style)
         time.annotate(f"{number}", (max(runs[-1].seconds, 1e-3), errors[-1]), fontsize=8)
         if not case.peer:
             continue
         ours = [abs(case.error(case.value[0], run.ours[0])) for run in runs]
-        size.loglog([3 * run.nodes for run in runs], ours, **style, label=f"{case.name}: ours")
+        size.loglog([run.cells for run in runs], ours, **style, label=f"{case.name}: ours")
         for mark, peer in zip("sv^D*Pxd", case.peer, strict=False):
-            (value,) = (value for value in case.value if value.name == peer.quantity)
-            theirs = [max(abs(case.error(value, x)), EXACT) for x in peer.values]
+            theirs = [max(abs(case.error(case.value[0], x)), EXACT) for x in peer.values]
             style = {"color": colours[number % 20], "marker": mark, "ms": 4, "ls": ":"}
-            size.loglog(peer.freedoms, theirs, **style, label=f"{case.name}: {peer.name}")
+            size.loglog(peer.cells, theirs, **style, label=f"{case.name}: {peer.name}")
     time.set(
         xlabel="seconds of the steps", ylabel="largest relative error of a case, by its number"
     )
-    size.set(xlabel="degrees of freedom", ylabel="relative error")
+    size.set(xlabel="cells", ylabel="relative error")
     if size.has_data():
         size.legend(fontsize=7)
     figure.savefig(path, dpi=120)
 
 
-def options() -> Namespace:
-    """Return the options of the command line."""
+def main() -> None:
+    """Print the table and draw the chart."""
     parser = lab.parser(__doc__)
     parser.add_argument("words", nargs="*", metavar="WORD", help="run cases whose names contain it")
     parser.add_argument("--fast", action="store_true", help="run the coarse sizes only")
     parser.add_argument(
         "--chart", type=Path, default=CHART, metavar="PNG", help="file of the chart"
     )
-    return parser.parse_args()
-
-
-def main() -> None:
-    """Print the table and draw the chart."""
-    args = options()
+    args = parser.parse_args()
     lab.heading()
     found: dict[str, tuple[Case, list[Run]]] = {}
 
@@ -313,13 +328,12 @@ def main() -> None:
             found[case.name] = case, runs
             yield from rows(len(found), case, runs)
 
+    print(INTRODUCTION)
     everything = [
         case for case in cases() if not args.words or any(word in case.name for word in args.words)
     ]
-    for own, title in (
-        (False, "Against published values"),
-        (True, "Against our own finite elements"),
-    ):
+    titles = {False: "Against published values", True: "Against our own finite elements"}
+    for own, title in titles.items():
         if chosen := [case for case in everything if case.own is own]:
             print(f"\n## {title}")
             lab.table(all_rows(chosen))

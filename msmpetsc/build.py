@@ -36,7 +36,7 @@ from msmpetsc.geometry.surface import (
     examine,
     joined,
 )
-from msmpetsc.lattice.initial_state import InitialState, initial_state
+from msmpetsc.lattice.initial_state import InitialState, ReadState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
 from msmpetsc.lattice.topology import Topology, topology_of
@@ -183,10 +183,16 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topol
     return np.concatenate([nearest, topology.table.rows_of(encode_morton(ghosts), nearest)])
 
 
-def build_model(comm: MPI.Comm, scene: Scene, geometry: Geometry | None = None) -> Model:
+def build_model(
+    comm: MPI.Comm,
+    scene: Scene,
+    geometry: Geometry | None = None,
+    read_state: ReadState | None = None,
+) -> Model:
     """Build the model of a scene (collective). Raises InputError on all ranks.
 
-    geometry : of the scene's meshes and cages; built here if None
+    geometry   : of the scene's meshes and cages; built here if None
+    read_state : reader of the states that ``start.from`` names; not needed without
     """
     geometry = geometry or Geometry(comm, scene)
     bodies, cages = geometry.bodies, geometry.cages
@@ -215,7 +221,7 @@ def build_model(comm: MPI.Comm, scene: Scene, geometry: Geometry | None = None) 
         anchors=anchors,
         exchanges=exchanges,
         penalties=penalties,
-        start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
+        start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds, read_state),
         bodies=bodies,
         collision=collision_surface(scene, bodies, cages, lattice, obstacles),
         node_counts=taken(comm, scene, lattice, anchors, masks),

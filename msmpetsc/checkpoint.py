@@ -21,6 +21,9 @@ from msmpetsc.errors import InputError
 MAX_VALUE = 1e60
 # largest counter; a double holds every whole number up to it
 MAX_COUNT = 2**53
+# number of a run's last step plus the number stored for its state; no run resumes
+# there, since a longer run would remember earlier steps
+AT_END = -2
 Range = tuple[float, float]
 COUNT: Range = (0, MAX_COUNT)
 ANY: Range = (-math.inf, math.inf)

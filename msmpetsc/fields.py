@@ -207,7 +207,7 @@ EMBEDDING = {
 }
 # two slots; the slot with the greater step is valid
 CHECKPOINT = {
-    "step": Field("i8", (2,), "1", "number of the step, -1 for none"),
+    "step": Field("i8", (2,), "1", "number of the step, -1 for none, -2 - n at the end"),
     "numbers": Field("f8", (2, "k"), "1", "scalars that a step depends on; names in an attribute"),
     "q": Field("f8", (2, "n", 3), "m", "node positions"),
     "q_previous": Field("f8", (2, "n", 3), "m", "node positions one step before"),

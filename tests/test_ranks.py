@@ -70,7 +70,9 @@ CASES = {
     }),
     "start": Case({
         "start": {"scale": [1, 1, 0.5], "scatter": 0.5, "twist": {"axis": [1, 0, 1], "degrees": 40},
-                  "velocity": [0, 0, 1], "spin": [2, 0, 1]},
+                  "velocity": [0, 0, 1], "spin": [2, 0, 1],
+                  "gradient": [[0, 1, 0], [0, 0, 2], [1, 0, 1]],
+                  "swirl": {"axis": [0, 0, 1], "distances": [0, 1], "rates": [1, 9]}},
         "time": steps(2, 1 / 128), "output": {"surface": True},
     }),
     "clamp": Case({"cages": {"cell_size": 0.11}, "pin": [{"region": TILTED}],

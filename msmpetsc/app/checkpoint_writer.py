@@ -64,6 +64,8 @@ class Checkpoints:
             if saved.step != self._written:
                 self.file.write_checkpoint(saved)
                 self._written = saved.step
+            if simulation.step == simulation.steps != saved.step:
+                self.file.write_checkpoint(simulation.end)
             self._frames = 0
             self._ended = perf_counter()
             self._interval = (self._ended - began) / CHECKPOINT_TIME

@@ -211,7 +211,9 @@ class Resumed:
 
 def flat(scene: Scene) -> dict[str, Any]:
     """Return the values of a scene by key, for example "time.step" or "obstacle.0.point"."""
-    return dict(_leaves("", scene.model_dump(exclude=IGNORED_FIELDS, exclude_none=True)))
+    return dict(
+        _leaves("", scene.model_dump(exclude=IGNORED_FIELDS, exclude_none=True, by_alias=True))
+    )
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:

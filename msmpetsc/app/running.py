@@ -5,9 +5,11 @@ import shlex
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -31,7 +33,7 @@ from msmpetsc.backend import kernel_cache
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.results.checkpoint_reader import Earlier
+from msmpetsc.results.checkpoint_reader import Earlier, end_of_run
 from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import GrowingXdmf, write_xdmf
@@ -209,7 +211,7 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     )
 
 
-def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
+def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, Any]:
     """Return the attributes of the result file: versions, options, ranks, command and scene."""
     options = PETSc.Options().getAll().items()
     # relative paths of a scene without a file start from its folder
@@ -228,10 +230,15 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
     }
 
 
-def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
-    """Open the result file for writing, new or of the resumed run (collective)."""
+def open_output(
+    comm: MPI.Intracomm, plan: RunPlan, more: Mapping[str, Any] | None = None
+) -> ResultFile:
+    """Open the result file for writing, new or of the resumed run (collective).
+
+    more : further attributes of the file
+    """
     request = plan.request
-    attributes = attributes_of(comm, plan.scene, request)
+    attributes = attributes_of(comm, plan.scene, request) | dict(more or {})
     if plan.resumed:
         return plan.resumed.file(comm, attributes, request.gather)
     begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
@@ -240,7 +247,7 @@ def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
     """Return the model after logging its size and checking it for a resume (collective)."""
-    model = build_model(comm, plan.scene)
+    model = build_model(comm, plan.scene, None, partial(end_of_run, comm, plan.scene.folder))
     log_model(comm, model)
     warn_of_long_steps(plan.scene, model)
     if plan.resumed:

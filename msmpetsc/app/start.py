@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from time import perf_counter
@@ -20,7 +21,7 @@ from msmpetsc.app.resume import earlier_run, kept_options
 from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import STATUS_INTERRUPTED, InputError
 from msmpetsc.fields import Frame
-from msmpetsc.results.checkpoint_reader import Earlier
+from msmpetsc.results.checkpoint_reader import Earlier, end_of_run
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.petsc.initialise import lent_options, start_for_runs
 from msmpetsc.solve.petsc.words import words_of
@@ -277,7 +278,8 @@ class Simulation:
         simulate.refuse_bad_options(scene)
         if self._geometry is None or not self._geometry.fits(scene):
             self._geometry = Geometry(self.comm, scene)
-        self.model = model = build_model(self.comm, scene, self._geometry)
+        read_state = partial(end_of_run, self.comm, scene.folder)
+        self.model = model = build_model(self.comm, scene, self._geometry, read_state)
         loop = resources.enter_context(simulate.TimeLoop(self.comm, scene, model))
         if alone:
             loop.refuse_unused_options()

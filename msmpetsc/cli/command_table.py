@@ -202,6 +202,27 @@ COMMANDS = {
         description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options, with a single "
         "dash, may follow.",
     ),
+    "modes": Command(
+        "find natural frequencies and mode shapes",
+        (
+            "msmpetsc modes my.toml --count 20",
+            "msmpetsc modes my.toml -o out/modes.h5 --overwrite",
+        ),
+        (
+            SCENE,
+            whole("--count", "N", "number of modes, rigid modes included (10)", default=10),
+            argument(
+                "-o", "--output", metavar="OUT.h5", type=checked_file,
+                help="result file of the shapes: frame N is mode N",
+            ),
+            switch("--overwrite", "replace OUT.h5 if it exists"),
+            SET,
+            JSON,
+        ),
+        description="Find the lowest natural frequencies of the held or free bodies, rigid modes "
+        "first: about the equilibrium of a static scene, about the state that start.from names, or "
+        "at rest.",
+    ),
     "inspect": Command(
         "estimate the size and memory of a scene on a number of ranks",
         ("msmpetsc inspect my.toml --ranks 64", "msmpetsc inspect my.toml --json"),

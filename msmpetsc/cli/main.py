@@ -35,6 +35,8 @@ from msmpetsc.errors import (
 
 # commands that need the packages of the extra "render" only
 READING = ("render", "export", "compare", "series")
+# commands that may use several ranks
+ON_RANKS = ("run", "modes")
 # options with a single dash that are not PETSc's
 OUR_SHORT = ("-o", "-h")
 
@@ -48,8 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
         with ending_together(comm):
             # --help and --version exit here
             args = parsed(words)
-            # only `run` may use several ranks
-            comm = world(started=args.command == "run")
+            comm = world(started=args.command in ON_RANKS)
         extra = "render" if args.command in READING else "run"
         level = logging.WARNING if args.quiet else logging.INFO
         with logged_on_root(comm, level, args.verbose), ending_together(comm, extra):
@@ -77,7 +78,7 @@ def carry_out(args: argparse.Namespace, ranks: int) -> int:
     Raises InputError on several ranks for a command that is for a single process.
     """
     command = COMMANDS[args.command]
-    if ranks > 1 and args.command != "run":
+    if ranks > 1 and args.command not in ON_RANKS:
         raise InputError(f"{args.command} is for one process: start it without mpiexec")
     # SIGTERM, like Ctrl-C, then also ends the runs that the command has started
     if command.starts_runs:

@@ -39,6 +39,7 @@ class Blocks(NamedTuple):
                 filled up with an index past the end; (8, 0) on a CPU
     owned     : number of blocks of cells that the rank owns
     h4        : four times the side h of a cell [m]
+    u         : number of the volumetric energy (elasticity.neo_hookean)
     """
 
     nodes: Indices
@@ -47,6 +48,7 @@ class Blocks(NamedTuple):
     around: Indices
     owned: int
     h4: float
+    u: int
 
 
 class CellRows(NamedTuple):
@@ -63,6 +65,7 @@ class CellRows(NamedTuple):
     which: Indices
     constants: Floats
     h4: float
+    u: int
     by_node: bool
     state: Floats
     width: int
@@ -74,10 +77,10 @@ def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
     own = constants[:0] if state is None else state.ravel()
     width = len(own) // (LANES * len(blocks.nodes))
     nodes = blocks.nodes.reshape(-1, 8)
-    return CellRows(nodes, blocks.which, constants, blocks.h4, by_node, own, width)
+    return CellRows(nodes, blocks.which, constants, blocks.h4, blocks.u, by_node, own, width)
 
 
-def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
+def blocks_of(lattice: Lattice, constants: Rows, u: int) -> Blocks:
     """Return the lattice's cells with their constants (c, ROWS), on the device of its nodes.
 
     Cells with equal constants share blocks, so that few distinct rows are stored.
@@ -102,7 +105,7 @@ def blocks_of(lattice: Lattice, constants: Rows) -> Blocks:
         around = rows_of(corners.ravel().astype(np.int64), lattice.owned)
     arrays = nodes, which.astype(np.int32), rows[first], around
     nodes, which, distinct, around = (like(lattice.nodes, array) for array in arrays)
-    return Blocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size)
+    return Blocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size, u)
 
 
 def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:

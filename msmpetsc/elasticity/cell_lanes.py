@@ -18,6 +18,7 @@ from msmpetsc.elasticity.assumed_strain import rest_constants
 from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, STATE, Blocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
+    QUADRATIC,
     cell_gradient,
     cell_product,
     determinant_and_change,
@@ -117,10 +118,19 @@ def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
 
 
 @njit(fastmath=FAST, error_model="numpy")
-def _gradient_lanes(w: Floats, h4: float) -> None:
+def _quadratic_gradient_lanes(w: Floats, h4: float) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        slopes, modes = cell_gradient(rest_constants(w, k), w[k + 104], w[k + 112], e, h4)
+        rest, m, lame = rest_constants(w, k), w[k + 104], w[k + 112]
+        slopes, modes = cell_gradient(rest, m, lame, e, h4, QUADRATIC)
+        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
+
+
+@njit(fastmath=FAST, error_model="numpy")
+def _gradient_lanes(w: Floats, h4: float, u: int) -> None:
+    for lane in range(LANES):
+        k, e = CONSTANTS + lane, _strains_in(w, lane)
+        slopes, modes = cell_gradient(rest_constants(w, k), w[k + 104], w[k + 112], e, h4, u)
         write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
 
 
@@ -131,7 +141,11 @@ def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
     for b in range(len(blocks.nodes)):
         _gather(blocks.nodes, b, q, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        _gradient_lanes(w, blocks.h4)
+        # Only a number known to the compiler lets it vectorise the loop
+        if blocks.u == QUADRATIC:
+            _quadratic_gradient_lanes(w, blocks.h4)
+        else:
+            _gradient_lanes(w, blocks.h4, blocks.u)
         _scatter(blocks.nodes, b, w, gradient)
 
 
@@ -161,6 +175,6 @@ def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
             j_base, j_change = w[s], w[s + 8]
             if m > 0.0:
                 change += w[s + 16] + blocks.h4**2 * volume_change(
-                    j_base + j_change, j_base, j_change, m, lame
+                    j_base + j_change, j_base, j_change, m, lame, blocks.u
                 )
     return change

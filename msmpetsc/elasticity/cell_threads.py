@@ -83,7 +83,9 @@ def _write_gradients(
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
         m, lame = cells.constants[k + 104], cells.constants[k + 112]
-        slopes, modes = cell_gradient(rest_constants(cells.constants, k), m, lame, e, cells.h4)
+        slopes, modes = cell_gradient(
+            rest_constants(cells.constants, k), m, lame, e, cells.h4, cells.u
+        )
         at = (i // LANES) * 24 * LANES + i % LANES
         write_forces(store, at, form_of(cells.constants, k), slopes, modes)
 
@@ -111,7 +113,7 @@ def _write_states(
         k, e, inverse_h4 = constants_at(cells, i), strains_at(q, cells, i), 1.0 / cells.h4
         f = gradient_of(e, inverse_h4)
         slope, curvature = slopes_at(
-            f, cells.constants[k + 104], cells.constants[k + 112], projected
+            f, cells.constants[k + 104], cells.constants[k + 112], cells.u, projected
         )
         write_state(cells.state, state_at(cells, i), f, slope, curvature)
         if not projected:
@@ -127,9 +129,9 @@ def _write_changes(
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
         g, f = gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)
         j_base, j_change = determinant_and_change(g, f)
-        m, parts[i] = cells.constants[k + 104], 0.0
+        m, lame, parts[i] = cells.constants[k + 104], cells.constants[k + 112], 0.0
         if m > 0.0:
-            volume = volume_change(j_base + j_change, j_base, j_change, m, cells.constants[k + 112])
+            volume = volume_change(j_base + j_change, j_base, j_change, m, lame, cells.u)
             forms = forms_change(cells.constants, k, g, e, d, 1.0 / cells.h4)
             parts[i] = forms + cells.h4**2 * volume
 

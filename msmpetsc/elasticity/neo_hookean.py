@@ -3,15 +3,19 @@
 A cell has Lame's constants mu and lambda and the volume V inside the surface. F is the mean
 deformation gradient over that volume, J = det F. The energy is
 
-    E = V (mu/2 (|F|^2 - 3) + U(J)) + W,        U(J) = -mu ln J + lambda/2 (J - 1)^2
+    E = V (mu/2 (|F|^2 - 3) + U(J)) + W,        U(J) = -mu ln J + lambda u(J)
 
 for J above J_0 (Bonet and Wood 2008, Eq. 6.27; Smith, de Goes and Kim 2018 on the logarithm). Below
 J_0, U is continued by its Taylor polynomial of second order. W is the energy of bending and twist
-within the cell (elasticity.assumed_strain).
+within the cell (elasticity.assumed_strain). The volumetric energy u is
+
+    quadratic    (J - 1)^2 / 2
+    log          (ln J)^2 / 2
+    simo         (J^2 - 1 - 2 ln J) / 4        (Simo and Taylor 1982)
 
 - L in A = M + t^2 L is 2 mu + 3 lambda times the integral of |grad x|^2, or more
   (lattice.cell_moments.bounding_laplacians): A dominates the Hessian.
-- U'' > 0 everywhere, so an inverted cell is pushed back.
+- U'' > 0, but for ``log`` above J = e^(1 + mu / lambda). So an inverted cell is pushed back.
 - The second variation at rest is not negative, however the cell is cut. For a mean slope G
   it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the squares of W.
 
@@ -21,11 +25,11 @@ into blocks:
 
 - 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu];
 - a 3 x 3 block: sum (mu s_i^2 - U' J) y_i^2 + (U'' J^2 + U' J) (sum y_i)^2 with y_i = x_i / s_i.
-  It is not negative if U' < 0 and J >= 1/2.
+  It is not negative if U' < 0, J >= 1/2 and U'' >= 0, for each u.
 
 For all other F the term of U' is at most |U'| R |F| in norm, with R^2 = 4/3. The reason is that
 the traceless matrix of s has the norm sqrt(2) |F|. The projected Hessian limits |U'| so that mu
-outweighs this term.
+outweighs this term, and raises U'' to zero.
 
 The loops of a CPU (elasticity.cell_lanes) and of a GPU (elasticity.cell_threads) share these
 formulas. A Hessian stores F, V U' and V U'' of each cell, and its modes unless it is projected.
@@ -50,6 +54,9 @@ from msmpetsc.elasticity.assumed_strain import (
 from msmpetsc.elasticity.cell_strain import Eight, Modes, Nine, Seven, Strains
 from msmpetsc.elasticity.springs import Vector
 
+# Names of the volumetric energies u; kernels have their numbers
+VOLUMETRIC = ("quadratic", "log", "simo")
+QUADRATIC, LOG, SIMO = range(len(VOLUMETRIC))
 # J_0 [-]; U is a parabola below, so that the force on an inverted cell stays finite
 ONSET = 0.2
 # least J [-] at which compression keeps the 3 x 3 block semidefinite; see above
@@ -107,35 +114,59 @@ def _change_of_cofactors(f: Nine, g: Nine) -> Nine:
 
 
 @njit(inline="always")
-def _slopes(j: float, mu: float, lame: float) -> tuple[float, float]:
-    """Return U' and U'' [Pa] at J = j."""
-    above = max(j, ONSET)
-    curvature = mu / (above * above) + lame
-    return lame * (above - 1.0) - mu / above + curvature * (j - above), curvature
+def _volumetric_slopes(j: float, u: int) -> tuple[float, float]:
+    """Return u' and u'' at J = j, for the volumetric energy of number u."""
+    slope, curvature = j - 1.0, 1.0
+    if u == LOG:
+        slope, curvature = math.log(j) / j, (1.0 - math.log(j)) / (j * j)
+    elif u == SIMO:
+        slope, curvature = 0.5 * (j - 1.0 / j), 0.5 + 0.5 / (j * j)
+    return slope, curvature
 
 
 @njit(inline="always")
-def volume_energy(j: float, mu: float, lame: float) -> float:
+def _volumetric_change(j: float, before: float, change: float, u: int) -> float:
+    """Return u(j) - u(before) with the digits of ``change`` = j - before."""
+    if u == QUADRATIC:
+        return 0.5 * change * (j + before - 2.0)
+    growth = math.log1p(change / before)
+    if u == LOG:
+        return 0.5 * growth * math.log(j * before)
+    return 0.25 * change * (j + before) - 0.5 * growth
+
+
+@njit(inline="always")
+def _slopes(j: float, mu: float, lame: float, u: int) -> tuple[float, float]:
+    """Return U' and U'' [Pa] at J = j."""
+    above = max(j, ONSET)
+    slope, bend = _volumetric_slopes(above, u)
+    curvature = mu / (above * above) + lame * bend
+    return lame * slope - mu / above + curvature * (j - above), curvature
+
+
+@njit(inline="always")
+def volume_energy(j: float, mu: float, lame: float, u: int) -> float:
     """Return U [Pa] at J = j."""
     above = max(j, ONSET)
     below = j - above
-    slope, curvature = _slopes(above, mu, lame)
+    slope, curvature = _slopes(above, mu, lame, u)
     return (
-        0.5 * lame * (above - 1.0) ** 2
+        lame * _volumetric_change(above, 1.0, above - 1.0, u)
         - mu * math.log(above)
         + below * (slope + 0.5 * curvature * below)
     )
 
 
 @njit(inline="always")
-def volume_change(j: float, before: float, change: float, mu: float, lame: float) -> float:
+def volume_change(j: float, before: float, change: float, mu: float, lame: float, u: int) -> float:
     """Return U(j) - U(before) [Pa] with the digits of ``change`` = j - before."""
     if j >= ONSET and before >= ONSET:
-        return 0.5 * lame * change * (j + before - 2.0) - mu * math.log1p(change / before)
+        change_of_u = _volumetric_change(j, before, change, u)
+        return lame * change_of_u - mu * math.log1p(change / before)
     if j < ONSET and before < ONSET:
-        slope, curvature = _slopes(ONSET, mu, lame)
+        slope, curvature = _slopes(ONSET, mu, lame, u)
         return change * (slope + 0.5 * curvature * (j + before - 2.0 * ONSET))
-    return volume_energy(j, mu, lame) - volume_energy(before, mu, lame)
+    return volume_energy(j, mu, lame, u) - volume_energy(before, mu, lame, u)
 
 
 @njit(inline="always")
@@ -215,12 +246,12 @@ def kept_modes(state: Floats, s: int) -> Three:
 
 
 @njit(inline="always")
-def slope_gradient(e: Strains, m: float, lame: float, h4: float) -> Nine:
+def slope_gradient(e: Strains, m: float, lame: float, h4: float, u: int) -> Nine:
     """Return the derivative (9,) of E with respect to 4 h times the mean slope."""
     g, inverse_h4 = _slope_of(e), 1.0 / h4
     n = cofactors(g)
     j = determinant(g, n) * (inverse_h4 * inverse_h4 * inverse_h4)
-    return _plus(_times(m, g), inverse_h4 * _slopes(j, m, lame)[0], n)
+    return _plus(_times(m, g), inverse_h4 * _slopes(j, m, lame, u)[0], n)
 
 
 @njit(inline="always")
@@ -240,7 +271,9 @@ def slope_product(e: Strains, m: float, state: Floats, s: int) -> Nine:
 
 
 @njit(inline="always")
-def cell_gradient(rest: Eight, m: float, lame: float, e: Strains, h4: float) -> tuple[Nine, Modes]:
+def cell_gradient(
+    rest: Eight, m: float, lame: float, e: Strains, h4: float, u: int
+) -> tuple[Nine, Modes]:
     """Return the gradient of E by 4 h times the mean slopes (9,) and by the modes (3 x 4).
 
     The constants are not in an array, because numba would then not vectorise loops over cells.
@@ -248,8 +281,9 @@ def cell_gradient(rest: Eight, m: float, lame: float, e: Strains, h4: float) -> 
     rest    : ``rest_constants``
     m, lame : V mu and V lambda over 16 h^2
     e       : strains of positions
+    u       : number of the volumetric energy
     """
-    slopes = slope_gradient(e, m, lame, h4)
+    slopes = slope_gradient(e, m, lame, h4, u)
     turning, modes = rest_gradient(rest, columns(gradient_of(e, 1.0 / h4)), e, 1.0 / h4)
     return _sum(slopes, turning), modes
 
@@ -305,19 +339,23 @@ def write_modes(store: Floats, s: int, e: Strains, inverse_h4: float) -> None:
 
 
 @njit(inline="always")
-def slopes_at(f: Nine, mu: float, lame: float, projected: bool) -> tuple[float, float]:
-    """Return U' and U'' at F. If ``projected``, |U'| is limited so that mu outweighs it."""
+def slopes_at(f: Nine, mu: float, lame: float, u: int, projected: bool) -> tuple[float, float]:
+    """Return U' and U'' at F.
+
+    If ``projected``, U'' is not negative, and |U'| is limited so that mu outweighs it.
+    """
     n = cofactors(f)
     j = determinant(f, n)
-    slope, curvature = _slopes(j, mu, lame)
+    slope, curvature = _slopes(j, mu, lame, u)
     if projected:
+        curvature = max(curvature, 0.0)
         limit = mu / _coupling_bound(f, j, slope, ONSET)
         slope = min(max(slope, -limit), limit)
     return slope, curvature
 
 
 @njit(inline="always")
-def concavity_bounds(c: Floats, k: int, e: Strains, h4: float) -> tuple[float, float]:
+def concavity_bounds(c: Floats, k: int, e: Strains, h4: float, u: int) -> tuple[float, float]:
     """Return a, b >= 0: the Hessian's form is at least -a |G|^2 - b |h|^2.
 
     G are the slopes of a displacement, and h its modes XY, XZ and YZ. mu outweighs a part of the
@@ -330,8 +368,9 @@ def concavity_bounds(c: Floats, k: int, e: Strains, h4: float) -> tuple[float, f
         return 0.0, 0.0
     n = cofactors(f)
     j = determinant(f, n)
-    slope = _slopes(j, mu, lame)[0]
+    slope, curvature = _slopes(j, mu, lame, u)
     left = mu - abs(slope) * _coupling_bound(f, j, slope, CONVEX)
+    left += min(curvature, 0.0) * _inner(n, n)
     return rest_concavity(rest_constants(c, k), columns(f), e, 1.0 / h4, left)
 
 

@@ -42,6 +42,7 @@ from msmpetsc.elasticity.cell_blocks import (
 from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import constants_at, linearise, state_at, strains_at
 from msmpetsc.elasticity.neo_hookean import (
+    VOLUMETRIC,
     along_cofactors,
     concavity_bounds,
     corner_stiffness,
@@ -84,7 +85,7 @@ def _add_concavity(
             slope, mode = _sizes(a, cells.constants, k)
             slopes += slope
             modes += mode
-        of_slopes, of_modes = concavity_bounds(cells.constants, k, e, cells.h4)
+        of_slopes, of_modes = concavity_bounds(cells.constants, k, e, cells.h4, cells.u)
         for a in range(8):
             slope, mode = _sizes(a, cells.constants, k)
             bound = of_slopes * slopes * slope + of_modes * modes * mode
@@ -170,7 +171,7 @@ class NeoHookean:
         constants = np.concatenate(
             [forms[:, :6], modes, m, (lame * volume / h4**2)[:, None]], axis=1
         )
-        return cls(blocks_of(lattice, constants))
+        return cls(blocks_of(lattice, constants, VOLUMETRIC.index(lattice.volumetric)))
 
     @property
     def corners(self) -> Indices:

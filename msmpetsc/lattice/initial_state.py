@@ -1,6 +1,6 @@
 """Initial state of bodies: positions and velocities of their nodes at time 0."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from mpi4py import MPI
@@ -12,10 +12,17 @@ from msmpetsc.scene.motion import Start, Twist
 
 # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 InitialState = tuple[Positions, Rows]
+# returns the last state in a result file of the lattice (results.checkpoint_reader)
+ReadState = Callable[[str, Lattice], InitialState]
 
 
 def initial_state(
-    comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
+    comm: MPI.Comm,
+    starts: Sequence[Start | None],
+    lattice: Lattice,
+    held: Mask,
+    bounds: Rows,
+    read_state: ReadState | None = None,
 ) -> InitialState:
     """Return initial positions and velocities of nodes from their bodies' starts (collective).
 
@@ -23,6 +30,10 @@ def initial_state(
     held   : (l,) bool, nodes that stay at rest in their rest positions
     bounds : (b, 2, 3) bounding box of each body at rest [m]
     """
+    states = {}
+    for name in dict.fromkeys(start.from_ for start in starts if start and start.from_):
+        assert read_state is not None
+        states[name] = read_state(name, lattice)
     velocity = np.zeros_like(lattice.nodes)
     if not any(starts):
         return lattice.nodes, velocity
@@ -32,13 +43,29 @@ def initial_state(
             own = np.flatnonzero(body == number)
             owned = int((own < lattice.owned).sum())
             q[own] = moved(start, lattice.nodes[own], lattice.global_numbers[own], bounds[number])
-            q[own[held[own]]] = lattice.nodes[own[held[own]]]
+            at_rest = held[own]
+            if start.from_ is not None:
+                q[own], velocity[own] = (rows[own] for rows in states[start.from_])
+                at_rest = held[own] & ~lattice.pinned[own]
+            q[own[at_rest]] = lattice.nodes[own[at_rest]]
             mass = lattice.mass[own[:owned]]
             total: Floats = comm.allreduce(np.append(mass @ q[own[:owned]], mass.sum()))
-            centre_of_mass = total[:3] / total[3]
-            velocity[own] = np.array(start.velocity) + np.cross(start.spin, q[own] - centre_of_mass)
+            about = total[:3] / total[3] if start.about is None else np.array(start.about)
+            velocity[own] += velocity_field(start, q[own] - about)
     velocity[held] = 0
     return q, velocity
+
+
+def velocity_field(start: Start, r: Rows) -> Rows:
+    """Return the velocities (n, 3) [m/s] of a start at r (n, 3) [m], relative to ``about``."""
+    velocity: Rows = np.array(start.velocity) + np.cross(start.spin, r)
+    if start.gradient is not None:
+        velocity += r @ np.array(start.gradient).T
+    if start.swirl is not None:
+        a = np.array(start.swirl.axis) / np.linalg.norm(start.swirl.axis)
+        rate = np.interp(r @ a, start.swirl.distances, start.swirl.rates)
+        velocity += rate[:, None] * np.cross(a, r)
+    return velocity
 
 
 def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Positions:

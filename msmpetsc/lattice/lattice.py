@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, to_host
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.lattice.mass_and_stiffness import SolidCells, law_of_solid, law_of_springs
@@ -41,6 +41,7 @@ class Lattice:
     cell_fill   : (c,) fraction of each of ``cells`` that lies inside the surface [-]
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
     solid       : constants of a neo-Hookean solid; None if the law is springs
+    volumetric  : name of a solid's volumetric energy (elasticity.neo_hookean)
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
     """
 
@@ -62,6 +63,7 @@ class Lattice:
     cell_fill: Floats = field(default_factory=lambda: np.empty(0))
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
     solid: SolidCells | None = None
+    volumetric: str = "quadratic"
     viscous: float = 0.0
 
     @property
@@ -87,6 +89,12 @@ class Lattice:
         """Return the greatest stiffness [N/m] of a spring, or of a solid's cell (collective)."""
         stiffness = self.stiffness if self.solid is None else self.cell_stiffness
         return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
+
+    def longest_side(self) -> float:
+        """Return the longest side [m] of the bounding box of all nodes at rest (collective)."""
+        own = [to_host(self.nodes.min(axis=0)), to_host(self.nodes.max(axis=0))]
+        low, high = np.array(self.table.comm.allgather(own)).transpose(1, 0, 2)
+        return float((high.max(axis=0) - low.min(axis=0)).max())
 
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool pinned, too."""
@@ -136,4 +144,5 @@ def build_lattice(
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid and SolidCells(*(rows[kept] for rows in law.solid)),
+        volumetric=material.volume,
     )

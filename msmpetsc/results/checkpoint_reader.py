@@ -10,14 +10,17 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Indices
-from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.checkpoint import AT_END, Checkpoint
 from msmpetsc.comm import on_root, together
 from msmpetsc.errors import InputError
 from msmpetsc.fields import CHECKPOINT
+from msmpetsc.lattice.initial_state import InitialState
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.results.comparison import rows_agree
 from msmpetsc.results.layout import scatter_rows
 from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import as_python, plain_damage
+from msmpetsc.scene.reading import scene_of
 
 # median distance of a checkpoint from its frame, in longest sides [-]; most stay near
 NEAR = 0.01
@@ -50,6 +53,8 @@ class Earlier:
     def read(cls, path: Path) -> "Earlier":
         """Read the earlier run on a single rank. Raises InputError if the file is no result."""
         with Result(path) as result:
+            if "frequencies" in result.attributes:
+                raise InputError(f"{path} has the modes of a body, no run to go on from")
             texts = {
                 name: value for name, value in result.attributes.items() if isinstance(value, str)
             }
@@ -150,10 +155,44 @@ def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
         )
 
 
-def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]) -> None:
+def end_of_run(comm: MPI.Comm, folder: Path, name: str, lattice: Lattice) -> InitialState:
+    """Return positions and velocities at the end of a result file's run (collective).
+
+    folder, name : the file's path, as in ``start.from``
+
+    A run that was stopped ends at its last checkpoint. Raises InputError for a file without a
+    state, of another lattice, or damaged.
+    """
+    path = folder / name
+    earlier: Earlier = comm.bcast(on_root(comm, lambda: Earlier.read(path)))
+    at_rest = lattice.nodes[: lattice.owned]
+    words = "start.from: it is of another lattice"
+    refuse_changed_lattice(comm, path, {"lattice/nodes": at_rest}, words)
+    with opened_on_root(comm, path) as run:
+        slot = comm.bcast(on_root(comm, lambda: _last_slot(run)))
+        if slot is None or "scene" not in earlier.texts:
+            raise InputError(f"{path}: start.from: it has no state to start from")
+        names = "q", "q_previous"
+        own = {n: _own_rows(comm, run, (f"checkpoint/{n}", slot), lattice.owned) for n in names}
+    Checkpoint(rows=own).refuse_rows_unlike(comm, Checkpoint(rows=dict.fromkeys(names, at_rest)))
+    time_step = scene_of(path, earlier.texts["scene"], to_read=False).time.step
+    q, q_previous = (lattice.table.with_ghosts(lattice.ghosts, own[n]) for n in names)
+    return q, (q - q_previous) / time_step
+
+
+def _last_slot(run: Result) -> int | None:
+    """Return the slot of the state at the end of a run, or of the newest checkpoint, or None."""
+    steps = run["checkpoint/step"][:]
+    return int(np.argmin(steps)) if steps.min() <= AT_END else newest_slot(steps)
+
+
+def refuse_changed_lattice(
+    comm: MPI.Comm, path: Path, lattice: dict[str, Array], words: str = "the mesh has changed"
+) -> None:
     """Raise InputError if a lattice differs from the lattice in the file (collective).
 
     lattice : this rank's rows by dataset, "lattice/nodes"
+    words   : what is wrong then
     """
     with opened_on_root(comm, path) as run:
         counts = comm.bcast(
@@ -168,9 +207,7 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
                 agree = rows_agree(np.asarray(rows, float), stored, SAME_LATTICE * greatest).all()
                 same = all(comm.allgather(bool(agree)))
             if not same:
-                raise InputError(
-                    f"{path}: the mesh has changed: {name} differs from this run's lattice"
-                )
+                raise InputError(f"{path}: {words}: {name} differs from this run's lattice")
 
 
 @contextmanager

@@ -128,6 +128,11 @@ class Material(Table):
         0.25,
         description='Poisson\'s ratio, with law = "neo-hookean"; tissue has 0.45 to 0.49 [-]',
     )
+    volume: Literal["quadratic", "log", "simo"] = Field(
+        "quadratic",
+        description='energy of the volume ratio J beside -mu ln J, with law = "neo-hookean": '
+        "quadratic, lambda/2 (J - 1)^2; log, lambda/2 (ln J)^2; simo, lambda/4 (J^2 - 1 - 2 ln J)",
+    )
     damping: NotNegative = Field(
         0.0,
         description="mass-proportional damping: free velocities decay as exp(-damping t) [1/s]",
@@ -138,7 +143,7 @@ class Material(Table):
         'with law = "neo-hookean" [s]',
     )
 
-    _is_of_solids = field_validator("poisson_ratio", "retardation_time")(
+    _is_of_solids = field_validator("poisson_ratio", "volume", "retardation_time")(
         only_for("law", "neo-hookean")
     )
 

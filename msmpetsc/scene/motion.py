@@ -10,13 +10,16 @@ from msmpetsc.scene.problems import rule
 from msmpetsc.scene.suggestions import TAGS
 from msmpetsc.scene.values import (
     Direction,
+    FileName,
     FunctionName,
     ListOf,
+    Matrix,
     NotNegative,
     Positive,
     Table,
     Vector,
     after_start,
+    refuse_unlike,
 )
 
 
@@ -32,12 +35,34 @@ class Twist(Table):
     )
 
 
+class Swirl(Table):
+    """An angular velocity about an axis, piecewise linear along it, constant beyond the table."""
+
+    axis: Direction = Field(description="axis through start.about, of any nonzero length [-]")
+    distances: ListOf[float] = Field(description="ascending distances along the axis [m]")
+    rates: ListOf[float] = Field(
+        description="angular velocity at each distance, right-handed about the axis [rad/s]"
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        refuse_unlike(self.distances, self.rates, "distances", "rates")
+        return self
+
+
 class Start(Table):
     """The state of a body at time 0: its rest shape scaled, then twisted, then scattered.
 
-    Pinned and anchored nodes stay at their rest positions without velocity.
+    Pinned and anchored nodes stay at their rest positions without velocity. A state of another run
+    takes the place of the rest shape, also for pinned nodes; velocities are added.
     """
 
+    from_: FileName | None = Field(
+        None,
+        alias="from",
+        description="result file of a run of the same lattice, in or below the scene's folder; its "
+        "last state takes the place of the rest shape at rest",
+    )
     scale: Vector = Field(
         (1.0, 1.0, 1.0),
         description="scale factors along x, y, z about the centre of the rest bounding box; "
@@ -52,12 +77,28 @@ class Start(Table):
         "bounding box [-]",
     )
     velocity: Vector = Field((0.0, 0.0, 0.0), description="velocity of all nodes [m/s]")
-    spin: Vector = Field(
-        (0.0, 0.0, 0.0), description="angular velocity about the centre of mass [rad/s]"
+    spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about start.about [rad/s]")
+    gradient: Matrix | None = Field(
+        None, description="rows of G, for the velocity G (x - about) at a position x [1/s]"
     )
+    swirl: Swirl | None = Field(None, description="an angular velocity that varies along an axis")
+    about: Vector | None = Field(
+        None,
+        description="point about which spin, gradient and swirl act [m]; the centre of mass if "
+        "absent",
+    )
+
+    @property
+    def moves(self) -> bool:
+        """Return whether the table gives a velocity."""
+        turns = any(self.spin) or self.gradient is not None or self.swirl is not None
+        return any(self.velocity) or turns
 
     @model_validator(mode="after")
     def _is_no_point(self) -> Self:
+        is_scaled = self.scale != (1.0, 1.0, 1.0)
+        if self.from_ is not None and (is_scaled or self.twist is not None or self.scatter):
+            raise rule("has from, whose shape may not be scaled, twisted or scattered")
         if not any(self.scale) and not self.scatter:
             raise rule(
                 "scales the body to a point, where springs have no direction; give 0.01 or scatter"
@@ -108,12 +149,7 @@ class ForceTable(Table):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "ForceTable":
-        if any(a >= b for a, b in pairwise(self.times)):
-            raise rule("must have ascending times")
-        if not self.times or len(self.times) != len(self.values):
-            raise rule(
-                f"has {len(self.times)} times and {len(self.values)} values: one value a time"
-            )
+        refuse_unlike(self.times, self.values, "times", "values")
         return self
 
 

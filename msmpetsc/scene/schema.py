@@ -296,6 +296,12 @@ class SceneFile(Table):
         }
         for path, mesh in (self.meshes | solids).items():
             yield (*path, "source"), mesh.source
+        starts = {("start",): self.start} | {
+            ("body", number, "start"): body.start for number, body in enumerate(self.body)
+        }
+        for keys, start in starts.items():
+            if start is not None and start.from_ is not None:
+                yield (*keys, "from"), start.from_
         for path, _, table in chain.from_iterable(self.tables(kind) for kind in OF_REGIONS):
             if isinstance(table.region.painted, str):
                 yield (*path, "region", "painted"), table.region.painted

@@ -139,9 +139,9 @@ def _broken_by_statics(scene: Any) -> Iterator[Broken]:
         yield "time", rule(words, "material")
     bodies = [("body", f"body.{number}.", body) for number, body in enumerate(scene.body)]
     for key, prefix, tables in [("", "", scene), *bodies]:
-        if tables.start is not None and (any(tables.start.velocity) or any(tables.start.spin)):
+        if tables.start is not None and tables.start.moves:
             words = (
-                f"{key and f'{prefix}start '}may have no velocity or spin with "
+                f"{key and f'{prefix}start '}may have no velocity, spin, gradient or swirl with "
                 f'time.integrator = "{STATIC}": there is no inertia'
             )
             yield key or "start", rule(words, "time")

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import (
@@ -81,6 +82,19 @@ def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | N
     return stop
 
 
+def refuse_unlike(places: Sequence[float], values: Sequence[Any], name: str, of: str) -> None:
+    """Raise a broken rule unless the places of a piecewise linear function ascend, one a value.
+
+    name, of : the keys of the places and of the values
+    """
+    if any(a >= b for a, b in pairwise(places)):
+        raise rule(f"must have ascending {name}")
+    if not places or len(places) != len(values):
+        raise rule(
+            f"has {len(places)} {name} and {len(values)} {of}: as many are needed, at least one"
+        )
+
+
 def only_for(key: str, *values: str) -> Callable[..., Any]:
     """Return a validator of a key that is allowed only if another key has a given value."""
 
@@ -109,6 +123,7 @@ GroupName = Annotated[FileName, BeforeValidator(_as_name)]
 FunctionName = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_printable)]
 IntegratorName = Literal["implicit-euler", "bdf2", "verlet", "static"]
 PresetName = Annotated[str, AfterValidator(_known_preset)]
+Matrix = Annotated[tuple[Vector, Vector, Vector], Strict(False)]
 Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
 Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
 
@@ -142,7 +157,7 @@ class Table(BaseModel):
     @classmethod
     def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
         """Return the checked table; raise all problems, pydantic's and our own, together."""
-        known = list(cls.model_fields)
+        known = [field.alias or name for name, field in cls.model_fields.items()]
         problems = one_of_problems(data, cls.one_of, known)
         try:
             table = handler(data)

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
-from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.checkpoint import AT_END, Checkpoint
 from msmpetsc.comm import Route
 from msmpetsc.constraints.holders import sums_by
 from msmpetsc.contact.obstacles.penalty import ContactAt
@@ -211,6 +211,14 @@ class TimeLoop:
             checkpoint.keep_counts(part)
         checkpoint.rows = {name: to_host(rows) for name, rows in checkpoint.rows.items()}
         return checkpoint
+
+    @property
+    def end(self) -> Checkpoint:
+        """Positions at the last step and before it, from which another run may start."""
+        owned = self.model.lattice.owned
+        rows = {"q": self.state.q[:owned], "q_previous": self.state.q_previous[:owned]}
+        step = AT_END - self.step
+        return Checkpoint(step, {name: to_host(values) for name, values in rows.items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Resume from a checkpoint before the first step (collective). Raises InputError."""

@@ -77,9 +77,7 @@ class Composition:
         stills = []
         for index in frames:
             overlays = overlays_at(self.subject, index, self.extremes, self.camera)
-            stills.append(
-                Still(index, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut)
-            )
+            stills.append(Still(index, overlays, (self.subject.moment(index), words), cut))
         return stills
 
     def room(self, stills: Sequence[Still]) -> tuple[Floats, Floats, float]:

@@ -1,7 +1,7 @@
 """Bodies to be drawn: from a result's frames, or from a scene before its first step."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -116,6 +116,7 @@ class Drawable:
     array     : function from the name of a result's dataset to its values
     solids    : surfaces at time 0 of obstacles that have a mesh, by obstacle number
     von_mises : function from a frame's number to nodal stress (n,) [Pa]; None if not stored
+    frequencies : (T - 1,) [Hz] of the modes that frames after the first show; empty for a run
     """
 
     name: str
@@ -129,6 +130,13 @@ class Drawable:
     array: Callable[[str], Array]
     solids: Mapping[int, Surface]
     von_mises: Callable[[int], Floats] | None = None
+    frequencies: Floats = field(default_factory=lambda: np.empty(0))
+
+    def moment(self, index: int) -> str:
+        """Return the caption of a frame: its time, or number and frequency of its mode."""
+        if 0 < index <= len(self.frequencies):
+            return f"mode {index}: {self.frequencies[index - 1]:.4g} Hz"
+        return f"t = {self.times[index]:.3f} s"
 
     @property
     def title(self) -> str:
@@ -181,6 +189,7 @@ def drawable_of_result(run: Result) -> Drawable:
         von_mises=(lambda index: run.frames.von_mises[index].astype(float))
         if "von_mises" in run.frames
         else None,
+        frequencies=np.ravel(run.attributes.get("frequencies", [])),
     )
 
 

@@ -71,7 +71,8 @@ CASES = {
     "solid, static": {
         "time": {**FALL["time"], "integrator": "static"},
         "gravity": {"acceleration": [0, 0, -40.0]}, **HELD,
-        "material": {**SOLID["material"], "poisson_ratio": 0.499}, "output": {"stress": True},
+        "material": {**SOLID["material"], "poisson_ratio": 0.499, "volume": "log"},
+        "output": {"stress": True},
     },
     "solid, verlet": {**FALL, **SOLID, **LED, "time": {**FALL["time"], "integrator": "verlet"}},
     "solid, multigrid": {**FALL, **VISCOUS, **HELD,

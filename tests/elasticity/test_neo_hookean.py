@@ -1,8 +1,11 @@
 """The neo-Hookean solid against closed forms, finite differences and dense eigenvalues, in whole
 and in cut cells."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from block_scene import clamped_beam, play
 from lattices import COMM, block, cages_of, dense_hessian
 from scipy.spatial.transform import Rotation
 
@@ -10,7 +13,7 @@ from msmpetsc.elasticity.assumed_strain import ASSUMED
 from msmpetsc.elasticity.cell_volume import least_volumes, volume_ratios
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import worst_inverted
-from msmpetsc.elasticity.neo_hookean import ONSET
+from msmpetsc.elasticity.neo_hookean import ONSET, VOLUMETRIC
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes
@@ -47,9 +50,11 @@ def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     ) / n
 
 
-def solid(*sides: int, poisson: float, cut: bool = False) -> Lattice:
+def solid(*sides: int, poisson: float, cut: bool = False, volume: str = "quadratic") -> Lattice:
     """A block of whole or of randomly cut cells."""
-    material = Material(density=1000, young_modulus=YOUNG, law="neo-hookean", poisson_ratio=poisson)
+    material = Material(
+        density=1000, young_modulus=YOUNG, law="neo-hookean", poisson_ratio=poisson, volume=volume
+    )
     lattice = build_lattice(cages_of(block(*sides), H), material)
     if not cut:
         return lattice
@@ -67,15 +72,20 @@ def gradient(elastic: Elasticity, q: np.ndarray) -> np.ndarray:
     return g
 
 
-cases = pytest.mark.parametrize(
-    ("poisson", "cut"), [(0.25, False), (0.0, True), (0.45, True), (0.49, False)]
+volumes = pytest.mark.parametrize("volume", VOLUMETRIC)
+CASES = [(0.25, False), (0.0, True), (0.45, True), (0.49, False)]
+cases = pytest.mark.parametrize(("poisson", "cut"), CASES)
+kinds = pytest.mark.parametrize(
+    ("poisson", "cut", "volume"),
+    [(*case, "quadratic") for case in CASES]
+    + [(*case, name) for case in CASES[2:] for name in ("log", "simo")],
 )
 
 
-@cases
-def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool):
+@kinds
+def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool, volume: str):
     """In states from strained to inverted: both branches of U."""
-    lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
+    lattice = solid(3, 2, 2, poisson=poisson, cut=cut, volume=volume)
     elastic = Elasticity(lattice)
     for strain in (0.05, 0.5):
         q = lattice.nodes + strain * H * RNG.standard_normal(lattice.nodes.shape)
@@ -149,11 +159,11 @@ def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
     )
 
 
-@cases
+@kinds
 def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(
-    poisson: float, cut: bool
+    poisson: float, cut: bool, volume: str
 ):
-    lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
+    lattice = solid(3, 2, 2, poisson=poisson, cut=cut, volume=volume)
     elastic = Elasticity(lattice)
     q, v = (lattice.nodes + 0.3 * H * RNG.standard_normal(lattice.nodes.shape) for _ in range(2))
     assert elastic.change(q, v) == pytest.approx(elastic.energy(q) - elastic.energy(v), rel=1e-12)
@@ -163,9 +173,9 @@ def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(
     )
 
 
-@cases
-def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: bool):
-    lattice = solid(3, 3, 2, poisson=poisson, cut=cut)
+@kinds
+def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: bool, volume: str):
+    lattice = solid(3, 3, 2, poisson=poisson, cut=cut, volume=volume)
     elastic = Elasticity(lattice)
     turned = Rotation.from_rotvec([1.0, -2.0, 0.5]).apply(lattice.nodes) + np.array([3, 2, 1])
     for q in (lattice.nodes, turned):
@@ -173,17 +183,19 @@ def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: b
         assert abs(elastic.energy(q)) < 1e-12 * YOUNG * H**3
 
 
-@cases
+@kinds
 def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_concavity(
-    poisson: float, cut: bool
+    poisson: float, cut: bool, volume: str
 ):
-    lattice = solid(2, 2, 1, poisson=poisson, cut=cut)
+    lattice = solid(2, 2, 1, poisson=poisson, cut=cut, volume=volume)
     elastic, worst = Elasticity(lattice), 0.0
     shapes = [
         np.diag([0.6, 1.2, 1.2]),
         np.diag([1.4, 1.4, 0.9]),
         np.diag([0.1, 0.1, -0.02]),
         np.diag([0.9, 0.9, -0.5]),
+        # U'' < 0 of the logarithm
+        np.diag([1.6, 1.6, 1.6]),
     ]
     for f in (np.eye(3), *shapes, *RNG.normal(size=(8, 3, 3))):
         for noise in (0.0, 0.3):
@@ -239,10 +251,12 @@ def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
     np.testing.assert_allclose(lattice.stiffness, np.array([0, 0, 5, 5])[kind] * H / 12, atol=1e-17)
 
 
-@cases
-def test_the_constant_laplacian_is_no_less_than_the_hessian_at_rest(poisson: float, cut: bool):
+@kinds
+def test_the_constant_laplacian_is_no_less_than_the_hessian_at_rest(
+    poisson: float, cut: bool, volume: str
+):
     """So that local/global iterations, which solve with it, come nearer."""
-    lattice = solid(3, 2, 2, poisson=poisson)
+    lattice = solid(3, 2, 2, poisson=poisson, volume=volume)
     laplacian = np.zeros(2 * (len(lattice.nodes),))
     for (a, b), k in zip(lattice.springs, lattice.stiffness, strict=True):
         laplacian[[a, b], [a, b]] += k
@@ -251,8 +265,68 @@ def test_the_constant_laplacian_is_no_less_than_the_hessian_at_rest(poisson: flo
     assert np.linalg.eigvalsh(np.kron(laplacian, np.eye(3)) - h).min() > -1e-12 * np.abs(h).max()
 
 
-def test_below_the_onset_the_volume_energy_goes_on_smoothly():
-    lattice = solid(1, 1, 1, poisson=0.3)
+# u(J) and u'(J) in closed form (Bonet and Wood 2008, chapter 6; Simo and Taylor 1982)
+U = {
+    "quadratic": (lambda j: (j - 1) ** 2 / 2, lambda j: j - 1),
+    "log": (lambda j: np.log(j) ** 2 / 2, lambda j: np.log(j) / j),
+    "simo": (lambda j: (j**2 - 1 - 2 * np.log(j)) / 4, lambda j: (j - 1 / j) / 2),
+}
+
+
+@volumes
+def test_uniform_strain_has_the_energy_and_the_forces_of_its_law(volume: str):
+    """Corner forces are P N_i, with the derivatives of trilinear functions in a whole cell."""
+    lattice = solid(1, 1, 1, poisson=0.4, volume=volume)
+    shear, lame = lame_constants(YOUNG, 0.4)
+    elastic, (u, slope) = Elasticity(lattice), U[volume]
+    outward = 2 * (lattice.nodes - lattice.nodes.mean(axis=0)) / H
+    for f in (
+        np.diag([0.7, 0.8, 0.9]),
+        np.diag([3.0, 0.5, 1.1]),
+        np.eye(3) + 0.2 * RNG.normal(size=(3, 3)),
+    ):
+        j = np.linalg.det(f)
+        energy = shear / 2 * (np.sum(f**2) - 3) - shear * np.log(j) + lame * u(j)
+        assert elastic.energy(lattice.nodes @ f.T) == pytest.approx(H**3 * energy, rel=1e-12)
+        stress = shear * f + (lame * slope(j) - shear / j) * j * np.linalg.inv(f).T
+        forces = H**2 / 4 * outward @ stress.T
+        np.testing.assert_allclose(
+            gradient(elastic, lattice.nodes @ f.T), forces, atol=1e-12 * np.abs(forces).max()
+        )
+
+
+@volumes
+def test_volumetric_energies_agree_at_small_strain_alone(volume: str):
+    quadratic, other = (solid(2, 1, 1, poisson=0.45, volume=name) for name in ("quadratic", volume))
+    at_rest, moved = quadratic.nodes, 1.1 * quadratic.nodes
+    hessians = [dense_hessian(Elasticity(lattice), at_rest) for lattice in (quadratic, other)]
+    np.testing.assert_allclose(*hessians, atol=1e-12 * np.abs(hessians[0]).max())
+    energies = [Elasticity(lattice).energy(moved) for lattice in (quadratic, other)]
+    assert (abs(energies[1] / energies[0] - 1) > 0.05) == (volume != "quadratic")
+
+
+@volumes
+def test_a_folded_bar_comes_to_an_end_without_cells_inside_out(tmp_path: Path, volume: str):
+    path = clamped_beam(
+        tmp_path,
+        material={"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean", "volume": volume},
+        start={"scale": [0.5, 1, -0.3]},
+        time={"integrator": "static"},
+    )
+    model, frames = play(path)
+    lattice = model.lattice
+    assert (
+        volume_ratios(
+            frames[0].position, lattice.local_cells, lattice.solid.forms, lattice.cell_size
+        ).min()
+        < 0
+    )
+    assert worst_inverted(COMM, lattice, frames[-1].position)[0] == 0
+
+
+@volumes
+def test_below_the_onset_the_volume_energy_goes_on_smoothly(volume: str):
+    lattice = solid(1, 1, 1, poisson=0.3, volume=volume)
     elastic = Elasticity(lattice)
     above, below = (lattice.nodes * [1, 1, ONSET + e] for e in (1e-9, -1e-9))
     np.testing.assert_allclose(

@@ -1,15 +1,18 @@
 """How a body starts: its places, its velocities, the same on any number of ranks."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from block_scene import CELL, DENSITY, SIDES, block_scene, play
+from conftest import result_on, run
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
+from msmpetsc.results.checkpoint_reader import end_of_run
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -122,6 +125,125 @@ def test_spin_has_the_angular_momentum_of_the_block(tmp_path: Path, integrator: 
     np.testing.assert_allclose(momentum, inertia * spin, rtol=1e-12)
     assert frames[0].kinetic == pytest.approx(inertia @ spin**2 / 2 + MASS / 2, rel=1e-12)
     np.testing.assert_allclose(frames[0].momentum, [0, 0, MASS], atol=1e-11)
+
+
+def test_gradient_stretches_and_turns_about_the_centre_or_a_point(tmp_path: Path):
+    """Of diag(a, b, c) the kinetic energy is m/2 (a^2 (A^2 / 12 + h^2 / 6) + ...), since a cell's
+    mass sits at its corners; an antisymmetric gradient is a spin."""
+    rates, about = np.array([2.0, -1.0, 3.0]), np.array([0.1, 0.2, -0.3])
+    second = SIDES**2 / 12 + CELL**2 / 6
+    energy = MASS / 2 * rates**2 @ second
+    frame = at_start(tmp_path, {"gradient": np.diag(rates).tolist()})[1]
+    assert frame.kinetic == pytest.approx(energy, rel=1e-12)
+    frame = at_start(tmp_path, {"gradient": np.diag(rates).tolist(), "about": about.tolist()})[1]
+    moved = energy + MASS / 2 * rates**2 @ (MIDDLE - about) ** 2
+    assert frame.kinetic == pytest.approx(moved, rel=1e-12)
+    np.testing.assert_allclose(frame.momentum, MASS * rates * (MIDDLE - about), rtol=1e-12)
+    x, y, z = rates
+    turning = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    for more in ({}, {"about": about.tolist()}):
+        by_spin, by_gradient = (
+            at_start(tmp_path, {name: value} | more)[0].start[1]
+            for name, value in (("spin", rates.tolist()), ("gradient", turning))
+        )
+        np.testing.assert_allclose(by_gradient, by_spin, atol=1e-15)
+
+
+@pytest.mark.parametrize("h", [1 / 2, 1 / 4])
+def test_swirl_of_the_twisting_column(tmp_path: Path, h: float):
+    """A column of 1 x 6 x 1 m and 1100 kg/m^3, turning by 105 sin(pi y / 12) about y, has 3.031875
+    MJ. With its mass at nodes, the sums of x^2 are larger by h^2 / 6, and the sums of the sine are
+    those of the trapezium rule: exact for sine^2, h/2 cot(pi h / 24) for the sine."""
+    y = np.arange(0, 6 + h / 2, h)
+    rates = 105 * np.sin(np.pi * y / 12)
+    swirl = {"axis": [0, 2, 0], "distances": y.tolist(), "rates": rates.tolist()}
+    path = block_scene(
+        tmp_path,
+        np.array([1, 6, 1]),
+        cages={"cell_size": h},
+        material={"young_modulus": 17e6, "density": 1100.0, "law": "neo-hookean"},
+        start={"about": [0.5, 0, 0.5], "swirl": swirl},
+        time={"step": 1e-4, "duration": 1e-4},
+    )
+    scene = load_scene(path)
+    model = build_model(MPI.COMM_SELF, scene)
+    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
+        frame = next(simulation.frames())
+    assert frame.kinetic == pytest.approx(3.031875e6 * (1 + 2 * h**2), rel=1e-12)
+    q, velocity = model.start
+    momentum = model.lattice.mass @ np.cross(q - [0.5, 0, 0.5], velocity)
+    exact = 1100 * 105 * (1 / 6 + h**2 / 3) * h / 2 / np.tan(np.pi * h / 24)
+    np.testing.assert_allclose(momentum[1], exact, rtol=1e-12)
+    np.testing.assert_allclose(frame.momentum, 0, atol=1e-6)
+
+
+def test_a_swirl_is_constant_beyond_its_table(tmp_path: Path):
+    swirl = {"axis": [0, 0, 1], "distances": [-0.01, 0.01], "rates": [-3, 3]}
+    model, _ = at_start(tmp_path, {"swirl": swirl})
+    r = model.lattice.nodes - MIDDLE
+    expected = 3 * np.sign(r[:, 2])[:, None] * np.cross([0, 0, 1], r)
+    np.testing.assert_allclose(model.start[1], expected, atol=1e-15)
+
+
+def hung(folder: Path, name: str, **tables) -> Path:
+    """A block that hangs by its side."""
+    material = {"young_modulus": 2e4, "density": DENSITY, "law": "neo-hookean"}
+    gravity = {"acceleration": [0, 0, -9.81]}
+    tables = {"pin": NEAR, "material": material, "gravity": gravity} | tables
+    return block_scene(folder, name=name, **tables)
+
+
+def test_a_state_of_equilibrium_stays_at_rest_on_any_number_of_ranks(tmp_path: Path):
+    """To the errors of its solves, 1e-9; the pinned nodes keep their places in the file."""
+    at_rest = result_on(1, hung(tmp_path, "rest", time={"integrator": "static"}))
+    nodes, found = at_rest["lattice/nodes"][:], at_rest["frames/position"][-1]
+    sag = np.abs(found - nodes).max()
+    going_on = hung(
+        tmp_path,
+        "going_on",
+        start={"from": "rest_1.h5"},
+        time={"step": T, "duration": 8 * T, "integrator": "bdf2"},
+    )
+    for ranks in (1, 3):
+        frames = result_on(ranks, going_on)["frames/position"][:]
+        np.testing.assert_array_equal(frames[0], found)
+        np.testing.assert_allclose(frames, np.broadcast_to(found, frames.shape), atol=1e-7 * sag)
+    assert sag > 0.1 * SIDES[0]
+
+
+def test_a_run_from_a_moving_state_is_the_rest_of_a_longer_run(tmp_path: Path):
+    """Implicit Euler knows no more than positions and velocities; a velocity of the table is
+    added."""
+    time = {"step": T, "duration": 12 * T}
+    whole = result_on(1, hung(tmp_path, "whole", time=time))["frames/position"][:]
+    result_on(1, hung(tmp_path, "half", time=time), "--frames", 5)
+    start = {"from": "half_1.h5"}
+    rest = hung(tmp_path, "rest", time={"step": T, "duration": 7 * T}, start=start)
+    frames = result_on(1, rest)["frames/position"][:]
+    np.testing.assert_allclose(frames, whole[5:], atol=1e-8 * np.ptp(whole))
+    faster = {"step": T / 2, "duration": T}
+    scene = load_scene(hung(tmp_path, "faster", time=faster, start=start | {"velocity": [1, 0, 0]}))
+    read = partial(end_of_run, MPI.COMM_SELF, tmp_path)
+    model = build_model(MPI.COMM_SELF, scene, None, read)
+    free = ~model.lattice.pinned
+    expected = (whole[5] - whole[4]) / T + [1, 0, 0]
+    np.testing.assert_allclose(model.start[1][free], expected[free], atol=1e-6)
+    np.testing.assert_array_equal(model.start[1][~free], 0)
+
+
+def test_a_state_that_does_not_fit_is_refused_on_all_ranks(tmp_path: Path):
+    """Another lattice, no file, no result, a state that is also scaled."""
+    result_on(1, hung(tmp_path, "rest", time={"integrator": "static"}))
+    path = hung(tmp_path, "go", start={"from": "rest_1.h5"}, time={"step": T, "duration": T})
+    for words, ranks, change in (
+        ("start.from: it is of another lattice", 3, "cages.cell_size=0.1"),
+        ("no such file", 1, "start.from=none.h5"),
+        ("is not an HDF5 file", 1, "start.from=go.toml"),
+        ("may not be scaled", 1, "start.scale=[1,1,2]"),
+    ):
+        done = run(ranks, "-m", "msmpetsc", "run", path, "--set", change, status=2)
+        lines = [line for line in done.stderr.splitlines() if "error:" in line]
+        assert len(lines) == 1 and words in lines[0]
 
 
 @pytest.mark.parametrize("what", ["pin", "anchor"])

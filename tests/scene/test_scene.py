@@ -153,6 +153,12 @@ MISTAKES = [  # what is changed, into what, the key that is named, and its line
         "material.poisson_ratio",
         16,
     ),
+    (
+        "density = 1000",
+        'density = 1000\nlaw = "linear"\nvolume = "log"',
+        "material.volume",
+        16,
+    ),
     ("[material]", "[materail]", "materail", 12),
     ("step = 0.0166667", 'step = "1e-3"', "time.step", 17),
     ("duration = 2.0", "duration = 0.001", "time.duration", 18),
@@ -378,10 +384,23 @@ def test_what_changes_in_time_wants_both(tmp_path, change):
     ]
 
 
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("distances = [1, 0], rates = [0, 1]", "must have ascending distances"),
+        ("distances = [0, 1], rates = [0]", "has 2 distances and 1 rates"),
+        ("distances = [], rates = []", "has 0 distances and 0 rates"),
+    ],
+)
+def test_a_swirl_whose_table_is_no_function_is_refused(tmp_path: Path, table: str, words: str):
+    (line,) = problems(tmp_path, STATE, f"start.swirl={{ axis = [0, 0, 1], {table} }}")
+    assert f"start.swirl: {words}" in line
+
+
 TABLES = [name for name, field in SceneFile.model_fields.items() if field.annotation is not str]
 PLACES = [  # of tables and vectors within tables
     "gravity.acceleration", "start.velocity", "start.spin", "start.scale", "start.twist",
-    "pin.0.region",
+    "start.gradient", "start.swirl", "pin.0.region",
     "anchor.0.path", "force.0.total", "obstacle.0.path", "output.probe",
 ]  # fmt: skip
 

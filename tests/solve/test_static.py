@@ -117,6 +117,7 @@ def test_a_body_that_may_turn_or_move_is_refused(tmp_path: Path, tables: dict, w
 PLANE = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
 OF_MOTION = {
     "no velocity": {"start": {"velocity": [0.0, 0.0, 1.0]}},
+    "gradient or swirl": {"start": {"gradient": [[0, 1, 0]] * 3}},
     "may not reflect": {"obstacle": [PLANE]},
     "no friction": {"obstacle": [PLANE | {"response": "penalty", "friction": 0.1}]},
 }

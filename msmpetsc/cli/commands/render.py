@@ -3,6 +3,7 @@
 import argparse
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -111,9 +112,11 @@ def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[s
     from mpi4py import MPI
 
     from msmpetsc.build import build_model
+    from msmpetsc.results.checkpoint_reader import end_of_run
 
     scene = load_scene(path, changes)
-    model = build_model(MPI.COMM_SELF, scene)
+    comm = MPI.COMM_SELF
+    model = build_model(comm, scene, None, partial(end_of_run, comm, scene.folder))
     subject = drawable_of_model(path, scene, model)
     lattice = model.lattice
     cells = f"{len(lattice.cells)} cells of {lattice.cell_size:.4g} m, {lattice.owned} nodes"

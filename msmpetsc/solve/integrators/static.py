@@ -194,11 +194,7 @@ class Static(ImplicitEuler):
     def _first_tau(self) -> float:
         """Return SLENDER times the time [s] of sound along the longest side (collective)."""
         lattice = self.environment.lattice
-        low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
-        low, high = (
-            np.array(self.comm.allgather([float(x) for x in corner])) for corner in (low, high)
-        )
-        cells = (high.max(axis=0) - low.min(axis=0)).max() / lattice.cell_size
+        cells = lattice.longest_side() / lattice.cell_size
         sums = np.array(
             [float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())]
         )

@@ -4,7 +4,7 @@ The method is Algorithm 5.1 of Knyazev 2001, Toward the optimal preconditioned e
 step's preconditioner. A block is needed since a single direction may settle on a higher mode.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -87,30 +87,46 @@ class Lobpcg:
         weigh    : applies W; M if None
         left_out : directions (r, n), orthonormal in M, that the search leaves out
         """
+        lowest = []
+        for its, found in enumerate(self.iterates(start, block, weigh, left_out)):
+            lowest.append(found[0][0])
+            if its == most:
+                break
+            if lowest[-1] < 0:
+                if its >= 2 and lowest[-1] > SHARPENED * lowest[-3]:
+                    break
+            elif its >= max(least, 1) and lowest[-1] > SETTLED * lowest[its // 2]:
+                break
+        return found[0], found[1]
+
+    def iterates(
+        self, start: Rows, block: int, weigh: Act | None = None, left_out: Rows | None = None
+    ) -> Iterator[tuple[Floats, Rows, Floats]]:
+        """Yield the lowest eigenvalues (k,), their modes (k, n) and errors (k,), without end.
+
+        The errors r^T P^-1 r of the eigenvalues are those before the last iteration, with the
+        residuals r and the preconditioner P. Arguments are those of ``lowest``.
+        """
         size = min(block, len(start))
         values, (x, last) = self._ritz(self._block(start, weigh), size)
         # A small body has fewer modes than the block
-        size, lowest = len(values), [values[0]]
-        for its in range(1, most + 1):
+        size = len(values)
+        errors = np.full(size, np.inf)
+        while True:
+            yield values, x[0], errors
             residuals = x[1] - like(start, values)[:, None] * x[2]
             sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
             self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
             # Multigrid works in single precision
             residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])
             w = self._of_each(self.preconditioner.apply, residuals)
+            errors = self.comm.allreduce(to_host((residuals * w).sum(axis=1))) * sizes**2
             w = self.unit(self.without(left_out, w))
             blocks = [x, self._block(w, weigh), *([] if last is None else [last])]
             values, (x, last) = self._ritz(
                 tuple(np.concatenate(parts) for parts in zip(*blocks, strict=True)), size
             )
-            lowest.append(values[0])
             self.its += len(w)
-            if lowest[-1] < 0:
-                if its >= 2 and lowest[-1] > SHARPENED * lowest[-3]:
-                    break
-            elif its >= least and lowest[-1] > SETTLED * lowest[its // 2]:
-                break
-        return values, x[0]
 
     def _block(self, directions: Rows, weigh: Act | None) -> Block:
         weighed = (

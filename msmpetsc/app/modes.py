@@ -1,0 +1,69 @@
+"""``msmpetsc modes``: natural frequencies and mode shapes, and a result file of the shapes."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.app.request import RunRequest
+from msmpetsc.app.start import options_given
+from msmpetsc.comm import on_root
+from msmpetsc.errors import InputError
+from msmpetsc.fields import Frame
+
+# for type checkers only: PETSc must get its options before it is imported
+if TYPE_CHECKING:
+    from msmpetsc.app.running import RunPlan
+    from msmpetsc.build import Model
+    from msmpetsc.solve.modes import Modes
+
+# Greatest displacement of a shape in the file, over the longest side [-]; well visible
+AMPLITUDE = 0.1
+
+
+def find_modes(comm: MPI.Intracomm, request: RunRequest, count: int) -> "Modes":
+    """Return the lowest modes of a request's scene; write their shapes if it has an output.
+
+    All ranks call it together. Raises InputError or StepFailed.
+    """
+    with options_given(comm, request):
+        from msmpetsc.app.running import described_model, prepare
+        from msmpetsc.solve.modes import modes_of
+
+        if request.output and not request.overwrite:
+            on_root(comm, lambda: refuse_existing(request))
+        plan = prepare(comm, request, None)
+        model = described_model(comm, plan)
+        modes = modes_of(comm, plan.scene, model, count)
+        if request.output:
+            _write(comm, plan, model, modes)
+    return modes
+
+
+def refuse_existing(request: RunRequest) -> None:
+    """Raise InputError if the output exists, before the modes are searched."""
+    if request.path.exists():
+        raise InputError(f"{request.path} exists: --overwrite replaces it")
+
+
+def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes") -> None:
+    """Write the state as frame 0, then a frame for each shape (collective). Raises InputError."""
+    from msmpetsc.app.running import open_output, write_companions
+    from msmpetsc.results.writer import write_model
+    from msmpetsc.solve.simulate import SurfaceMotion
+
+    embedding, side = model.embedding, model.lattice.longest_side()
+    surface_at = None if embedding is None else SurfaceMotion(comm, model.lattice, embedding)
+    with open_output(comm, plan, {"frequencies": modes.frequencies}) as file:
+        write_model(comm, file, model)
+        rows = {} if surface_at is None else {"surface": surface_at.weights.shape[0]}
+        file.start_frames(1 + len(modes.shapes), model.lattice.owned, rows)
+        frame = Frame(0, 0.0, modes.position, None, 0.0, 0, 0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), 0.0)
+        for index, shape in enumerate([np.zeros_like(modes.position), *modes.shapes]):
+            largest = max(comm.allgather(float(np.abs(shape).max(initial=0.0))))
+            scale = AMPLITUDE * side / largest if largest else 0.0
+            q = modes.position + scale * shape
+            surface = surface_at(q) if surface_at else None
+            file.append(replace(frame, index=index, time=index, position=q, surface=surface))
+    write_companions(comm, plan.request, whole=False)

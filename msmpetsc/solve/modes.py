@@ -1,0 +1,151 @@
+"""Natural frequencies and mode shapes of a body about a state: K v = omega^2 M v.
+
+K is the Hessian of the energy. H = M + tau^2 K of an implicit step has the same modes, and the
+eigenvalues of M^(-1) H are 1 + (omega tau)^2. H is definite for free bodies, too. Its multigrid
+approximates a shifted inverse, of the shift omega^2 = -1 / tau^2.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.build import Model
+from msmpetsc.environment import Environment
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.time import STATIC
+from msmpetsc.solve.integrators.static import SLENDER, Static
+from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.lobpcg import Lobpcg
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.simulate import TimeLoop
+
+# Relative error of (omega tau)^2 at which a search ends [-]; frequencies have half
+ACCURACY = 1e-7
+# (omega tau)^2 below which a mode is rigid [-]; bars a thousand times as long as thick
+# bend above it, and rounding is below it
+RIGID = 1e-5
+# Relative difference of (omega tau)^2 up to which modes are alike [-]; above the error
+ALIKE = 1e-6
+# Modes beyond the count that are searched, so that the last of the count converge [-]
+SPARE = 4
+# Most iterations of a search [-]; usual are 10 to 60, at large strain some 300
+MOST_ITERATIONS = 1000
+
+
+@dataclass(frozen=True)
+class Modes:
+    """The lowest modes about a state: rigid modes first, then by frequency.
+
+    frequencies : (k,) [Hz]; 0 for rigid modes, negative if a mode grows at that rate
+    shapes      : (k, owned, 3) [-], orthonormal in M over all ranks, zero at held nodes
+    position    : (owned, 3) [m] of the state
+    rigid       : number of rigid modes
+    """
+
+    frequencies: Floats
+    shapes: Rows
+    position: Positions
+    rigid: int
+
+
+def modes_of(comm: MPI.Intracomm, scene: Scene, model: Model, count: int) -> Modes:
+    """Return the lowest ``count`` modes of a scene's bodies (collective).
+
+    The state is the last equilibrium of a static scene, the state that ``start.from`` names, or
+    the rest shape.
+
+    Raises InputError if the bodies have fewer modes, StepFailed if no state or mode is found.
+    """
+    if scene.time.integrator == STATIC:
+        with TimeLoop(comm, scene, model) as loop:
+            for _ in loop.advance():
+                pass
+            assert isinstance(loop.integrator, Static) and loop.integrator.problem
+            time = scene.time.steps * scene.time.step
+            return _about(loop.environment, loop.state.q, loop.integrator.problem, time, count)
+    is_given = any(start and start.from_ for start in scene.starts)
+    q = model.start[0] if is_given else model.lattice.nodes
+    problem = StepProblem(q, q, np.zeros((model.lattice.owned, 3)))
+    return _about(Environment(model), q, problem, 0.0, count)
+
+
+def _about(
+    environment: Environment, q: Positions, problem: StepProblem, time: float, count: int
+) -> Modes:
+    """Return the lowest modes about positions q (l, 3) [m], with a problem's contact.
+
+    time : [s], at which anchors hold
+    """
+    lattice = environment.lattice.pin(environment.anchors.fixed_at(time))
+    comm, tau = lattice.table.comm, SLENDER * time_of_sound(lattice)
+    preset = find_preset("newton-multigrid")
+    stepper = Stepper(comm, lattice, tau, preset, touches=environment.touches)
+    try:
+        functional, unknowns = stepper.functional, stepper.unknowns
+        if count + SPARE > unknowns.total:
+            raise InputError(
+                f"--count {count}: {unknowns.total} free nodes show "
+                f"{max(unknowns.total - SPARE, 0)} modes at most: give the body more cells"
+            )
+        stepper.set_up()
+        functional.begin(replace(problem, q=q, y=q))
+        contact = functional.contact_at(q)
+        stepper.jacobian.hessian.linearise(q, contact)
+        stepper.jacobian.preconditioner.prepare(q, contact)
+        squares, found = _lowest(stepper.minimum.curvature.search, count)
+        order = np.lexsort((squares, squares != 0))
+        shapes = np.zeros((count, lattice.owned, 3))
+        shapes[:, unknowns.free] = found[order].reshape(count, 3, -1).transpose(0, 2, 1)
+    finally:
+        stepper.destroy()
+    frequencies = np.sign(squares) * np.sqrt(np.abs(squares)) / (2 * np.pi * tau)
+    return Modes(frequencies[order], shapes, q[: lattice.owned], int((squares == 0).sum()))
+
+
+def _lowest(search: Lobpcg, count: int) -> tuple[Floats, Rows]:
+    """Return the lowest (omega tau)^2 (count,), 0 for rigid modes, and the modes (count, n).
+
+    Raises StepFailed if they do not converge.
+    """
+    block = count + SPARE
+    start = search.random(block)
+    for _, (values, modes, errors) in zip(
+        range(MOST_ITERATIONS), search.iterates(start, block), strict=False
+    ):
+        squares = values[:count] - 1
+        squares[np.abs(squares) < RIGID] = 0.0
+        error = (errors[:count] / np.where(squares, np.abs(squares), 1.0)).max()
+        if error <= ACCURACY:
+            return squares, _turned(search, squares, modes[:count])
+    raise StepFailed(
+        f"modes: not found in {MOST_ITERATIONS} iterations, the relative error is {error:.1e}",
+        "modes",
+    )
+
+
+def _turned(search: Lobpcg, squares: Floats, modes: Rows) -> Rows:
+    """Return the modes in a basis that does not depend on rounding.
+
+    Among modes alike, the i-th is orthogonal to the noise vectors before the i-th, and has a
+    positive part in the i-th.
+    """
+    noise = search.functional.noise(len(modes))
+    parts = search.comm.allreduce((modes * search.functional.mass) @ noise.T)
+    differ = np.diff(squares) > ALIKE * np.abs(squares[1:])
+    for alike in np.split(np.arange(len(modes)), np.flatnonzero(differ) + 1):
+        turn, upper = np.linalg.qr(parts[alike, : len(alike)])
+        modes[alike] = (turn * np.sign(upper.diagonal())).T @ modes[alike]
+    return modes
+
+
+def time_of_sound(lattice: Lattice) -> float:
+    """Return the time [s] of sound along the longest side, of the speed (E / density)^(1/2)."""
+    stiffness = float(lattice.cell_stiffness[: lattice.cells_owned].sum())
+    mass, edges = lattice.table.comm.allreduce(np.array([float(lattice.mass.sum()), stiffness]))
+    # An edge has the stiffness 4/7 E h (lattice.material)
+    return lattice.longest_side() / lattice.cell_size * float(np.sqrt(4 / 7 * mass / edges))

@@ -1,0 +1,224 @@
+"""Natural frequencies against dense eigenvalues, closed forms of bars, and published values; on any
+number of ranks, with shapes that other commands read."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+from block_scene import block_scene
+from conftest import result_on, run
+from lattices import dense_hessian
+from mpi4py import MPI
+from one_process import answers_on, refusal_in
+from scipy.linalg import eigh
+from scipy.optimize import brentq
+
+from msmpetsc import open as open_result
+from msmpetsc.build import build_model
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.results.checkpoint_reader import end_of_run
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.modes import Modes, modes_of
+from msmpetsc.view.drawable import drawable_of_result
+
+COMM = MPI.COMM_SELF
+YOUNG, DENSITY = 1e6, 1000.0
+SPEED = np.sqrt(YOUNG / DENSITY)  # [m/s] of longitudinal waves in a bar
+CLAMP = [{"region": {"half_space": {"point": [0.001, 0, 0], "normal": [-1, 0, 0]}}}]
+ENDS = [*CLAMP, {"region": {"half_space": {"point": [0.999, 0, 0], "normal": [1, 0, 0]}}}]
+ONCE = {"step": 0.01, "duration": 0.01}
+
+
+def body(folder: Path, sides: list[float], h: float, poisson: float = 0.0, **tables) -> Path:
+    material = {
+        "young_modulus": YOUNG,
+        "density": DENSITY,
+        "law": "neo-hookean",
+        "poisson_ratio": poisson,
+    }
+    given = {"cages": {"cell_size": h}, "material": material, "time": ONCE}
+    return block_scene(folder, np.array(sides), **given | tables)
+
+
+def modes(path: Path, count: int) -> Modes:
+    scene = load_scene(path)
+    read_state = partial(end_of_run, COMM, scene.folder)
+    return modes_of(COMM, scene, build_model(COMM, scene, None, read_state), count)
+
+
+def dense_frequencies(path: Path, q: np.ndarray) -> np.ndarray:
+    """All frequencies [Hz] about positions q (n, 3), by a dense eigensolver."""
+    lattice = build_model(COMM, load_scene(path)).lattice
+    free = np.repeat(~lattice.pinned, 3)
+    stiffness = dense_hessian(Elasticity(lattice), q)[np.ix_(free, free)]
+    squares = eigh(stiffness, np.diag(np.repeat(lattice.mass, 3)[free]), eigvals_only=True)
+    return np.sign(squares) * np.sqrt(np.abs(squares)) / (2 * np.pi)
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "linear"])
+def test_modes_at_rest_are_those_of_dense_matrices(tmp_path: Path, law: str):
+    """A block whose cells the surface cuts, free and clamped."""
+    material = {"young_modulus": YOUNG, "density": DENSITY, "law": law}
+    for tables in ({}, {"pin": CLAMP}):
+        path = body(tmp_path, [0.5, 0.31, 0.2], 0.11, material=material, **tables)
+        found = modes(path, 12)
+        nodes = build_model(COMM, load_scene(path)).lattice.nodes
+        expected = dense_frequencies(path, nodes)[:12]
+        assert found.rigid == (0 if tables else 6)
+        assert (found.frequencies[: found.rigid] == 0).all()
+        rest = slice(found.rigid, None)
+        np.testing.assert_allclose(found.frequencies[rest], expected[rest], rtol=1e-6)
+
+
+def test_modes_of_a_loaded_body_are_those_of_its_state(tmp_path: Path):
+    """A sagging beam, by a static scene and from its file; they differ from those at rest."""
+    loaded = {"pin": CLAMP, "gravity": {"acceleration": [0, 0, -40.0]}}
+    path = body(tmp_path, [1, 0.25, 0.25], 0.125, **loaded, time={"integrator": "static"})
+    found = modes(path, 6).frequencies
+    with result_on(1, path) as run_of:
+        q = run_of["frames/position"][-1]
+    expected = dense_frequencies(path, q)[:6]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    other = body(
+        tmp_path, [1, 0.25, 0.25], 0.125, **loaded, start={"from": "scene_1.h5"}, name="other"
+    )
+    np.testing.assert_allclose(modes(other, 6).frequencies, expected, rtol=1e-6)
+    at_rest = body(tmp_path, [1, 0.25, 0.25], 0.125, pin=CLAMP)
+    assert np.abs(modes(at_rest, 6).frequencies / expected - 1).max() > 0.01
+
+
+def test_an_obstacle_that_is_pressed_holds_the_tip(tmp_path: Path):
+    """A clamped bar's lowest bending has (1.875 / L)^2; with its far end supported (3.927 / L)^2,
+    which is 4.39 times as much, and more with the support before the end."""
+    loaded = {"pin": CLAMP, "gravity": {"acceleration": [0, 0, -9.81]}}
+    loaded["time"] = {"integrator": "static"}
+    plate = {"shape": "box", "box": [[0.9, -1, -0.5], [1.2, 1, -0.001]], "response": "penalty"}
+    upright = []
+    for more in ({}, {"obstacle": [plate]}):
+        found = modes(body(tmp_path, [1, 0.125, 0.125], 0.0625, **loaded, **more), 3)
+        _, y, z = np.abs(found.shapes).max(axis=1).T
+        upright.append(found.frequencies[z > y][0])
+    assert 3 < upright[1] / upright[0] < 6
+
+
+def test_a_compressed_bar_grows_sideways_to_both_sides(tmp_path: Path):
+    """Shortened by 5%, beyond Euler's load 4 pi^2 EI / L^2 of strain pi^2 / 3 (t / L)^2 =
+    3.3% of two clamps, and short of the second load, 2.05 times as much."""
+    shape = [1, 0.1, 0.1]
+    start = {"scale": [0.95, 1, 1]}
+    result_on(
+        1,
+        body(
+            tmp_path, shape, 0.05, start=start, name="short", time={"step": 1e-9, "duration": 1e-9}
+        ),
+    )
+    path = body(tmp_path, shape, 0.05, pin=ENDS, start={"from": "short_1.h5"})
+    found = modes(path, 4).frequencies
+    assert (found[:2] < 0).all() and found[0] == pytest.approx(found[1], rel=1e-6)
+    assert (found[2:] > 0).all()
+
+
+def timoshenko(slenderness: float) -> float:
+    """The lowest b^2 = rho A omega^2 L^4 / (E I) of a free square bar of nu = 0 (Huang 1961)."""
+    r2, s2 = 1 / 12 / slenderness**2, 2 * 6 / 5 / 12 / slenderness**2
+
+    def of_free_ends(b: float) -> float:
+        root = np.sqrt((r2 - s2) ** 2 + 4 / b**2)
+        x, y = b * np.sqrt((root - r2 - s2) / 2), b * np.sqrt((root + r2 + s2) / 2)
+        mixed = b**2 * r2 * (r2 - s2) ** 2 + 3 * r2 - s2
+        last = b / np.sqrt(1 - b**2 * r2 * s2) * mixed * np.sinh(x) * np.sin(y)
+        return 2 - 2 * np.cosh(x) * np.cos(y) + last
+
+    return brentq(of_free_ends, 15, 30)
+
+
+def test_a_free_bar_swings_by_the_theory_of_bars(tmp_path: Path):
+    """Of 10 x 1 x 1 m. Along the bar, masses at nodes have (c / (pi h)) sin(pi h / (2 L)) exactly.
+    Bending comes to Timoshenko's bar with h^2: the error falls by 4, and its limit is 1e-4 off."""
+    bending = []
+    for h in (0.5, 0.25):
+        found = modes(body(tmp_path, [10, 1, 1], h), 14)
+        assert found.rigid == 6
+        along = SPEED / (np.pi * h) * np.sin(np.pi * h / 20)
+        assert np.abs(found.frequencies / along - 1).min() < 1e-7
+        bending.append(found.frequencies[6:8])
+    np.testing.assert_allclose(np.ptp(bending, axis=1), 0, atol=1e-7)
+    coarse, fine = np.mean(bending, axis=1)
+    exact = timoshenko(10) * SPEED / np.sqrt(12) / 100 / (2 * np.pi)
+    assert 1.8 < np.log2((exact - coarse) / (exact - fine)) < 2.2
+    assert (4 * fine - coarse) / 3 == pytest.approx(exact, rel=1e-4)
+
+
+def test_a_cantilever_has_the_frequencies_of_finite_elements(tmp_path: Path):
+    """Of 10 x 1 x 1 m, nu = 0.3, by quadratic elements: bending 0.0510 and 0.3060, torsion 0.4546,
+    longitudinal 0.7933 Hz; torsion is lower by 4.1% with four cells across, since cells do not
+    warp."""
+    found = modes(body(tmp_path, [10, 1, 1], 0.25, 0.3, pin=CLAMP), 6).frequencies
+    np.testing.assert_allclose(
+        found[[0, 1, 2, 3, 5]], [0.0510, 0.0510, 0.3060, 0.3060, 0.7933], rtol=2e-3
+    )
+    assert found[4] == pytest.approx(0.4546, rel=0.05)
+
+
+def test_a_free_nearly_incompressible_cube(tmp_path: Path):
+    """E = rho = 1, nu = 0.499: 0.262 to 0.263 Hz (Puso and Solberg 2006), extrapolated by h^2."""
+    unit = {"young_modulus": 1.0, "density": 1.0, "law": "neo-hookean", "poisson_ratio": 0.499}
+    found = [modes(body(tmp_path, [1, 1, 1], h, material=unit), 7) for h in (1 / 4, 1 / 8)]
+    coarse, fine = (each.frequencies[6] for each in found)
+    assert 0.2615 < (4 * fine - coarse) / 3 < 0.2635
+
+
+def test_shapes_are_orthonormal_and_two_bodies_have_twelve_rigid(tmp_path: Path):
+    path = body(tmp_path, [0.5, 0.25, 0.25], 0.125)
+    scene = {"cages": {"cell_size": 0.125}, "time": ONCE, "output": {"surface": False}}
+    scene["material"] = {"young_modulus": YOUNG, "density": DENSITY}
+    scene["body"] = [{"mesh": {"source": "scene.ply", "base": [x, 0, 0]}} for x in (0, 2)]
+    path.write_text(tomli_w.dumps(scene))
+    found = modes(path, 15)
+    assert found.rigid == 12 and (found.frequencies[12:] > 0).all()
+    mass = build_model(COMM, load_scene(path)).lattice.mass
+    shapes = found.shapes.reshape(15, -1)
+    np.testing.assert_allclose(shapes * np.repeat(mass, 3) @ shapes.T, np.eye(15), atol=1e-6)
+
+
+def test_ranks_agree_and_other_commands_read_the_shapes(tmp_path: Path):
+    """A square bar, whose modes come in pairs."""
+    path = body(tmp_path, [1, 0.1, 0.1], 1 / 40, 0.3, output={"surface": True})
+    files, printed = [], []
+    for ranks in (1, 3):
+        files.append(tmp_path / f"modes_{ranks}.h5")
+        words = ["modes", path, "--count", 10, "--json", "-o", files[-1]]
+        done = run(ranks, "-m", "msmpetsc.cli.main", *words, status=0)
+        printed.append(json.loads(done.stdout))
+    np.testing.assert_allclose(printed[0]["frequencies"], printed[1]["frequencies"], rtol=1e-7)
+    assert printed[0]["rigid"] == printed[1]["rigid"] == 6
+    with h5py.File(files[0]) as one, h5py.File(files[1]) as other:
+        q, rest = one["frames/position"][:], one["lattice/nodes"][:]
+        np.testing.assert_allclose(other["frames/position"][:], q, atol=1e-4)
+        np.testing.assert_array_equal(one["frames/time"], np.arange(11))
+        np.testing.assert_array_equal(q[0], rest)
+        np.testing.assert_allclose(np.abs(q[1:] - rest).max(axis=(1, 2)), 0.1, rtol=1e-12)
+    with open_result(files[0]) as result:
+        captions = [drawable_of_result(result).moment(index) for index in (0, 7)]
+    assert captions == ["t = 0.000 s", f"mode 7: {printed[0]['frequencies'][6]:.4g} Hz"]
+    last = tmp_path / "last.obj"
+    run(1, "-m", "msmpetsc.cli.main", "export", files[0], "-o", last, "--frames", 7, status=0)
+    assert last.read_text().count("\nv ") > 3
+
+
+def test_bad_input_is_refused_on_all_ranks(tmp_path: Path):
+    path, file = body(tmp_path, [0.5, 0.5, 0.5], 0.125), tmp_path / "modes.h5"
+    run(1, "-m", "msmpetsc.cli.main", "modes", path, "-o", file, "--count", 6, status=0)
+    commands = {
+        "125 free nodes show 121 modes at most": ["modes", path, "--count", 122],
+        "exists: --overwrite replaces it": ["modes", path, "-o", file],
+        "must be named *.h5": ["modes", path, "-o", tmp_path / "modes.png"],
+        "--count must be at least 1": ["modes", path, "--count", 0],
+        "has the modes of a body": ["run", "--resume", file],
+    }
+    for words, answers in zip(commands, answers_on(2, [*commands.values()]), strict=True):
+        assert words in refusal_in(answers)

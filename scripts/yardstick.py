@@ -34,8 +34,9 @@ FOLDER = lab.SCENES / "studies" / "yardstick"
 CHART = FOLDER / "yardstick.png"
 # |error| shown as "exact", that of the solver in most cases [-]
 EXACT = 1e-6
-# cells that give the stress at a place: their distance [cells], their fill [-]
-NEAR, WHOLE = 3.0, 0.99
+# cells that give the stress at a place: their distance less the degree [cells], their
+# fill over the largest [-]; least singular value of the fit [-]
+NEAR, WHOLE, FIT = 2.0, 0.99, 1e-9
 INTRODUCTION = """
 Values, errors and costs stand from coarse to fine. An error is relative, *exact* below 1e-6. The
 order is observed: by the differences of three sizes, or the errors of two. Seconds are of the steps
@@ -179,7 +180,7 @@ def names_of(scene: Scene, frames: list[msmpetsc.Frame], lattice: Lattice) -> di
     at(probe)     : its positions (T, 3) [m]
     moved(probe)  : its displacements (T, 3) [m] from the start
     peaks(y)      : times and heights (k, 2) of the local maxima of y (T,)
-    stress_at(*x) : stress (6,) [Pa] of the last frame at a place at rest
+    stress_at(*x) : stress (6,) [Pa] of the last frame at a place at rest, by a fit of a degree
     """
     fields = {
         name: np.array([getattr(frame, name) for frame in frames])
@@ -197,13 +198,15 @@ def names_of(scene: Scene, frames: list[msmpetsc.Frame], lattice: Lattice) -> di
     def peaks(y: np.ndarray) -> np.ndarray:
         return np.array([*maxima(fields["time"], y)]).reshape(-1, 2)
 
-    def stress_at(*place: float) -> np.ndarray:
-        # a plane through the stresses of whole cells near the place
-        distance = lattice.nodes[lattice.cells].mean(axis=1) - place
-        near = np.linalg.norm(distance, axis=1) < NEAR * lattice.cell_size
-        near &= lattice.cell_fill > WHOLE
-        plane = np.column_stack([np.ones(near.sum()), distance[near]])
-        return np.linalg.lstsq(plane, fields["cell_stress"][-1][near])[0][0]
+    def stress_at(*place: float, degree: int = 1) -> np.ndarray:
+        # a polynomial through the stresses of whole cells near the place
+        x = (lattice.nodes[lattice.cells].mean(axis=1) - place) / lattice.cell_size
+        near = np.linalg.norm(x, axis=1) < NEAR + degree
+        near &= lattice.cell_fill > WHOLE * lattice.cell_fill.max()
+        ones = np.column_stack([np.ones(len(x)), x])[near]
+        terms = [ones[:, i] * ones[:, j] for i in range(4) for j in range(i, 4)]
+        basis = ones if degree == 1 else np.column_stack(terms)
+        return np.linalg.lstsq(basis, fields["cell_stress"][-1][near], rcond=FIT)[0][0]
 
     functions = {"at": at, "moved": moved, "peaks": peaks, "stress_at": stress_at}
     return fields | functions | {"np": np, "norm": np.linalg.norm}

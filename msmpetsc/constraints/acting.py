@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import reduce
-from itertools import compress
 
 import numpy as np
 
@@ -18,7 +17,7 @@ class ActingForces:
         self.lattice, self.loads, self.own_forces = lattice, loads, own_forces
         self.all: list[Load | OwnForce] = [*loads, *own_forces]
         self._own = [np.zeros((0, 3))] * len(own_forces)
-        self._states_of_loads: list[bool | tuple[float, ...]] = []
+        self._totals: list[tuple[float, ...]] = []
         self._load = np.zeros((lattice.owned, 3), like=lattice.nodes)
 
     def begin_step(self, q: Positions, v: Rows, time: float) -> None:
@@ -38,36 +37,33 @@ class ActingForces:
 
     def at(self, time: float) -> Rows:
         """Return the external force f_ext (owned, 3) [N] at a time [s], as a read-only array."""
-        load = self.given(time)
-        for force, own in zip(self.own_forces, self._own, strict=True):
-            if force.acts_at(time) and len(own):
-                load = load + own
-        return load
+        return self._with_own(self.given(time), [force.acts_at(time) for force in self.own_forces])
+
+    def mean(self, begin: float, end: float) -> Rows:
+        """Return the mean of f_ext (owned, 3) [N] from begin to end [s], as a read-only array."""
+        load = self._shared([load.mean(begin, end) for load in self.loads])
+        return self._with_own(load, [force.share(begin, end) for force in self.own_forces])
 
     def given(self, time: float) -> Rows:
         """Return f_ext (owned, 3) [N] without the users' functions: the part with a potential."""
-        states = [load.state_at(time) for load in self.loads]
-        if states != self._states_of_loads:
-            self._states_of_loads = states
+        return self._shared([load.state_at(time) for load in self.loads])
+
+    def _shared(self, totals: list[tuple[float, ...]]) -> Rows:
+        """Return the force (owned, 3) [N] of the loads with these totals."""
+        if totals != self._totals:
+            self._totals = totals
             self._load = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
-            for load in compress(self.loads, states):
-                self._load += load.force_at(time)
+            for load, total in zip(self.loads, totals, strict=True):
+                if any(total):
+                    self._load += load.share * like(load.share, np.array(total))
         return self._load
 
-    def beyond(self, time: float, end: float) -> Rows | None:
-        """Return f(time) - f(end) (owned, 3) [N] of time-dependent forces that act at both times.
-
-        end : end of the step that contains ``time`` [s]
-
-        The result is None if no force depends on time.
-        """
-        difference = None
-        for load in self.loads:
-            if len(load.total.times) > 1:
-                difference = np.zeros_like(self._load) if difference is None else difference
-                if load.acts_at(time) and load.acts_at(end):
-                    difference += load.force_at(time) - load.force_at(end)
-        return difference
+    def _with_own(self, load: Rows, shares: Sequence[float]) -> Rows:
+        """Return a force (owned, 3) [N] plus shares of the users' forces."""
+        for share, own in zip(shares, self._own, strict=True):
+            if share and len(own):
+                load = load + share * own
+        return load
 
 
 class Anchors:

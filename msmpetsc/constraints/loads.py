@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 # relative tolerance of times [-]; a multiple of the time step may be rounded down
 SAME_TIME = 1e-12
+# relative distance to an event within which an end of an interval means the event [-];
+# adaptive steps end just before events
+AT_EVENT = 1e-11
 
 
 def within(time: float, start: float, stop: float | None) -> bool:
@@ -40,6 +43,25 @@ class Lines:
     def value_at(self, time: float) -> Floats:
         """Return the vector (c,) at a time [s]."""
         return np.array([np.interp(time, self.times, column) for column in self.vectors.T])
+
+    def mean(self, begin: float, end: float, start: float, stop: float | None) -> Floats:
+        """Return the mean (c,) from begin to end [s] of the function, 0 outside start to stop.
+
+        A stop of None is infinite.
+        """
+        kinks = np.array([start, *self.times, np.inf if stop is None else stop])
+        for kink in kinks:
+            begin, end = (
+                kink if abs(kink - time) <= AT_EVENT * abs(time) else time for time in (begin, end)
+            )
+        first, last = max(begin, kinks[0]), min(end, kinks[-1])
+        if not first < last:
+            return np.zeros(self.vectors.shape[1])
+        times = [first, *self.times[(first < self.times) & (self.times < last)], last]
+        shares = np.diff((np.array(times) - begin) / (end - begin))
+        values = np.array([self.value_at(time) for time in times])
+        mean: Floats = shares @ (0.5 * (values[:-1] + values[1:]))
+        return mean
 
 
 @dataclass(frozen=True)
@@ -97,6 +119,10 @@ class Motion(Lines):
         return (x - center) @ rotation.T + center + by
 
 
+# the function 1
+ALWAYS = Lines(np.zeros(1), np.ones((1, 1)))
+
+
 def total_of(total: Vector | ForceTable) -> Lines:
     """Return the total [N] of a scene's force over time; a constant force has a single time."""
     if isinstance(total, ForceTable):
@@ -147,13 +173,13 @@ class Load(Timed):
     share: Rows
     total: Lines
 
-    def force_at(self, time: float) -> Rows:
-        """Return the force (owned, 3) [N] on the nodes at a time [s]."""
-        return self.share * like(self.share, self.total.value_at(time))
+    def state_at(self, time: float) -> tuple[float, ...]:
+        """Return the total at a time [s]; zeros if the force does not act."""
+        return tuple((self.acts_at(time) * self.total.value_at(time)).tolist())
 
-    def state_at(self, time: float) -> bool | tuple[float, ...]:
-        """Return the total at a time [s]; False if the force does not act."""
-        return self.acts_at(time) and tuple(self.total.value_at(time).tolist())
+    def mean(self, begin: float, end: float) -> tuple[float, ...]:
+        """Return the mean of the total from begin to end [s]."""
+        return tuple(self.total.mean(begin, end, self.start, self.stop).tolist())
 
     @property
     def events(self) -> list[float]:
@@ -175,6 +201,10 @@ class OwnForce(Timed):
     function: ForceFunction
     rows: Indices
     mass: Floats
+
+    def share(self, begin: float, end: float) -> float:
+        """Return the share of the time from begin to end [s] in which the force acts."""
+        return float(ALWAYS.mean(begin, end, self.start, self.stop)[0])
 
     def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
         """Return the force (owned, 3) [N] at positions q and velocities v (owned, 3).

@@ -3,10 +3,11 @@
 If the energy is convex, an exactly solved step of implicit Euler satisfies
 
     T(v_(n+1)) + E(q_(n+1)) + C(q_(n+1))
-        <=  T(v_n) + E(q'_n) + C(q'_n) + f_ext . (q_(n+1) - q'_n) + W
+        <=  T(v_n) + E(q'_n) + C(q'_n) + f . (q_(n+1) - q'_n) + W
 
 - T is the kinetic energy of the free nodes.
 - C is the contact energy. Both sides take the obstacles at their positions at the step's end.
+- f is the mean of f_ext over the step.
 - q'_n is q_n with the anchored nodes at their prescribed positions at the step's end.
 - W bounds the work of moving obstacles: by friction, and by impacts as impulse times velocity.
 
@@ -14,10 +15,10 @@ Spurious energy is the excess of the left side, less its later dissipation. Mess
 from nowhere. Energy of nodes that rebound after the solve enters the balance of the next step,
 because the next step dissipates most of it.
 
-For Verlet, W holds the work of anchors and moving obstacles in the substeps. Therefore q'_n is q_n,
-and C is taken at the start of the step. W also holds the work of varying forces beyond f_ext at the
-end. The energy of Verlet and BDF2 oscillates, so a step may regain a limited share of earlier
-losses. In a linear body, the energy of Verlet with substeps dt oscillates by
+For Verlet, W holds the work of anchors, moving obstacles and f_ext in the substeps. Therefore f is
+absent, q'_n is q_n, and C is taken at the start of the step. The energy of Verlet and BDF2
+oscillates, so a step may regain a limited share of earlier losses. In a linear body, the energy of
+Verlet with substeps dt oscillates by
 
     dt^2/8 |M^(-1) (f_ext - grad E)|_M^2
 
@@ -280,6 +281,7 @@ class EnergyBalance:
         contact = environment.obstacles.push(when, sides)
         known = self.known[1] if self.known and q is self.known[0] else None
         ended = result.position[owned], after.sides
+        load = None if result.explicit else environment.forces.mean(time - time_step, time)
         along = time_step * np.broadcast_to(frame, 3)
         shift, drift = like(lattice.nodes, along), like(lattice.nodes, along / time_step)
         pressing = result.problem and result.problem.contact
@@ -288,7 +290,7 @@ class EnergyBalance:
             0.5 * np.vdot((lattice.mass * free)[:, None] * (v - drift), v - drift),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned] + shift) if contact else 0.0,
-            np.vdot(environment.forces.at(time), result.position[owned] - q[owned] - shift)
+            (0.0 if load is None else np.vdot(load, result.position[owned] - q[owned] - shift))
             + environment.obstacles.friction_work_bound(
                 (q[owned], sides), ended, time, time_step, along
             )

@@ -92,7 +92,7 @@ def test_it_acts_on_its_region_and_in_its_time(tmp_path: Path):
     list(msm.frames(scene, set={"force.0.region": region}))
     assert seen == [(2 * 5 * 3, 0.125, 0.0), (30, 0.125, 0.01), (30, 0.125, 0.02)]  # once a step
     msm.register_force("late", lambda x, v, t: [0, 0, 1.0])
-    late = heights(flying(tmp_path, "late", 4, begin=0.03))  # in the steps that end from then on
+    late = heights(flying(tmp_path, "late", 4, begin=0.02))  # in the steps that begin from then on
     assert np.allclose(np.diff(late), STEP * (SPEED + STEP * np.array([0, 0, 1, 2])))
 
 

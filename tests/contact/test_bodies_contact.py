@@ -316,9 +316,8 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
             simulation.state,
         )
         functional, minimum, q = stepper.functional, stepper.minimum, state.q
-        faces = ContactFaces(
-            environment, q, 2 * q - state.q_previous, 0.01, 0.01, None, stepper.lattice.pinned
-        )
+        y, load = 2 * q - state.q_previous, environment.forces.at(0.01)
+        faces = ContactFaces(environment, q, y, load, 0.01, 0.01, None, stepper.lattice.pinned)
         environment.contacts.widen()
         functional.begin(faces.problem())
         now = functional.at(q)

@@ -53,6 +53,21 @@ def test_springs_and_masses_follow_the_definition(cells: set):
         assert mass == pytest.approx(DENSITY * H**3 / 8 * around, rel=1e-13)
 
 
+@pytest.mark.parametrize("across, excess", [(2, 1 / 2), (4, 1 / 8), (8, 1 / 32)])
+def test_the_inertia_of_a_turning_bar_is_too_large_by_two_over_n_squared(
+    across: int, excess: float
+):
+    """The trapezoidal rule for the integral of x^2 over n cells of size h: a^3 / 12 + a h^2 / 6."""
+    bar = build_lattice(
+        cages_of(block(3, across, across)), Material(density=DENSITY, young_modulus=E)
+    )
+    x = bar.nodes - bar.nodes.mean(axis=0)
+    spin = np.cross([1.0, 0, 0], x)
+    twice_energy = bar.mass @ (spin**2).sum(axis=1)
+    exact = bar.mass.sum() * (across * H) ** 2 / 6
+    assert twice_energy == pytest.approx((1 + excess) * exact, rel=1e-12)
+
+
 def test_cells_name_their_corners_in_vtk_order():
     cages = cages_of(block(2, 3, 2))
     lattice = build_lattice(cages, Material(density=DENSITY, stiffness=7.0, law="linear"))

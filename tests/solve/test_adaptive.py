@@ -84,9 +84,31 @@ def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact:
     assert 1e-2 < error_of(model, frames[::16], exact) < 9e-2
     q = np.array([frame.position for frame in frames])
     rough = np.abs(np.diff(q, 3, axis=0)).max()
-    assert rough < 0.025 * np.abs(np.diff(q, axis=0)).max()  # no kinks at frames within
+    # Straight lines between ends of steps have 0.3 here.
+    assert rough < 0.05 * np.abs(np.diff(q, axis=0)).max()
     energy = np.array([frame.kinetic + frame.elastic + frame.potential for frame in frames])
     assert np.abs(np.diff(energy)).max() < 0.02 * max(frame.kinetic for frame in frames)
+
+
+@pytest.mark.parametrize(
+    "start", [{"twist": {"axis": [1, 0, 0], "degrees": 120}}, {"scale": [1.3, 1, 1]}]
+)
+def test_the_estimate_of_a_bar_two_cells_across_that_is_let_go(tmp_path: Path, start: dict):
+    """Within a factor of two. Means over neighbours remove such a motion, and the first step from
+    rest looks as if its acceleration were constant."""
+    tables = {
+        "start": start,
+        "material": {"law": "neo-hookean", "young_modulus": 1e5, "density": 1e3},
+        "solver": {"preset": "newton", "error": 1e-5},
+        "output": {"surface": False, "every": 1},
+    }
+    sides, time = np.array([1.0, 0.25, 0.25]), {"duration": 0.2, "integrator": "bdf2"}
+    fine = time | {"step": STEP / 64}
+    exact = play(block_scene(tmp_path, sides, **tables, time=fine), "output.every=64")[1]
+    chosen = time | {"step": STEP, "error": 0.05}
+    model, frames = play(block_scene(tmp_path, sides, **tables, time=chosen))
+    ratio = frames[-1].time_error / error_of(model, frames, exact)
+    assert 0.5 < ratio < 2
 
 
 LANDING = {  # it falls by 5 mm, lands at 0.5 m/s, and slides under a force that comes and goes

@@ -337,11 +337,31 @@ def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path,
 
 
 def test_a_coarsest_lattice_that_is_good_by_chance_takes_no_cells(tmp_path: Path, monkeypatch):
-    """Errors of 0.1, 0.07 and 0.025 show no order, so the last is taken as 0.046, until a finer one
-    is asked."""
+    """Errors of 0.1, 0.07 and 0.025 show no order. The usual order is assumed, and is right."""
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.1, cell_error=2.0, most=0.1)
-    assert max(each.cells for each in plan.tried) == round(6400 * 2**1.5)
+    assert plan.bounds == ["the cells: their distances show no order; order 1.5 is assumed"]
+    assert max(each.cells for each in plan.tried) == 6400
     assert plan.met and bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.75 * 0.1
+
+
+def test_no_refusal_without_a_finer_lattice(tmp_path: Path, monkeypatch):
+    """The error is 8 / sqrt(cells), and 8 times 6,400 cells are the most."""
+    plan, _, _ = sized(tmp_path, monkeypatch, 0.03, cell_error=8.0)
+    assert not plan.met
+    assert max(each.cells for each in plan.tried) == round(6400 * 2**1.5)
+
+
+def test_orders_that_differ_are_assumed_to_be_their_mean(tmp_path: Path, monkeypatch):
+    """100, 800, 6,400 cells show order 1, and 800, 6,400, 18,102 the steepest order, 2.2."""
+    errors = {100: 0.2, 800: 0.1, 6400: 0.05, 18102: 0.043}
+    (tmp_path / "scene.toml").write_text(SCENE)
+
+    def by_cells(bench: Bodies, case: Case, cells: int) -> float:
+        return errors.get(cells, 0.043)
+
+    monkeypatch.setattr(Bodies, "error_of", by_cells)
+    plan, _, _ = sized(tmp_path, monkeypatch, 0.01)
+    assert "the cells: their distances show no order; order 1.6 is assumed" in plan.bounds
 
 
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
@@ -398,12 +418,12 @@ def test_a_plan_says_what_bounds_the_error(tmp_path: Path, monkeypatch, bound: s
 
 
 def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
-    """On the finest lattice that was tried: then order 1 is taken. Coarser ones do not matter."""
+    """On the finest lattice that was tried: then order 1 is assumed. Coarser ones do not matter."""
     plan, _, _ = sized(
         tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0
     )
     order, motion = plan.bounds
-    assert "order 1 is taken" in order and motion.endswith('"neo-hookean" may help')
+    assert "order 1 is assumed" in order and motion.endswith('"neo-hookean" may help')
     without, _, _ = sized(
         tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells < 6400 else 0.0
     )

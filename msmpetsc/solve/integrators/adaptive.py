@@ -5,7 +5,8 @@ The local error of a step follows from positions q and velocities v at its ends:
     implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
-``StepControl`` sums local errors, averaged over neighbours, and the errors of contact (README).
+A BDF2 step without history has a further error (``Bdf2``).
+``StepControl`` sums the root mean squares of local errors, and the errors of contact (README).
 
 If U is the size of the motion, the trajectory error of the run may reach ``error`` U. Each step
 spends its local error from a credit that grows with the motion and with time:
@@ -21,14 +22,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
-from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import Positions, Rows, like, to_host
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.checkpoint import COUNT, LENGTH, Checkpoint, Range
 from msmpetsc.comm import log
+from msmpetsc.constraints.loads import AT_EVENT
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
@@ -42,9 +41,7 @@ LOWEST, HIGHEST = -10, 6
 # number of step lengths whose integrators are kept; neighbouring lengths alternate
 KEPT = 4
 # end of a step before an event, over the event's time; the event must not act yet
-JUST_BEFORE = 1 - 1e-10
-# averages over neighbours in a local error; they remove waves as short as a cell
-SWEEPS = 4
+JUST_BEFORE = 1 - 0.5 * AT_EVENT
 # part of the saved credit that a step may spend; savings must last for an impact
 SAVINGS_SHARE = 1 / 8
 # part of an equal share of all credit that any step may spend; the run must advance
@@ -69,27 +66,6 @@ def local_error(order: int, q: Positions, v: Rows, x: Positions, w: Rows, time_s
     if order == 1:
         return 0.5 * time_step * (w - v)
     return 1.6 * (x - q - 0.5 * time_step * (v + w))
-
-
-class NeighbourMean:
-    """Average vectors over nodes and their spring neighbours, ``SWEEPS`` times (collective)."""
-
-    def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        self.comm, self.lattice = comm, lattice
-        ends, nodes = to_host(lattice.springs), np.arange(len(lattice.nodes))
-        rows, columns = np.r_[ends[:, 0], ends[:, 1], nodes], np.r_[ends[:, 1], ends[:, 0], nodes]
-        # A rank knows all springs of its owned nodes.
-        own = rows < lattice.owned
-        shape = lattice.owned, len(nodes)
-        joined = csr_array((np.ones(own.sum()), (rows[own], columns[own])), shape=shape)
-        self.weights = csr_array(joined.multiply(1 / joined.sum(axis=1)[:, None]))
-
-    def __call__(self, vectors: Rows) -> Rows:
-        """Return the averages (owned, 3) of vectors (owned, 3)."""
-        means = to_host(vectors)
-        for _ in range(SWEEPS):
-            means = self.weights @ self.lattice.table.with_ghosts(self.lattice.ghosts, means)
-        return like(vectors, means)
 
 
 def between(
@@ -257,7 +233,6 @@ class Adaptive(Integrator):
             self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels
         )
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
-        self.mean = NeighbourMean(self.comm, self.lattice)
         self.integrators: dict[int, Integrator] = {}
         self.tick = self.last = 0
         self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
@@ -348,13 +323,18 @@ class Adaptive(Integrator):
                 return self._accepted(replace(result, cost=cost), before, after, level)
 
     def _start_of(self, state: State, level: int, restarts: bool) -> State:
-        """Return the state from which a step of a level starts; ``restarts`` drops the history."""
-        v = state.velocity(self.time_step)
+        """Return the state from which a step of a level starts; ``restarts`` drops the history.
+
+        The history of another level has the mean acceleration a of the last step. So loads change
+        its velocity in proportion to their impulse in that step (Bdf2).
+        """
+        q, v, t, span = state.q, state.velocity(self.time_step), self._length(level), None
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
-            s = 1 - 2.0 ** (level - self.last)
-            history = between(*history, state.q, v, self._length(self.last), s)
-        return replace(state, q_previous=state.q - self._length(level) * v, history=history)
+            span = self._length(self.last)
+            a = (v - history[1]) / span
+            history = q - t * v + 0.5 * t**2 * a, v - t * a
+        return replace(state, q_previous=q - t * v, history=history, span=span)
 
     def _end_time(self, tick: int) -> float:
         """Return the end time [s] of a step that ends at a tick: just before an event there."""
@@ -368,9 +348,9 @@ class Adaptive(Integrator):
         end = self._end_time(self.tick + self.ticks.length(level))
         free = mass * ~self.environment.anchors.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
-        local = self.mean(local_error(self.order, q, v, x, w, t) * (free > 0)[:, None])
+        local = local_error(self.order, q, v, x, w, t)
         sums = [
-            mass @ (local**2).sum(axis=1),
+            free @ (local**2).sum(axis=1),
             mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1),
         ]
         # At rest, the size of the motion is the displacement until the next frame.
@@ -385,6 +365,7 @@ class Adaptive(Integrator):
         sums += [mass @ (coming**2).sum(axis=1), late]
         means = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         error, motion, coming, late = means
+        late += result.begun_error / math.sqrt(self.mass)
         if not self.control.motion:
             motion = max(motion, coming)
         return Measure(math.sqrt(error) + late, math.sqrt(motion))

@@ -1,7 +1,8 @@
 """Implicit integrators: implicit Euler and BDF2 take each step as a minimisation.
 
 Both integrators solve  M (x - y) + tau^2 (grad E(x) - f_ext) = 0  for x. They differ in y, the
-positions without forces, and in tau, which is a fixed part of the time step t.
+positions without forces, and in tau, which is a fixed part of the time step t. In f_ext, loads have
+means over steps, so that their impulse on a free body is their integral over time.
 
 Mass-proportional damping adds -alpha M v to the forces. With v = (x - c) / tau and y = c + tau w,
 
@@ -60,7 +61,7 @@ class ContactFaces:
     these contacts. If there are no contacts, they take none. If the solution shows other contacts,
     the step is solved again. This replaces a broad phase at each iterate.
 
-    q, y       : (l, 3) [m] as in StepProblem
+    q, y, load : as in StepProblem
     before     : (o, l) faces at the start of the step; None: the nearest faces
     fixed      : (l,) bool, nodes that are not unknowns
     q_before   : (l, 3) [m] positions one step before q, for BDF2
@@ -74,6 +75,7 @@ class ContactFaces:
     environment: Environment
     q: Positions
     y: Positions
+    load: Rows
     time: float
     time_step: float
     before: Indices | None
@@ -104,7 +106,7 @@ class ContactFaces:
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
         prescribed = environment.anchors.prescribed(self.q, time)
-        return StepProblem(self.q, self.y, environment.forces.at(time), self.contact, prescribed)
+        return StepProblem(self.q, self.y, self.load, self.contact, prescribed)
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the result of ``step`` with settled contacts. Raises StepFailed."""
@@ -229,7 +231,8 @@ class ImplicitEuler(Integrator):
         y = 2 * q - state.q_previous
         if self.damping:
             y = q + self._carried(time_step) / time_step * (q - state.q_previous)
-        result, sides = self._solve(state, y, time, time_step)
+        load = self.environment.forces.mean(time - time_step, time)
+        result, sides = self._solve(state, y, load, time, time_step)
         after, before, work = self.environment.obstacles.strike(
             result.position,
             result.previous,
@@ -242,6 +245,7 @@ class ImplicitEuler(Integrator):
         self,
         state: State,
         y: Positions,
+        load: Rows,
         time: float,
         time_step: float,
         q_before: Positions | None = None,
@@ -249,11 +253,12 @@ class ImplicitEuler(Integrator):
         """Return the solution of the step to ``time`` [s] and its contact faces (o, l).
 
         y        : (l, 3) [m] positions without forces
+        load     : (owned, 3) [N] f_ext
         q_before : (l, 3) [m] positions one step before the state, for BDF2
         """
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(
-            self.environment, state.q, y, time, time_step, state.sides, fixed, q_before
+            self.environment, state.q, y, load, time, time_step, state.sides, fixed, q_before
         )
         work_before = self.stepper.work_so_far()
         rates = self._rates(state.q, y, q_before)
@@ -339,6 +344,10 @@ class Bdf2(ImplicitEuler):
 
         y = (4 q_n - q_(n-1)) / 3 + tau (4 v_n - v_(n-1)) / 3.
 
+    Let f_n be the mean of the loads over step n. In a free body m (v_n - v_(n-1)) = t f_n, if
+
+        f_ext = (3 f_(n+1) - f_n) / 2.
+
     Friction extrapolates the normal forces of the last two states.
     """
 
@@ -354,13 +363,18 @@ class Bdf2(ImplicitEuler):
         """
         self._let_go(time)
         q, v, work_before = state.q, state.velocity(self.time_step), Work()
-        self.environment.forces.begin_step(q, v, time - self.time_step)
-        history = state.history
+        begin, forces = time - self.time_step, self.environment.forces
+        forces.begin_step(q, v, begin)
+        load = forces.mean(begin, time)
+        history, begun_error = state.history, 0.0
         if history is None:
-            history, work_before = self._history(state, time)
+            history, begun_error, work_before = self._history(state, load, time)
+        else:
+            before = forces.mean(begin - (state.span or self.time_step), begin)
+            load = load if before is load else 1.5 * load - 0.5 * before
         q_0, v_0 = history
         y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
-        result, sides = self._solve(state, y, time, self.time_step, q_0)
+        result, sides = self._solve(state, y, load, time, self.time_step, q_0)
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
         # acceleration times t^2
@@ -372,7 +386,7 @@ class Bdf2(ImplicitEuler):
             self.stepper.lattice.pinned,
         )
         cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
-        result = replace(result, previous=previous, cost=cost, work=work)
+        result = replace(result, previous=previous, cost=cost, work=work, begun_error=begun_error)
         if before is not previous:
             struck = (before != previous).any(axis=1)[:, None]
             v_after = (result.position - before - a) / self.time_step
@@ -380,13 +394,33 @@ class Bdf2(ImplicitEuler):
             v = np.where(struck, v_after, v)
         return result, State(result.position, before, (q, v), sides)
 
-    def _history(self, state: State, time: float) -> tuple[tuple[Positions, Rows], Work]:
-        """Return a history for a state without history, and the work of finding the history.
+    def _history(
+        self, state: State, load: Rows, time: float
+    ) -> tuple[tuple[Positions, Rows], float, Work]:
+        """Return a history for a state without history, its error, and the work of finding it.
 
-        The history leads to q and v with the acceleration of an implicit Euler step of length tau.
-        The error of this acceleration is of first order.
+        The history leads to q and v with the acceleration a of an implicit Euler step of length
+        tau. The error of this acceleration is of first order.
+
+        A mode of frequency w has a = a_n / (1 + (tau w)^2), with the acceleration a_n at q. The
+        BDF2 step then moves it as if its acceleration were constant. The error [m sqrt(kg)] is
+        nearly tau^2 |a|_M (1 - |a|_M^2 / a_n^T M a).
         """
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
-        result, _ = self._solve(state, q + self._carried(tau) * v, time - t + tau, tau)
+        result, _ = self._solve(state, q + self._carried(tau) * v, load, time - t + tau, tau)
         a = ((result.position - q) / tau - v) / tau
-        return (q - t * v + t**2 / 2 * a, v - t * a), result.cost
+        history = q - t * v + t**2 / 2 * a, v - t * a
+        return history, self._begun_error(result), result.cost
+
+    def _begun_error(self, result: StepResult) -> float:
+        """Return the error [m sqrt(kg)] of the history that an implicit Euler step leads to."""
+        functional, problem = self.stepper.functional, result.problem
+        assert problem is not None
+        moved = functional.vectors.take()
+        self.stepper.unknowns.from_nodes(result.position - problem.y, moved)
+        functional.begin(replace(problem, y=problem.q, prescribed=None))
+        # With y = q, F is -tau^2 M a_n.
+        at_start = -functional.at(problem.q).f.dot(moved)
+        length = functional.norm(moved)
+        functional.vectors.give_back(moved)
+        return length * (1 - min(length**2 / at_start, 1.0)) if at_start > 0 else length

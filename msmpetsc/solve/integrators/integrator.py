@@ -45,6 +45,7 @@ class State:
     the frame, which shows the solution.
 
     history : q and velocity [m/s] one step earlier, for multistep methods; None: no history
+    span    : length [s] of the last step if the history belongs to another length; None: the same
     sides   : (o, l) obstacle faces at which the nodes are in contact; None: the nearest faces
     budget  : energy budget after the steps so far
     """
@@ -54,6 +55,7 @@ class State:
     history: tuple[Positions, Rows] | None = None
     sides: Indices | None = None
     budget: EnergyBudget = EnergyBudget()
+    span: float | None = None
 
     def velocity(self, time_step: float) -> Rows:
         """Return the velocities (l, 3) [m/s]."""

@@ -127,7 +127,8 @@ class LoadPath:
         # Obstacles move in the first load step only.
         time_step = 0.0 if len(self.known) > 1 else self.time_step
         fixed = self.stepper.lattice.pinned
-        faces = ContactFaces(self.environment, q, q, self.time, time_step, self.sides, fixed)
+        load = self.environment.forces.at(self.time)
+        faces = ContactFaces(self.environment, q, q, load, self.time, time_step, self.sides, fixed)
         result = faces.solve(lambda whole: self._step(self._problem(whole, share), share))
         lattice = self.stepper.lattice
         count, where = worst_inverted(

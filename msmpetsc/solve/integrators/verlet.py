@@ -7,8 +7,8 @@ Each substep kicks, drifts and kicks, with a = M^(-1) (f_ext - grad E), contact 
     v_(n+1)   = v_(n+1/2) + dt/2 a(q_(n+1))
 
 Adjacent half kicks are merged, except at the ends of a step, so that a frame has q and v of the
-same time. The method is stable if dt < 2 / omega, where omega^2 is the largest eigenvalue of
-M^(-1) (Hessian of E).
+same time. A kick has the mean of f_ext over its duration. The method is stable if dt < 2 / omega,
+where omega^2 is the largest eigenvalue of M^(-1) (Hessian of E).
 
 This limit holds for small oscillations only (README). Beyond them, the substeps gain the error of
 the trapezoidal rule for the work of the springs,
@@ -97,6 +97,7 @@ class Verlet(Integrator):
         self.elastic = self.gradient[:owned]
         self.contact: ContactAt | None = None
         self.sides = environment.obstacles.no_sides[:, :owned]
+        self.load = np.zeros((owned, 3), like=self.lattice.nodes)
         self.damping = environment.damping
         self.work = self.springs_work = self.gained = 0.0
         self.halvings = 0
@@ -133,19 +134,20 @@ class Verlet(Integrator):
         )
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
-            squared_start = self._squared_acceleration(start)
+            dt = self.time_step / count
+            self.load = self.environment.forces.mean(start, start + 0.5 * dt)
+            squared_start = self._squared_acceleration()
             # The energy below shows an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
                 self._take_substeps(count, start, time)
             energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
-            dt = self.time_step / count
             after = np.inf
             if energy <= self.unstable_energy:
                 after = contact_bound + self.highest.squared_at(self.position.values)
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
                 return self._result(
-                    count, dt**2 / 8 * (self._squared_acceleration(time) - squared_start)
+                    count, dt**2 / 8 * (self._squared_acceleration() - squared_start)
                 )
             if not is_stable:
                 squared = np.clip(after, 2 * squared, 16 * squared)
@@ -187,20 +189,21 @@ class Verlet(Integrator):
                 self.q, begin, end, self.sides
             )
             self._update_gradient(end)
-            self._count_work(moved, held)
             duration = end - begin
+            kicked = min(end + 0.5 * duration, time)
+            self.load = self.environment.forces.mean(end - 0.5 * duration, kicked)
+            self._count_work(moved, held)
         self._kick(time, 0.5 * duration, begin, time)
 
     def _count_work(self, moved: Rows, held: Mask) -> None:
-        """Add half the work [J] of the present forces to the work of springs and of anchors.
+        """Add half the work [J] of the present forces to the work of springs, loads and anchors.
 
         moved : (owned, 3) [m] displacements of the substep
         held  : (owned,) bool, nodes that anchors move against all forces
         """
-        # The energy balance takes the load at the end of the step.
         self.springs_work += 0.5 * np.vdot(self.elastic, moved)
-        against = self.gradient[: self.lattice.owned] - self.environment.forces.at(self.end)
-        self.work += 0.5 * float(np.vdot(against[held], moved[held]))
+        forces = np.where(held[:, None], self.gradient[: self.lattice.owned], self.load)
+        self.work += 0.5 * float(np.vdot(forces, moved))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
         """Return whether a step gained too much energy, and then halve the substeps (collective).
@@ -231,9 +234,9 @@ class Verlet(Integrator):
             self.halvings -= 1
         return False
 
-    def _squared_acceleration(self, time: float) -> float:
+    def _squared_acceleration(self) -> float:
         """Return |M^(-1) (f_ext - grad E)|_M^2 [J/s^2] of this rank's free nodes."""
-        force = (self.environment.forces.at(time) - self.gradient[: self.lattice.owned])[self.free]
+        force = (self.load - self.gradient[: self.lattice.owned])[self.free]
         return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
 
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
@@ -265,15 +268,7 @@ class Verlet(Integrator):
         begin, end : times [s] of the substep whose motion the obstacles have
         """
         self._damp(0.5 * duration)
-        beyond = self.environment.forces.beyond(time, self.end)
-        load = self.environment.forces.at(time)
-        before = None if beyond is None else self.v.copy()
-        kick(len(self.free), load, duration, self._movers())
-        # A kick by f changes the kinetic energy by duration f . (v- + v+) / 2.
-        if beyond is not None and before is not None:
-            self.work += (
-                0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
-            )
+        kick(len(self.free), self.load, duration, self._movers())
         self._damp(0.5 * duration)
         if self.contact:
             self.work += duration * self.contact.power(begin, end)
@@ -335,7 +330,7 @@ class Verlet(Integrator):
 
     def _contact_bound(self, start: float, time: float) -> float:
         """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
-        fall = self.environment.forces.at(start) * self.per_mass[:, None] * self.time_step
+        fall = self.environment.forces.mean(start, time) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
         stiffness = self.environment.obstacles.contact_stiffness_bound(

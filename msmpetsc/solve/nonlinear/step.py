@@ -60,6 +60,8 @@ class StepResult:
     energy_tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
     tau          : [s]
     viscous      : forces of viscosity (owned, 3) [N]
+    begun_error  : error of a history that the step had to make up (solve.integrators.implicit.Bdf2)
+                   [m sqrt(kg)]
     viscous_work : energy that viscosity took in of this rank's cells [J]
     """
 
@@ -76,6 +78,7 @@ class StepResult:
     tau: float = np.inf
     viscous: Rows | None = None
     viscous_work: float = 0.0
+    begun_error: float = 0.0
 
 
 @dataclass(eq=False)

@@ -31,7 +31,7 @@ ORDER_TOLERANCE = 0.05
 class ErrorLaw:
     """The power law e = factor * size^order of an error.
 
-    observed : whether the order was measured; otherwise it is an end of the accepted range
+    observed : whether the order was measured; otherwise it is an assumption
     cosine   : cosine c of the angle between distance and error of the finer run
     """
 
@@ -87,20 +87,24 @@ def error_law(
     orders: tuple[float, float],
     across: float | None = None,
     cosine: float = 1.0,
+    assumed: float | None = None,
 ) -> ErrorLaw:
     """Return the law of the error from distances between runs.
 
     sizes     : two or three sizes, descending
     distances : distances between consecutive runs
-    orders    : least and greatest order accepted; two runs get the least
+    orders    : least and greatest order accepted
     across    : distance between the first and the last run; it replaces the last of ``distances``
                 if no order is observed and the last two sizes are similar
     cosine    : cosine c of the angle between distance and error
+    assumed   : order if the distances show none, as those of two runs; the least if absent
     """
-    order = orders[0]
-    observed = False
+    order = None
     if len(sizes) > 2 and distances[-1] > 0:
-        order, observed = _order(sizes, distances[-2] / distances[-1], cosine, orders)
+        order = _order(sizes, distances[-2] / distances[-1], cosine, orders)
+    observed = order is not None
+    if order is None:
+        order = orders[0] if assumed is None else assumed
     a, b = sizes[-2:]
     distance = distances[-1]
     if not observed and across is not None and a < SIMILAR_RATIO * b:
@@ -112,8 +116,8 @@ def error_law(
 
 def _order(
     sizes: Sequence[float], ratio: float, cosine: float, orders: tuple[float, float]
-) -> tuple[float, bool]:
-    """Return the order that gives a ratio of distances, clipped, and whether it was observed."""
+) -> float | None:
+    """Return the order that gives a ratio of distances, clipped; None if they show no order."""
     a, b, c = sizes[-3:]
     low, high = orders
 
@@ -124,7 +128,7 @@ def _order(
         return float(math.sqrt(coarse**2 - (1 - cosine**2) * middle**2) - cosine * middle - ratio)
 
     if excess(low) >= 0:
-        return low, excess(low - ORDER_TOLERANCE) < 0
+        return low if excess(low - ORDER_TOLERANCE) < 0 else None
     if excess(high) <= 0:
-        return high, True
-    return float(brentq(excess, low, high)), True
+        return high
+    return float(brentq(excess, low, high))

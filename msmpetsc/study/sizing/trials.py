@@ -46,8 +46,10 @@ START_CELLS = 1000
 STEP_MARGIN = 8
 # distance of lattices [-] above which the motions are out of phase and show no order
 OUT_OF_PHASE = 0.15
-# order taken for lattices out of phase; clamped bars show 1.5 to 2
+# order assumed if lattices show none; clamped bars show 1.5 to 2
 USUAL_ORDER = 1.5
+# difference of the orders of coarser and finer lattices above which one is chance
+ALIKE = 0.5
 # step errors tried in addition to that of the trials
 LOOSE_STEP_ERRORS = (1e-1, 1e-2)
 # time limits of a trial on coarse lattices and on the finest [s]
@@ -150,12 +152,13 @@ class Sizer:
         )
         # the order determines the error of the finest lattice, which enters all errors
         is_uncertain = not law.observed or _distance(lattices[0], lattices[1]) > OUT_OF_PHASE
-        is_too_coarse = wanted is None or law.error(finest.edge) > UNCERTAIN * self.target
-        if (is_near or (is_uncertain and is_too_coarse)) and (
+        is_too_coarse = law.error(finest.edge) > UNCERTAIN * self.target
+        # few cells cannot show that no number of cells is enough
+        if (wanted is None or is_near or (is_uncertain and is_too_coarse)) and (
             finer := self._run(method, self._coarser(-0.5))
         ):
             lattices = [*lattices[-2:], finer]
-            model = replace(model, law=self._law(lattices))
+            model = replace(model, law=self._law(lattices, law))
         plan, model = self._refine_choice(model, lattices)
         return replace(plan, bounds=self._bounds(plan, model), tried=self.trials)
 
@@ -299,28 +302,42 @@ class Sizer:
             )
         return runs
 
-    def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
+    def _law(self, runs: list[SizeTrial], coarser: ErrorLaw | None = None) -> ErrorLaw:
         """Return the law of the cells' error from runs on two or three lattices.
 
-        If cells are inverted, order 1 is taken: the inverted region shrinks no faster than the edge
-        of a cell.
+        If they show no order, the order of coarser lattices is assumed, or the usual order if these
+        show none. If both differ, one of them is chance, and their mean is assumed. If cells are
+        inverted, order 1 is assumed: the inverted region shrinks no faster than the edge of a cell.
+
+        coarser : law of coarser lattices
         """
         distances = [_distance(*pair) for pair in pairwise(runs)]
         least, greatest = ORDERS
         is_out_of_phase = len(runs) > 2 and distances[0] > OUT_OF_PHASE
         is_inverted = runs[-1].inverted > 0
-        orders = (USUAL_ORDER if is_out_of_phase else least, greatest)
+        known = coarser.order if coarser and coarser.observed else None
+        orders, assumed = (USUAL_ORDER if is_out_of_phase else least, greatest), known
         if is_inverted:
-            orders = (least, least)
+            orders, assumed, known = (least, least), least, None
         across = _distance(runs[0], runs[-1])
         cosine = cosine_of(distances[0], distances[1], across) if len(runs) > 2 else 0.0
         edges = [each.edge for each in runs]
-        law = error_law(edges, distances, orders, None if is_out_of_phase else across, cosine)
+        law = error_law(
+            edges,
+            distances,
+            orders,
+            None if is_out_of_phase else across,
+            cosine,
+            assumed or USUAL_ORDER,
+        )
+        if known and law.observed and abs(law.order - known) > ALIKE:
+            mean = (law.order + known) / 2
+            law = error_law((edges[0], edges[-1]), (across,), ORDERS, None, cosine, mean)
         law = replace(law, observed=law.observed and not is_inverted)
         self.cell_bound = ""
         if not law.observed:
             self.cell_bound = (
-                f"the cells: their distances show no order; order {law.order:g} is taken"
+                f"the cells: their distances show no order; order {law.order:.2g} is assumed"
             )
         return law
 

@@ -24,6 +24,7 @@ import numpy as np
 from mpi4py import MPI
 
 import msmpetsc
+from msmpetsc.app.modes import find_modes
 from msmpetsc.app.request import RunRequest
 from msmpetsc.build import build_model
 from msmpetsc.fields import FRAME_FIELDS
@@ -31,7 +32,6 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 
 FOLDER = lab.SCENES / "studies" / "yardstick"
-CHART = FOLDER / "yardstick.png"
 # |error| shown as "exact", that of the solver in most cases [-]
 EXACT = 1e-6
 # cells that give the stress at a place: their distance less the degree [cells], their
@@ -318,7 +318,11 @@ def main() -> None:
     parser.add_argument("words", nargs="*", metavar="WORD", help="run cases whose names contain it")
     parser.add_argument("--fast", action="store_true", help="run the coarse sizes only")
     parser.add_argument(
-        "--chart", type=Path, default=CHART, metavar="PNG", help="file of the chart"
+        "--chart",
+        type=Path,
+        default=FOLDER / "yardstick.png",
+        metavar="PNG",
+        help="file of the chart",
     )
     args = parser.parse_args()
     lab.heading()

@@ -317,13 +317,7 @@ def main() -> None:
     parser = lab.parser(__doc__)
     parser.add_argument("words", nargs="*", metavar="WORD", help="run cases whose names contain it")
     parser.add_argument("--fast", action="store_true", help="run the coarse sizes only")
-    parser.add_argument(
-        "--chart",
-        type=Path,
-        default=FOLDER / "yardstick.png",
-        metavar="PNG",
-        help="file of the chart",
-    )
+    parser.add_argument("--chart", type=Path, default=FOLDER / "yardstick.png", help="a PNG file")
     args = parser.parse_args()
     lab.heading()
     found: dict[str, tuple[Case, list[Run]]] = {}

@@ -24,7 +24,7 @@ from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import BodySurface, Cages, fill
 from msmpetsc.geometry.cell_size import choose_cell_size, warn_of_thin_bodies
 from msmpetsc.geometry.embedding import embed
-from msmpetsc.geometry.morton import encode_morton
+from msmpetsc.geometry.morton import COPIES
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import (
@@ -174,13 +174,14 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topol
     exact, for any rotation of the body, if the surface is flat over a cell. With whole cells
     the lattice is the body, and each node is its own nearest point.
     """
-    owned, ghosts = np.split(topology.ijk, [len(topology.octants)])
+    owned = topology.ijk[: len(topology.octants)]
     body = cages.grids.body_of(owned)
     # a node shared by eight valid cells is inside, or in a narrow fold of the surface
-    rows = np.flatnonzero(~topology.octants.all(axis=1) & np.array(cages.is_weighted)[body])
+    is_inside = topology.octants.all(axis=1) & (topology.table.keys % COPIES == 0)
+    rows = np.flatnonzero(~is_inside & np.array(cages.is_weighted)[body])
     nearest = cages.grids.node_positions(owned)
     nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
-    return np.concatenate([nearest, topology.table.rows_of(encode_morton(ghosts), nearest)])
+    return topology.table.with_ghosts(topology.ghosts, nearest)
 
 
 def build_model(

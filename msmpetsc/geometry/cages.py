@@ -13,11 +13,13 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Indices, Rows
-from msmpetsc.comm import Route, SortedKeys, log, together
+from msmpetsc.comm import Route, SortedKeys, log, on_root, together
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.cell_parts import CellParts, PartsOfPoints, parts_of, ranges
+from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, packed, unpacked
-from msmpetsc.geometry.morton import decode_morton, encode_morton
+from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 from msmpetsc.geometry.valid_cells import (
     Slab,
@@ -62,6 +64,9 @@ class Cages:
     moments     : (n_local, 3) second moments of the material about the cells' middles [cells^5];
                   None if all cells count as full
     is_weighted : for each body, whether its boundary cells are weighted by their fill
+    copies      : cells with corners of their own; None if all cells are ordinary
+    parts       : finder of the part of a cell that holds a point, for each body on rank 0; None
+                  elsewhere, and for a body whose cells count as full
     """
 
     grids: BodyGrids
@@ -70,18 +75,25 @@ class Cages:
     fills: Rows | None = None
     moments: Rows | None = None
     is_weighted: tuple[bool, ...] = (False,)
+    copies: Copies | None = None
+    parts: tuple[PartsOfPoints | None, ...] = (None,)
 
     @property
     def ijk(self) -> Indices:
         """Grid index (n_local, 3) of this rank's cells."""
         return decode_morton(self.table.keys)
 
-    def of_cells(self, ijk: Indices, rows: Rows | None) -> Rows | None:
-        """Return ``rows`` of fills or moments of valid cells (c, 3) of any rank (collective).
+    def of_cells(self, keys: Indices, rows: Rows | None) -> Rows | None:
+        """Return ``rows`` of fills or moments of valid cells (c,) of any rank (collective).
 
         If ``rows`` is None, return None.
         """
-        return None if rows is None else self.table.rows_of(encode_morton(ijk), rows)
+        return None if rows is None else self.table.rows_of(keys, rows)
+
+    def corner_keys(self, keys: Indices) -> Indices:
+        """Return the keys (..., 8) of the corner nodes of cells (...,)."""
+        copies = self.copies or NO_COPIES
+        return copies.corner_keys(keys, decode_morton(keys))
 
 
 @dataclass(frozen=True)
@@ -123,22 +135,96 @@ def fill(
     grids = BodyGrids.covering([body.bounds for body in bodies], cell_size)
     slabs = slabs_of_all(bodies, grids, max_cells, boundary)
     refuse_beyond_memory(comm, sum(cells.count(comm) for cells in slabs))
-    parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, slabs, strict=True)]
+    of_parts = _parts_of_all(bodies, grids, slabs)
+    cells = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, slabs, strict=True)]
     keys = encode_morton(
-        np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(parts)])
+        np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(cells)])
     )
+    kind = np.concatenate([kind for _, kind, _ in cells])
+    is_weighted = tuple(cut is not None for _, _, cut in cells)
+    columns: list[Array] = [kind]
+    if any(is_weighted):
+        of_bodies = [_full_cells(len(kind)) if cut is None else cut for _, kind, cut in cells]
+        columns += [np.concatenate(rows) for rows in zip(*of_bodies, strict=True)]
+        keys, columns = _with_copies(comm, grids, of_parts, keys, columns)
     table = SortedKeys(comm, keys)
     route = Route(comm, table.owner(keys))
     order = np.argsort(route.send(keys))
-    kind = np.concatenate([kind for _, kind, _ in parts])
-    is_weighted = tuple(cut is not None for _, _, cut in parts)
-    fills = moments = None
-    if any(is_weighted):
-        of_bodies = [_full_cells(len(kind)) if cut is None else cut for _, kind, cut in parts]
-        fills, moments = (
-            route.send(np.concatenate(rows))[order] for rows in zip(*of_bodies, strict=True)
-        )
-    return Cages(grids, table, route.send(kind)[order], fills, moments, is_weighted)
+    kind, *cut = (route.send(column)[order] for column in columns)
+    fills, moments = cut or (None, None)
+    copies = find_copies(of_parts, grids, table)
+    _tell_copies(copies)
+    points = tuple(parts.points if parts else None for parts in of_parts)
+    return Cages(grids, table, kind, fills, moments, is_weighted, copies, points)
+
+
+def _tell_copies(copies: Copies | None) -> None:
+    """Log how many copies of cells and nodes there are."""
+    if copies:
+        cells = int((copies.keys % COPIES > 0).sum())
+        nodes = np.unique(copies.corners)
+        log.info(
+            "slits narrower than a cell: %d copies of cells and %d of nodes move apart",
+            cells, int((nodes % COPIES > 0).sum()),
+        )  # fmt: skip
+
+
+def _parts_of_all(
+    bodies: Sequence[BodySurface], grids: BodyGrids, slabs: Sequence[SlabCells]
+) -> list[CellParts | None]:
+    """Return the parts of each closed and weighted body on rank 0, None elsewhere (collective)."""
+
+    of_parts: list[CellParts | None] = [None] * len(bodies)
+
+    def of_root() -> None:
+        for number, (body, grid, cells) in enumerate(zip(bodies, grids.grids, slabs, strict=True)):
+            if body.surface and cells.columns:
+                volume = body.report.volume
+                of_parts[number] = parts_of(body.surface, grid, _axes(body), volume)
+
+    on_root(bodies[0].comm, of_root)
+    return of_parts
+
+
+def _with_copies(
+    comm: MPI.Comm,
+    grids: BodyGrids,
+    of_parts: Sequence[CellParts | None],
+    keys: Indices,
+    columns: list[Array],
+) -> tuple[Indices, list[Array]]:
+    """Return cells with copies for the parts in them; each part has its share (collective).
+
+    keys    : (n,) keys of this rank's cells
+    columns : kind (n,), fills (n, 2, 2, 2) and second moments (n, 3)
+    """
+
+    def of_root() -> list[Array]:
+        rows = [
+            (np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2, 2, 2)), np.empty((0, 3)))
+        ]
+        for body, parts in enumerate(of_parts):
+            if parts:
+                several = parts.several
+                ijk = parts.ijk[several] + grids.first(body)
+                number = ranges(np.zeros_like(several), parts.count[several])
+                of_cell = np.repeat(encode_morton(ijk), parts.count[several])
+                rows.append((of_cell, number, parts.shares, parts.spread))
+        return [np.concatenate(column) for column in zip(*rows, strict=True)]
+
+    of_key, copy, shares, spread = comm.bcast(on_root(comm, of_root))
+    order = np.argsort(keys)
+    place = np.searchsorted(keys, of_key, sorter=order)
+    cell = np.append(order, 0)[place]
+    own = np.append(keys, -1)[np.append(order, len(keys))[place]] == of_key
+    cell, copy = cell[own], copy[own]
+    kind, fills, moments = columns
+    of_copies = _clipped(fills[cell] * shares[own], moments[cell] * spread[own])
+    kept = np.ones(len(keys), bool)
+    kept[cell] = False
+    keys = np.concatenate([keys[kept], keys[cell] + copy])
+    rows = zip((kind, fills, moments), (kind[cell], *of_copies), strict=True)
+    return keys, [np.concatenate([whole[kept], copies]) for whole, copies in rows]
 
 
 # fills (n, 2, 2, 2) of the cells' corners, and second moments (n, 3)
@@ -190,6 +276,11 @@ def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | No
         fills, moments = sampled_inside(
             body.comm.bcast(body.surface), grid, cells.boundary[:, axes]
         )
+    return _clipped(fills, moments)
+
+
+def _clipped(fills: Rows, moments: Rows) -> Fill:
+    """Return fills from LEAST_FILL to 1, and second moments that belong to them."""
     clipped = np.clip(np.where(fills > FULL, 1.0, fills), LEAST_FILL, 1.0)
     return clipped, moments + (clipped - fills).mean(axis=(1, 2, 3))[:, None] / 4
 
@@ -304,8 +395,8 @@ def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:
     """Return the distinct cells (b, 3) of the slab that triangles touch, in lexicographic order."""
     keys = [np.empty(0, np.int64)]
     for start in range(0, len(corners), CHUNK):
-        cells = touched_cells(corners[start : start + CHUNK], *_limits(shape, slab))
-        keys.append(np.unique(packed(cells)))
+        touched, _ = touched_cells(corners[start : start + CHUNK], *_limits(shape, slab))
+        keys.append(np.unique(touched))
     return unpacked(np.unique(np.concatenate(keys)))
 
 

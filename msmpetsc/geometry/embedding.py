@@ -15,9 +15,10 @@ from scipy.sparse import coo_array, csr_array
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import Route, SortedKeys
 from msmpetsc.geometry.blended_coordinates import affine_weights, cages_weights, gradient_table
-from msmpetsc.geometry.block import MIDDLE
+from msmpetsc.geometry.block import MIDDLE, NODE_STRIDE
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.morton import decode_morton, encode_morton
+from msmpetsc.geometry.grid import CORNERS
+from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 
 # largest distance of a point outside its cell [cells]; above rounding
 ROUNDING = 1e-9
@@ -45,11 +46,10 @@ def embed(
     """
     comm = cages.table.comm
     total = comm.allreduce(sum(map(len, points)))
-    row, ijk, u = _to_cells(points, cages)
-    cell_keys, cell = np.unique(encode_morton(ijk), return_inverse=True)
-    around = decode_morton(cell_keys)[:, None, :]
-    neighbours = cages.table.find(encode_morton(around + CELLS_AROUND)) >= 0
-    numbers = nodes.find(encode_morton(around + NODES_AROUND))
+    row, key, u = _to_cells(points, cages)
+    cell_keys, cell = np.unique(key, return_inverse=True)
+    neighbours, node_keys = _around(cages, cell_keys)
+    numbers = nodes.find(node_keys)
 
     def entries(part: slice) -> tuple[Indices, Indices, Floats]:
         """Return the nonzero weights of some points as rows, columns and values."""
@@ -72,14 +72,47 @@ def embed(
 def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indices, Rows]:
     """Send points to the ranks of their cells (collective).
 
-    Return the number (p,), the cell (p, 3) and the coordinates in the cell (p, 3) of each.
+    Return the number (p,), the key of the cell (p,) and the coordinates in it (p, 3) of each.
     """
     at = [grid.to_cells(of_body) for grid, of_body in zip(cages.grids.grids, points, strict=True)]
     cells = [np.floor(of_body).astype(np.int64) for of_body in at]
     u = np.concatenate([x - ijk for x, ijk in zip(at, cells, strict=True)])
     ijk = np.concatenate([of_body + cages.grids.first(body) for body, of_body in enumerate(cells)])
-    route = Route(cages.table.comm, cages.table.owner(encode_morton(ijk)))
-    return route.send(np.arange(len(u))), route.send(ijk), route.send(u)
+    copies = [
+        parts.find(of_body, ijk) if parts else np.zeros(len(ijk), np.int64)
+        for parts, of_body, ijk in zip(cages.parts, points, cells, strict=True)
+    ]
+    keys = encode_morton(ijk) + np.concatenate(copies)
+    route = Route(cages.table.comm, cages.table.owner(keys))
+    return route.send(np.arange(len(u))), route.send(keys), route.send(u)
+
+
+def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
+    """Return the valid cells (c, 27) and the node keys (c, 64) around cells (c,) (collective).
+
+    A neighbour counts if a single copy of it shares a corner with the cell. The key of a node of no
+    such cell belongs to no node, or to a node that has no weight.
+    """
+    around = decode_morton(keys)[:, None, :]
+    cells = encode_morton(around + CELLS_AROUND)
+    neighbours = cages.table.find(cells) >= 0
+    node_keys = encode_morton(around + NODES_AROUND)
+    if cages.copies is None:
+        return neighbours, node_keys
+    copies = cells[:, :, None] + np.arange(COPIES)
+    rows = np.flatnonzero((cages.copies.place(copies) >= 0).any(axis=(1, 2)))
+    copies = copies[rows]
+    own, corners = cages.corner_keys(keys[rows]), cages.corner_keys(copies)
+    joined = (corners[..., None] == own[:, None, None, None, :]).any(axis=(3, 4))
+    joined &= cages.table.find(copies) >= 0
+    joined[:, MIDDLE] = copies[:, MIDDLE] == keys[rows, None]
+    neighbours[rows] = joined.sum(axis=2) == 1
+    # the cell itself comes last, so that its corners are its own
+    for cell in np.roll(np.arange(27), 26 - MIDDLE):
+        row, copy = np.nonzero(joined[:, cell] & neighbours[rows, cell, None])
+        place = (CELLS_AROUND[cell] + CORNERS + 1) @ NODE_STRIDE
+        node_keys[rows[row][:, None], place] = corners[row, cell, copy]
+    return neighbours, node_keys
 
 
 def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0) -> Rows:

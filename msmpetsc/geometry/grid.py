@@ -11,9 +11,13 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.morton import LIMIT
+from msmpetsc.geometry.morton import LIMIT, SIDE_LIMIT
 
 PACK = np.array([LIMIT**2, LIMIT, 1])
+# corners of a cell [cell]; in VTK's hexahedron order, as in the result file
+CORNERS = np.array(
+    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+)
 # triangles or cells in a batch [-]; bounds the memory of a pass
 CHUNK = 1 << 17
 # distance at which a coordinate is moved onto a grid plane, relative to the longest
@@ -43,10 +47,10 @@ class Grid:
         """
         length = (bounds[1] - bounds[0]) / cell_size
         cells = np.ceil(length - min(ON_PLANE * length.max(), MOST_ON_PLANE))
-        if not cells.max() < LIMIT - 1:
+        if not cells.max() < SIDE_LIMIT - 1:
             raise InputError(
                 f"cages.cell_size: {cell_size:g} m would cut the body into {cells.max():.3g} cells "
-                f"along one side, more than {LIMIT - 2}"
+                f"along one side, more than {SIDE_LIMIT - 2}"
             )
         return cls(bounds[0].copy(), float(cell_size), np.maximum(cells, 1).astype(np.int64))
 

@@ -1,6 +1,7 @@
 """Morton order: keys of grid indices that interleave the bits of i, j and k.
 
-Cells and nodes near in space have near keys, so a range of keys is compact.
+Cells and nodes near in space have near keys, so a range of keys is compact. The lowest bits of a
+key number the copies of a cell or node at the same grid index (geometry.copies).
 """
 
 import numpy as np
@@ -8,8 +9,14 @@ import numpy as np
 from msmpetsc.backend.arrays import Indices
 from msmpetsc.backend.kernel import njit
 
-# cells along an axis [-]; three indices of 21 bits fill 63 bits of a key
+# bits of a key for the number of a copy [-]; a key has 63 bits, and the indices take 61
+COPY_BITS = 2
+# copies at a grid index [-]
+COPIES = 1 << COPY_BITS
+# cells along the first axis [-]
 LIMIT = 1 << 21
+# cells along the longest side of a body [-]
+SIDE_LIMIT = LIMIT >> 1
 
 
 @njit()
@@ -36,24 +43,29 @@ def _gather(x: int) -> int:
 
 @njit()
 def _encode(ijk: Indices, keys: Indices) -> None:
-    """Set the Morton keys (n,) of grid indices (n, 3); -1 for an index outside 0..LIMIT - 1."""
+    """Set the Morton keys (n,) of grid indices (n, 3); -1 for an index without a key."""
     for n in range(len(ijk)):
+        i, j, k = ijk[n]
         keys[n] = -1
-        if 0 <= ijk[n, 0] < LIMIT and 0 <= ijk[n, 1] < LIMIT and 0 <= ijk[n, 2] < LIMIT:
-            keys[n] = _spread(ijk[n, 0]) | _spread(ijk[n, 1]) << 1 | _spread(ijk[n, 2]) << 2
+        if 0 <= i < LIMIT and 0 <= j < SIDE_LIMIT and 0 <= k < SIDE_LIMIT:
+            keys[n] = (_spread(i) | _spread(j) << 1 | _spread(k) << 2) << COPY_BITS
 
 
 @njit()
 def _decode(keys: Indices, ijk: Indices) -> None:
     """Set the grid indices (n, 3) of Morton keys (n,)."""
     for n in range(len(keys)):
-        ijk[n, 0] = _gather(keys[n])
-        ijk[n, 1] = _gather(keys[n] >> 1)
-        ijk[n, 2] = _gather(keys[n] >> 2)
+        bits = keys[n] >> COPY_BITS
+        ijk[n, 0] = _gather(bits)
+        ijk[n, 1] = _gather(bits >> 1)
+        ijk[n, 2] = _gather(bits >> 2)
 
 
 def encode_morton(ijk: Indices) -> Indices:
-    """Return the Morton key (...,) of each grid index (..., 3); -1 outside 0..LIMIT - 1."""
+    """Return the Morton key (...,) of copy 0 at each grid index (..., 3).
+
+    It is -1 outside 0..LIMIT - 1 along the first axis, and 0..SIDE_LIMIT - 1 along the others.
+    """
     rows = np.ascontiguousarray(ijk, np.int64).reshape(-1, 3)
     keys = np.empty(len(rows), np.int64)
     _encode(rows, keys)

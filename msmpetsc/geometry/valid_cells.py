@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.comm import Route
-from msmpetsc.geometry.grid import packed
+from msmpetsc.geometry.grid import PACK, packed
 from msmpetsc.geometry.morton import LIMIT
 
 # rounding of an interpolated coordinate, relative to the largest [-]; an upper bound
@@ -100,18 +100,19 @@ def _index_range(
 
 
 @njit()
-def touched_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
+def touched_cells(corners: Rows, low: Indices, high: Indices) -> tuple[Indices, Indices]:
     """Return all cells that triangles touch; cells within rounding of a triangle may be added.
 
     corners   : (f, 3, 3) triangles in cell units
     low, high : (3,) int64, limits low <= cell < high
-    returns   : (c, 3) int64, a row for each touching triangle and cell, so cells repeat
+    returns   : keys (c,) of cells (grid.packed) and numbers (c,) of triangles, for each triangle
+                and cell that touch
     """
-    cells = np.empty((4 * len(corners) + 16, 3), np.int64)
+    touching = np.empty((4 * len(corners) + 16, 2), np.int64)
     used = 0
     buffers = np.empty((3, 12, 3))
     work, across, along = buffers[0], buffers[1], buffers[2]
-    for triangle in corners:
+    for number, triangle in enumerate(corners):
         margin_j, margin_k = _rounding_bound(triangle, 1), _rounding_bound(triangle, 2)
         i0, i1 = _index_range(triangle, triangle, 3, 0, (low[0], high[0]), 0.0)
         for i in range(i0, i1 + 1):
@@ -124,10 +125,11 @@ def touched_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
                     continue
                 k0, k1 = _index_range(triangle, along, m, 2, (low[2], high[2]), margin_k)
                 for k in range(k0, k1 + 1):
-                    cells = grown(cells, used)
-                    cells[used, 0], cells[used, 1], cells[used, 2] = i, j, k
+                    touching = grown(touching, used)
+                    touching[used, 0] = i * PACK[0] + j * PACK[1] + k * PACK[2]
+                    touching[used, 1] = number
                     used += 1
-    return cells[:used]
+    return touching[:used, 0].copy(), touching[:used, 1].copy()
 
 
 class Slab(NamedTuple):

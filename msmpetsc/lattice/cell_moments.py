@@ -31,7 +31,7 @@ It is positive semidefinite because C is: it consists of three forms like
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Rows
-from msmpetsc.lattice.cut_cells import CORNERS
+from msmpetsc.geometry.grid import CORNERS
 
 # columns of ``forms_of`` [-]
 FORM = 13

@@ -13,12 +13,9 @@ A corner's mass is proportional to the diagonal of L that its springs give (READ
 import numpy as np
 
 from msmpetsc.backend.arrays import Rows
+from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.lattice.material import CELLS_AROUND, ISOTROPIC
 
-# corners of a cell [cell]; in VTK's hexahedron order, as in the result file
-CORNERS = np.array(
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
-)
 # kind (8, 8) of the spring between two corners [-]; 0 on the diagonal
 PAIR_KIND = ((CORNERS[:, None] - CORNERS) ** 2).sum(axis=2)
 # whether a corner's fill counts for a spring (8, 8, 8) [-]; it must agree with both

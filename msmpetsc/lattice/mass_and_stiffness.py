@@ -18,7 +18,7 @@ from msmpetsc.lattice.material import (
     edge_stiffness,
     lame_constants,
 )
-from msmpetsc.lattice.topology import DIRECTION, DIRECTION_KIND, Topology
+from msmpetsc.lattice.topology import DIRECTION, DIRECTION_KIND, Topology, find_slot, slots
 from msmpetsc.scene.body import Material
 
 
@@ -76,7 +76,7 @@ def law_of_springs(
 def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None) -> CellMaterial:
     """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given."""
     if of_cells:
-        return of_cells(net.ijk[net.cells[:, 0]])
+        return of_cells(net.keys)
     of_all = material.density, material.spring, material.poisson_ratio
     return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
 
@@ -120,17 +120,20 @@ def _sums_of_springs(net: Topology, values: Floats, weights: Rows) -> Floats:
 
     weights : (d, 8, 8) weight of a cell's value for the spring between two of its corners
     """
-    of_nodes = _sums_by_direction(net.cells, values, weights, len(net.octants))
-    sums: Floats = of_nodes[net.springs[:, 0], net.direction]
-    return sums
+    sums = _sums_by_slot(net.cells, values, weights, len(net.octants), net.further)
+    return sums.ravel()[net.slot]
 
 
 @njit()
-def _sums_by_direction(cells: Indices, values: Floats, weights: Rows, owned: int) -> Rows:
-    sums = np.zeros((owned, 27))
+def _sums_by_slot(cells: Indices, values: Floats, weights: Rows, owned: int, further: int) -> Rows:
+    neighbour, following = slots(owned if further else 0, further)
+    sums = np.zeros((owned + further, 27))
     for i in range(len(cells)):
         for a in range(8):
             if cells[i, a] < owned:
                 for b in range(8):
-                    sums[cells[i, a], DIRECTION[a, b]] += values[i] * weights[i, a, b]
+                    at = cells[i, a], DIRECTION[a, b]
+                    if further:
+                        at = find_slot(neighbour, following, at[0], at[1], cells[i, b])
+                    sums[at] += values[i] * weights[i, a, b]
     return sums

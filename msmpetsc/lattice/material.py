@@ -37,7 +37,7 @@ class CellMaterial:
     poisson: Floats
 
 
-# material of the cells with grid indices (c, 3)
+# material of the cells with these keys (c,)
 MaterialOfCells = Callable[[Indices], CellMaterial]
 
 

@@ -20,11 +20,11 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_h
 from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
+from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.inside import frame_of, inside_bodies
-from msmpetsc.geometry.morton import encode_morton
+from msmpetsc.geometry.morton import decode_morton, encode_morton
 from msmpetsc.geometry.surface import Surface, examine, is_inside
 from msmpetsc.geometry.valid_cells import Slab
-from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import CellMaterial, MaterialOfCells
 from msmpetsc.scene.body import Material, OwnMaterial, Region
@@ -131,18 +131,18 @@ class Finder:
         """Return the mask (n,) of points (n, 3) [m] of bodies (n,) in a table's region of space."""
         return inside_bodies(table.table.region, points, self.bounds, body, table.body)
 
-    def find_cells(self, table: OfBody, ijk: Indices) -> Mask:
+    def find_cells(self, table: OfBody, keys: Indices) -> Mask:
         """Return the mask (c,) of cells in a region (collective).
 
         A cell is in a region of space if the centroid of its part inside the surface is. A region
         of painted points or of a group has the cells of ``_of_mesh``.
 
-        ijk : (c, 3) grid index of the cells
+        keys : (c,) keys of the cells
 
         Raises InputError on all ranks if the region has no cell.
         """
-        grids = self.cages.grids
-        fills = self.cages.of_cells(ijk, self.cages.fills)
+        grids, ijk = self.cages.grids, decode_morton(keys)
+        fills = self.cages.of_cells(keys, self.cages.fills)
         middles = grids.node_positions(ijk + (0.5 if fills is None else _middles(fills)))
         if table.table.region.is_of_mesh:
             where = self._of_mesh(table, ijk, middles, grids.body_of(ijk), are_nodes=False)
@@ -328,7 +328,7 @@ def _extent(region: Region, bounds: Rows) -> str:
 
 
 def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
-    """Return the function from grid indices (c, 3) of cells to their materials (collective).
+    """Return the function from keys (c,) of cells to their materials (collective).
 
     It is None if all cells have the scene's material.
     """
@@ -343,11 +343,11 @@ def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
         for name in ("density", spring, "poisson_ratio")
     )
 
-    def of_cells(ijk: Indices) -> CellMaterial:
-        body = finder.cages.grids.body_of(ijk)
+    def of_cells(keys: Indices) -> CellMaterial:
+        body = finder.cages.grids.body_of(decode_morton(keys))
         cells = CellMaterial(density[body], stiffness[body], poisson[body])
         for part in parts:
-            where, own = finder.find_cells(part, ijk), part.table
+            where, own = finder.find_cells(part, keys), part.table
             for values, name in (
                 (cells.density, "density"),
                 (cells.spring, spring),

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from test_neo_hookean import RNG, YOUNG, H, cases, gradient, moments, points_inside, solid
 
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.lattice.cell_moments import bounding_laplacians, forms_of, laplacians
-from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.lattice.lattice import Lattice, SolidCells
 
 

@@ -25,6 +25,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, fill
 from msmpetsc.geometry.cell_size import choose_cell_size, estimated_cells, warn_of_thin_bodies
 from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.grid import unpacked
+from msmpetsc.geometry.morton import COPIES
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
@@ -43,8 +45,9 @@ SIDE = 6  # cells of the small grid of the boundary tests
 
 
 def cells_of(corners: np.ndarray, low=(0, 0, 0), high=(SIDE,) * 3) -> set[tuple[int, ...]]:
-    cells = touched_cells(np.atleast_3d(corners).reshape(-1, 3, 3), np.array(low), np.array(high))
-    return set(map(tuple, cells.tolist()))
+    triangles = np.atleast_3d(corners).reshape(-1, 3, 3)
+    keys, _ = touched_cells(triangles, np.array(low), np.array(high))
+    return set(map(tuple, unpacked(keys).tolist()))
 
 
 UNIT = 64  # triangles of the oracle have corners at multiples of 1/64
@@ -298,7 +301,8 @@ def test_too_many_cells_are_refused():
 def test_the_cell_size_gives_the_wanted_number_of_cells(name, count):
     body = body_of(read_surface(MESHES / f"{name}.ply"))
     cages = fill([body], choose_cell_size([body], count))
-    assert cages.table.total == pytest.approx(count, rel=0.01)
+    # copies of cells at slits come on top
+    assert len(np.unique(cages.table.keys // COPIES)) == pytest.approx(count, rel=0.01)
 
 
 def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.geometry.morton import decode_morton
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.scene.body import Material
@@ -102,7 +103,8 @@ def build(
     """
     middle = cells[:, 0].mean()
 
-    def of_cells(ijk: np.ndarray) -> CellMaterial:
+    def of_cells(keys: np.ndarray) -> CellMaterial:
+        ijk = decode_morton(keys)
         uniform = CellMaterial(
             *(np.full(len(ijk), value) for value in (density, YOUNG, poisson or 0.25))
         )

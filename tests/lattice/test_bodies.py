@@ -16,9 +16,8 @@ from one_process import input_error
 import msmpetsc as package
 from msmpetsc.build import build_model
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.grid import BodyGrids
+from msmpetsc.geometry.grid import CORNERS, BodyGrids
 from msmpetsc.geometry.morton import LIMIT, encode_morton
-from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.results.comparison import compare
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.metrics import distance_of_shapes, shape_error
@@ -325,7 +324,7 @@ IN_A_BODY = [
     ("body.1.mesh.source=../bar.ply", "is not in the scene's folder"),
     (
         'time={ step = 0.01, duration = 1, integrator = "static" }',
-        "body: body.0.start may have no velocity or spin",
+        "body: body.0.start may have no velocity, spin",
     ),
 ]
 

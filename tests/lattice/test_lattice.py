@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from lattices import DENSITY, E, H, block, cages_of
 
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.lattice.cut_cells import CORNERS
+from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.material import calibrated_stiffness
 from msmpetsc.scene.body import Material

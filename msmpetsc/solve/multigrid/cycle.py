@@ -22,17 +22,17 @@ from msmpetsc.backend.arrays import Positions, Rows, to_host
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.morton import decode_morton
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.largest_eigenvalue import largest_eigenvalue
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
 from msmpetsc.solve.multigrid.contact import CoarseContact
 from msmpetsc.solve.multigrid.finest_level import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import GalerkinSum, set_block_size
-from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
+from msmpetsc.solve.multigrid.grids import CoarseGrid, grids, interpolation, node_keys
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
@@ -97,27 +97,31 @@ class Multigrid:
     def _create_levels(self, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         """Return the sum of the first coarse matrix, and the coarse levels without values."""
         unknowns, comm = self.unknowns, self.unknowns.comm
-        size, everywhere = unknowns.size, grid_indices(unknowns)
+        size, everywhere = unknowns.size, node_keys(unknowns)
         offsets = self.bodies.offsets(comm, everywhere)
-        ijk = (everywhere + [1, 0, 0] * offsets[:, None])[to_host(unknowns.free)]
+        lattice = unknowns.lattice
+        copies = CoarseCopies(lattice.copies, lattice.table, offsets[: lattice.owned])
+        keys = (everywhere + offsets)[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
-        coarse = grids(comm, ijk, unknowns.total, COARSEST, max(asked - 1, 1) if asked else None)
+        count = max(asked - 1, 1) if asked else None
+        coarse = grids(comm, keys, copies, unknowns.total, COARSEST, count)
         if asked and asked != len(coarse) + 1:
             nearest = len(coarse) + 1
             raise InputError(
                 f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {nearest}"
             )
-        galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, offsets)
+        galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, offsets, copies)
         rows = np.arange(size)[:, None] + size * np.arange(3)
         sizes = 3 * size, 3 * unknowns.total
         levels: list[Level] = []
-        for grid in coarse:
-            p = interpolation(comm, ijk, rows, sizes, grid, unknowns.memory.mat_type)
+        for number, grid in enumerate(coarse):
+            parents = copies.of(number, keys)
+            p = interpolation(comm, keys, parents, rows, sizes, grid, unknowns.memory.mat_type)
             self.owned.callback(p.destroy)
             levels.append(Level(grid, p, PETSc.Mat() if levels else galerkin.matrix))
             self.owned.callback(levels[-1].matrix.destroy)
-            ijk, sizes = decode_morton(grid.table.keys), grid.sizes
-            rows = 3 * np.arange(len(ijk))[:, None] + np.arange(3)
+            keys, sizes = grid.table.keys, grid.sizes
+            rows = 3 * np.arange(len(keys))[:, None] + np.arange(3)
         return galerkin, levels
 
     def update(self, q: Positions, contact: Rows, surface: SurfaceHessian | None = None) -> None:

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows, like, to_host
 from msmpetsc.comm import Route, SortedKeys
-from msmpetsc.geometry.morton import LIMIT
+from msmpetsc.geometry.morton import LIMIT, decode_morton, encode_morton
 from msmpetsc.solve.linear.unknowns import Unknowns
 
 
@@ -34,16 +34,18 @@ class Bodies:
     number: Indices
     free: Mask
 
-    def offsets(self, comm: MPI.Comm, ijk: Indices) -> Indices:
-        """Return grid offsets (l,) along the first axis that separate the bodies (collective).
+    def offsets(self, comm: MPI.Comm, keys: Indices) -> Indices:
+        """Return what to add to the nodes' keys (l,) to separate the bodies (collective).
 
-        Shifted bodies share no coarse cell. Pinned nodes have offset 0. If the grid indices (l, 3)
-        have no room, all offsets are 0.
+        Shifted along the first axis, bodies share no coarse cell. Pinned nodes have offset 0. If
+        the grid indices have no room, all offsets are 0.
         """
-        farthest = comm.allreduce(int(ijk.max(initial=0)), MPI.MAX)
-        # A power of two above the extent separates bodies on coarser grids as well.
+        farthest = comm.allreduce(int(decode_morton(keys).max(initial=0)), MPI.MAX)
+        # A power of two above the extent separates bodies on coarser grids as well. It
+        # has none of the bits of the nodes, so its key may be added to theirs.
         room = 2 << farthest.bit_length()
-        return np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
+        shift = np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
+        return encode_morton(shift[:, None] * np.array([1, 0, 0]))
 
 
 def bodies_of(unknowns: Unknowns) -> Bodies:

@@ -32,9 +32,10 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
-from msmpetsc.geometry.morton import decode_morton, encode_morton
-from msmpetsc.lattice.cut_cells import CORNERS
+from msmpetsc.geometry.grid import CORNERS
+from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
+from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies, in_cells
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
@@ -44,6 +45,9 @@ PINNED = 27
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
 # entries of a row of ``_write_coarse`` [-]
 COARSE = 41
+# place value of each corner's copy in a number, and their limit [-]
+DIGITS = COPIES ** np.arange(8)
+MOST_COPIES = COPIES**8
 # pairs (36, 2) of corners: the upper triangle of a cell's matrix
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])
 
@@ -142,8 +146,9 @@ class GalerkinSum:
     On a CPU, all cells add to the blocks of this rank's pairs of nodes. On a GPU, each cell has its
     own blocks, which PETSc sums.
 
-    ijk     : (l, 3) grid index of each local node
-    offsets : (l,) offset of each node's body along the first axis (free_bodies.Bodies.offsets)
+    keys    : (l,) key of each local node
+    offsets : (l,) key of the offset of each node's body (free_bodies.Bodies.offsets)
+    copies  : copies of the coarse nodes
     matrix  : AIJ of block size 3; it has values after the first ``update``
     """
 
@@ -153,27 +158,33 @@ class GalerkinSum:
         elasticity: Elasticity,
         t2: float,
         grid: CoarseGrid,
-        ijk: Indices,
+        keys: Indices,
         offsets: Indices,
+        copies: CoarseCopies,
     ):
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
-        keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity, ijk, offsets)
+        corners, self.springs, self.nodes, self.cells = _by_cell(
+            unknowns, elasticity, decode_morton(keys), offsets, copies.of(0, keys + offsets)
+        )
         self.weights, self.full = (like(lattice.nodes, a) for a in (t2**0.5 * WEIGHTS, SYMMETRIC))
         of_springs = OF_SPRINGS._replace(factor=t2 * OF_SPRINGS.factor)
         self.of_springs, self.of_nodes = (
             Products(*(like(lattice.nodes, part) for part in products))
             for products in (of_springs, OF_NODES)
         )
-        first, second, places = self._pairs(grid, keys)
+        first, second, places = self._pairs(grid, corners)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)
         self.upper = like(lattice.nodes, upper)
         self.matrix = self._create_matrix(grid, first, second, upper)
 
-    def _pairs(self, grid: CoarseGrid, keys: Indices) -> tuple[Indices, Indices, Indices]:
-        """Return the pairs of nodes (b,), (b,) with a block, and each cell's blocks (c, 36)."""
-        number = grid.table.find(encode_morton(decode_morton(keys)[:, None, :] + CORNERS))
+    def _pairs(self, grid: CoarseGrid, corners: Indices) -> tuple[Indices, Indices, Indices]:
+        """Return the pairs of nodes (b,), (b,) with a block, and each cell's blocks (c, 36).
+
+        corners : (c, 8) keys of the cells' corners
+        """
+        number = grid.table.find(corners)
         first, second = number[:, PAIRS[:, 0]], number[:, PAIRS[:, 1]]
         exists = (first >= 0) & (second >= 0)
         pairs = (first * grid.table.total + second)[exists]
@@ -240,9 +251,12 @@ def set_block_size(matrix: PETSc.Mat) -> None:
 
 
 def _by_cell(
-    unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, offsets: Indices
+    unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, offsets: Indices, parents: Indices
 ) -> tuple[Indices, ByCell, ByCell, ByCell]:
-    """Return the keys of this rank's coarse cells, and its springs, nodes and cells by them."""
+    """Return the corners' keys of this rank's coarse cells, and its springs, nodes and cells.
+
+    parents : (l, 8) copies of each node's parents
+    """
     lattice = unknowns.lattice
     pinned, free = to_host(lattice.pinned), to_host(unknowns.free)
     springs = to_host(lattice.springs)[: lattice.springs_owned if elasticity.springs else 0]
@@ -251,22 +265,47 @@ def _by_cell(
     ends = [springs[moving], free[:, None], corners]
     low = [ijk[nodes].min(axis=1) // 2 for nodes in ends]
     # A pinned node has offset 0 and follows the body that it holds.
-    coarse_offsets = [offsets[nodes].max(axis=1) // 2 for nodes in ends]
+    # The bits of half an offset are three places lower in its key.
     keys = [
-        encode_morton(corner + [1, 0, 0] * offset[:, None])
-        for corner, offset in zip(low, coarse_offsets, strict=True)
+        encode_morton(corner) + (offsets[nodes].max(axis=1) >> 3)
+        for corner, nodes in zip(low, ends, strict=True)
     ]
     codes = [
         np.where(pinned[nodes], PINNED, (ijk[nodes] - 2 * corner[:, None]) @ [9, 3, 1])
         for nodes, corner in zip(ends, low, strict=True)
     ]
-    every = np.unique(np.concatenate(keys))
+    tails = [
+        _copies_of_corners(corner, ijk, nodes, parents)
+        for corner, nodes in zip(low, ends, strict=True)
+    ]
+    bases = np.unique(np.concatenate(keys))
+    numbers = [
+        np.searchsorted(bases, key) * MOST_COPIES + tail
+        for key, tail in zip(keys, tails, strict=True)
+    ]
+    every = np.unique(np.concatenate(numbers))
+    of_corners = every[:, None] // DIGITS % COPIES
+    cells = encode_morton(decode_morton(bases[every // MOST_COPIES])[:, None] + CORNERS)
     which = moving, free, np.arange(len(corners))
     of_springs, of_nodes, of_cells = (
-        ByCell.of(key, every, code, number).to_device_of(lattice.nodes)
-        for key, code, number in zip(keys, codes, which, strict=True)
+        ByCell.of(number, every, code, items).to_device_of(lattice.nodes)
+        for number, code, items in zip(numbers, codes, which, strict=True)
     )
-    return every, of_springs, of_nodes, of_cells
+    return cells + of_corners, of_springs, of_nodes, of_cells
+
+
+def _copies_of_corners(low: Indices, ijk: Indices, nodes: Indices, parents: Indices) -> Indices:
+    """Return the copies of the corners of each item's coarse cell as digits of a number (n,).
+
+    low     : (n, 3) index of the coarse cells
+    ijk     : (l, 3) index of the fine nodes
+    nodes   : (n, k) local nodes of each item
+    parents : (l, 8) copies of each node's parents
+    """
+    numbers = np.zeros(len(nodes), np.int64)
+    own = np.flatnonzero(parents.any(axis=1)[nodes].any(axis=1))
+    numbers[own] = in_cells(low[own], ijk[nodes[own]], parents[nodes[own]]) @ DIGITS
+    return numbers
 
 
 @kernel

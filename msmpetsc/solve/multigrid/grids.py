@@ -11,11 +11,12 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Indices, Mask, to_host
+from msmpetsc.backend.arrays import Indices, Mask
 from msmpetsc.comm import SortedKeys
+from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import decode_morton, encode_morton
-from msmpetsc.lattice.cut_cells import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
+from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 
 # most nodes of a coarse grid, over the finer grid's; a larger grid does not pay
 SHRINK = 0.7
@@ -33,31 +34,33 @@ class CoarseGrid:
         return 3 * len(self.table.keys), 3 * self.table.total
 
 
-def grid_indices(unknowns: Unknowns) -> Indices:
-    """Return the grid index (l, 3) of each local node, ghosts included."""
-    lattice = unknowns.lattice
-    nodes, keys = to_host(lattice.nodes), lattice.table.keys
-    if not len(nodes):
-        return np.empty((0, 3), np.int64)
-    # The origin is an owned node: a spring joins each ghost with an owned node.
-    first = np.maximum(lattice.first_of_body[lattice.body] - lattice.table.first, 0)
-    steps: Indices = np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
-    return decode_morton(keys[first]) + steps
+def node_keys(unknowns: Unknowns) -> Indices:
+    """Return the key (l,) of each local node, ghosts included (collective)."""
+    table = unknowns.lattice.table
+    return table.with_ghosts(unknowns.lattice.ghosts, table.keys)
 
 
-def parents_of(ijk: Indices) -> tuple[Indices, Mask]:
-    """Return the Morton keys (n, 8) of the parents of grid indices (n, 3), and a mask (n, 8).
+def parents_of(keys: Indices, copies: Indices) -> tuple[Indices, Mask]:
+    """Return the keys (n, 8) of the parents of nodes (n,), and a mask (n, 8).
 
     Corners that lie beyond an even index have no weight; the mask leaves them out.
+
+    copies : (n, 8) numbers of the parents' copies (solve.multigrid.coarse_copies)
     """
+    ijk = decode_morton(keys)
     needed = ~((CORNERS[None] > 0) & (ijk[:, None, :] % 2 == 0)).any(axis=2)
-    return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)), needed
+    return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)) + copies, needed
 
 
 def grids(
-    comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | None = None
+    comm: MPI.Comm,
+    keys: Indices,
+    copies: CoarseCopies,
+    total: int,
+    coarsest: int,
+    count: int | None = None,
 ) -> list[CoarseGrid]:
-    """Return the coarse grids of nodes at grid indices (n, 3), the finest first (collective).
+    """Return the coarse grids of nodes with keys (n,), the finest first (collective).
 
     Coarsening stops early if the next grid would not be much smaller. Raises InputError if PETSc
     cannot number the nodes.
@@ -68,19 +71,21 @@ def grids(
     """
     levels: list[CoarseGrid] = []
     while not levels or (total > coarsest if count is None else len(levels) < count):
-        keys, needed = parents_of(ijk)
-        grid = CoarseGrid(SortedKeys(comm, keys[needed]))
+        parents, needed = parents_of(keys, copies.of(len(levels), keys))
+        grid = CoarseGrid(SortedKeys(comm, parents[needed]))
         refuse_unknowns(grid.table.total)
         if levels and grid.table.total > SHRINK * total:
             break
         levels.append(grid)
-        total, ijk = grid.table.total, decode_morton(grid.table.keys)
+        copies.add(grid.table)
+        total, keys = grid.table.total, grid.table.keys
     return levels
 
 
 def interpolation(
     comm: MPI.Comm,
-    ijk: Indices,
+    keys: Indices,
+    copies: Indices,
     rows: Indices,
     row_sizes: tuple[int, int],
     grid: CoarseGrid,
@@ -88,13 +93,14 @@ def interpolation(
 ) -> PETSc.Mat:
     """Return the interpolation P (AIJ) from a coarse grid to finer nodes (collective).
 
-    ijk       : (n, 3) grid indices of this rank's finer nodes that are unknowns
+    keys      : (n,) keys of this rank's finer nodes that are unknowns
+    copies    : (n, 8) copies of their parents
     rows      : (n, 3) local rows of their x, y and z
     row_sizes : numbers of rows of this rank and of all ranks
     """
-    keys, needed = parents_of(ijk)
-    number = np.full(keys.shape, -1)
-    number[needed] = grid.table.find(keys[needed])
+    parents, needed = parents_of(keys, copies)
+    number = np.full(parents.shape, -1)
+    number[needed] = grid.table.find(parents[needed])
     count = needed.sum(axis=1)
     lengths = np.empty(row_sizes[0], np.int64)
     lengths[rows] = count[:, None]

@@ -5,7 +5,9 @@ import pytest
 from conftest import WORKERS, run
 from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
 
-from msmpetsc.geometry.morton import decode_morton
+from msmpetsc.comm import SortedKeys
+from msmpetsc.geometry.morton import decode_morton, encode_morton
+from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 from msmpetsc.solve.multigrid.grids import grids
 
 
@@ -17,10 +19,9 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
     with hierarchy(COMM, build(COMM, LATTICES[name], pins=pins), coarsest=2) as case:
         nodes, free = case.lattice.nodes, case.unknowns.free
         fine = np.rint((nodes - ORIGIN) / CELL).astype(int)
-        fine[:, 0] += case.multigrid.bodies.offsets(
-            COMM, fine
-        )  # each body has coarse nodes of its own
-        fine = fine[free]
+        # each body has coarse nodes of its own
+        keys = encode_morton(fine)
+        fine = decode_morton(keys + case.multigrid.bodies.offsets(COMM, keys))[free]
         for level, coarse in enumerate(case.multigrid.levels):
             p = case.interpolation(level)
             assert p.shape == (3 * len(fine), 3 * coarse.grid.table.total)
@@ -56,8 +57,10 @@ def test_grids_have_the_neighbours_of_half_an_index_until_one_is_small(
 def test_a_grid_that_is_not_much_smaller_is_none():
     """Bodies far from each other: each keeps a node, however coarse the grid."""
     ijk = 64 * np.argwhere(np.ones((3, 3, 3)))
-    assert [grid.table.total for grid in grids(COMM, ijk, 27, coarsest=1)] == [27]
-    assert len(grids(COMM, ijk, 27, coarsest=800)) == 1  # a coarse level there always is
+    keys = encode_morton(ijk)
+    far = keys, CoarseCopies(None, SortedKeys(COMM, keys), np.zeros(27, int)), 27
+    assert [grid.table.total for grid in grids(COMM, *far, coarsest=1)] == [27]
+    assert len(grids(COMM, *far, coarsest=800)) == 1  # a coarse level there always is
 
 
 def test_hierarchies_of_several_ranks_are_those_of_one():

@@ -1,0 +1,407 @@
+"""Find the connected parts of the body in each cell that its surface cuts.
+
+A slit narrower than a cell leaves several parts of the body in a cell. They are found in 3 steps:
+
+1. The triangles in a cell that are joined by mesh edges within the cell are a piece of surface.
+   The body along the inner side of a piece is connected. So a cell has at most as many parts as
+   pieces. Triangles that end in a low face of the cell bound the body below: a piece apart.
+2. In a cell of several pieces, LINES x LINES lines run along each axis, and their crossings form a
+   grid of points. Neighbouring points, and points and pieces, are joined if the line between them
+   is inside the body. Pieces that are joined bound the same part.
+   A piece between the lines is joined with the piece that a ray inwards from it meets.
+3. Parts of two cells meet in a common face if a piece crosses it. They also meet if a line of
+   step 2 crosses it inside both parts. For two cells of a single part, a point of it decides.
+
+Steps 1 and 3 are exact. Step 2 may separate a part at a neck that is thinner than the distance of
+the lines (geometry.lines_in_cells).
+
+All lengths are in cells. Only rank 0, which holds the surface, calls these functions.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
+from msmpetsc.geometry.grid import Grid, packed, unpacked
+from msmpetsc.geometry.lines_in_cells import LINES, split_cell
+from msmpetsc.geometry.morton import COPIES
+from msmpetsc.geometry.surface import Surface, first_of_equal, is_inside
+from msmpetsc.geometry.valid_cells import touched_cells
+
+# distance of a face's low side from the face [cells]; above rounding, below any wall
+BESIDE = 1e-4
+
+
+class Links(NamedTuple):
+    """Parts of neighbouring cells that meet.
+
+    low, high : (n,) numbers of the two cells, which share a face
+    axis      : (n,) axis normal to the face
+    part      : (n, 2) numbers of the parts in the two cells
+    """
+
+    low: Indices
+    high: Indices
+    axis: Indices
+    part: Indices
+
+
+@dataclass(frozen=True)
+class PartsOfPoints:
+    """Finder of the part of a cell that holds a point on or near the surface.
+
+    surface  : the body's surface
+    keys     : (s,) packed grid indices of the cells with several parts, ascending
+    cell     : (r,) number of the cell of each row, ascending
+    triangle : (r,) triangle in the cell
+    part     : (r,) part that the triangle bounds
+    """
+
+    surface: Surface
+    keys: Indices
+    cell: Indices
+    triangle: Indices
+    part: Indices
+
+    def find(self, points: Rows, ijk: Indices) -> Indices:
+        """Return the part (n,) that holds each point (n, 3) [m] in its cell (n, 3).
+
+        It is the part that the nearest of the cell's triangles bounds.
+        """
+        import igl
+
+        cell = _find(self.keys, packed(ijk))
+        part = np.zeros(len(points), np.int64)
+        for number in np.unique(cell[cell >= 0]):
+            own = cell == number
+            rows = slice(*np.searchsorted(self.cell, [number, number + 1]))
+            triangles = self.surface.triangles[self.triangle[rows]]
+            nearest = igl.point_mesh_squared_distance(points[own], self.surface.points, triangles)
+            part[own] = self.part[rows][nearest[1]]
+        return part
+
+
+@dataclass(frozen=True)
+class CellParts:
+    """Parts of the body in the cells that a closed surface cuts.
+
+    keys    : (b,) packed grid indices of the cut cells, ascending
+    count   : (b,) number of parts in each cell
+    links   : parts of neighbouring cut cells that meet
+    faces   : (b, 6) parts at the faces of each cell as bit masks, the low faces first; 1 in a cell
+              of a single part
+    apart   : (b,) whether a common face with another cut cell lies outside the body
+    shares  : (s, 2, 2, 2) share of each part of the several in a cell of the fill of the corners
+    spread  : (s, 3) the same of the second moments
+    points  : parts of points on the surface
+    """
+
+    keys: Indices
+    count: Indices
+    links: Links
+    faces: Array
+    apart: Mask
+    shares: Rows
+    spread: Rows
+    points: PartsOfPoints
+
+    @property
+    def ijk(self) -> Indices:
+        """Grid index (b, 3) of the cut cells."""
+        return unpacked(self.keys)
+
+    @property
+    def several(self) -> Indices:
+        """Numbers of the cells with several parts."""
+        return np.flatnonzero(self.count > 1)
+
+    def find(self, ijk: Indices) -> Indices:
+        """Return the number (...,) of each cut cell (..., 3), -1 for another cell."""
+        return _find(self.keys, packed(ijk))
+
+
+def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> CellParts:
+    """Return the parts of the body in the cells that a closed surface cuts.
+
+    axes   : (3,) cycled axes of the search for the cut cells (geometry.cages)
+    volume : the surface's volume [m^3]; negative if its triangles are wound inwards
+    """
+    at = grid.to_cells(surface.points)
+    corners = at[surface.triangles] if volume > 0 else at[surface.triangles[:, ::-1]]
+    limits = np.zeros(3, np.int64), grid.shape[axes]
+
+    def touched(triangles: Rows) -> tuple[Indices, Indices]:
+        return touched_cells(np.ascontiguousarray(triangles[..., axes]), *limits)
+
+    of_row, triangle = touched(corners)
+    cycled, cell = np.unique(of_row, return_inverse=True)
+    back = packed(unpacked(cycled)[:, np.argsort(axes)])
+    order = np.argsort(back)
+    keys, cell = back[order], np.argsort(order)[cell]
+    size = len(corners)
+    codes = np.unique(cell * size + triangle)
+    cell, triangle = codes // size, codes % size
+    flush = _flush(corners, triangle, keys, cell)
+    in_cell, one, other = _edges_in_cells(surface, at, touched)
+    number = np.append(np.argsort(order), -1)[_find(cycled, in_cell)]
+    ends = _ends_of_edges(codes, size, number, one, other)
+    piece, pieces = _pieces(cell, len(keys), ends[:, flush[ends[0]] == flush[ends[1]]])
+    several = np.flatnonzero(pieces > 1)
+    own, first_piece = _rows_of(cell, several), np.cumsum(pieces) - pieces
+    begin = np.searchsorted(cell[own], np.append(several, len(keys)))
+
+    ijk = unpacked(keys[several])
+    split = _split(corners, triangle[own], piece[own], flush[own], begin, ijk, pieces[several])
+    part_of_piece = np.zeros(pieces.sum(), np.int64)
+    part_of_piece[ranges(first_piece[several], pieces[several])] = split.part
+    part = part_of_piece[first_piece[cell] + piece]
+    count = np.ones(len(keys), np.int64)
+    count[several] = split.parts
+    several = np.flatnonzero(count > 1)
+    at_faces = np.full((len(keys), 6), -1)
+    at_faces[several] = np.arange(split.faces.shape[0] * 6).reshape(-1, 6)
+    sides = Sides(at_faces, split.faces.reshape(-1, LINES**2))
+    crossing = _crossing_rows(codes, keys, size, flush, ends)
+    links, apart = _links(surface, grid, keys, cell, part, crossing, sides)
+    own = _rows_of(cell, several)
+    own = own[part[own] >= 0]
+    of_several = np.searchsorted(several, cell[own])
+    points = PartsOfPoints(surface, keys[several], of_several, triangle[own], part[own])
+    return CellParts(keys, count, links, sides.masks(), apart, split.shares, split.spread, points)
+
+
+def _find(keys: Indices, wanted: Indices) -> Indices:
+    """Return the place (...,) of each wanted key in ascending keys, -1 if it is not there."""
+    if len(keys) == 0:
+        return np.full(np.shape(wanted), -1)
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[place] == wanted, place, -1)
+
+
+def ranges(first: Indices, length: Indices) -> Indices:
+    """Return the concatenated ranges first[i] .. first[i] + length[i] - 1."""
+    begin = np.cumsum(length) - length
+    return np.arange(length.sum()) - np.repeat(begin - first, length)
+
+
+def _rows_of(cell: Indices, wanted: Indices) -> Indices:
+    """Return the rows of ``cell`` (r,), ascending, that name a wanted cell."""
+    first = np.searchsorted(cell, wanted)
+    return ranges(first, np.searchsorted(cell, wanted, side="right") - first)
+
+
+def _edges_in_cells(
+    surface: Surface, at: Rows, touched: Callable[[Rows], tuple[Indices, Indices]]
+) -> tuple[Indices, Indices, Indices]:
+    """Return the cells (e,) that mesh edges touch, and two triangles (e,), (e,) at the edge."""
+    merged = first_of_equal(surface.points)
+    corner = merged[surface.triangles]
+    start, end = corner.ravel(), np.roll(corner, -1, axis=1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    edge = low * len(merged) + high
+    order = np.argsort(edge, kind="stable")
+    pair = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
+    first, second = order[pair], order[pair + 1]
+    ends = at[np.stack([low[first], high[first], high[first]], axis=1)]
+    cells, number = touched(ends)
+    return cells, first[number] // 3, second[number] // 3
+
+
+def _flush(corners: Rows, triangle: Indices, keys: Indices, cell: Indices) -> Array:
+    """Return the axes along which rows' triangles end in the low face of their cells, as bits (r,).
+
+    The body at such a triangle lies below the face, unless the triangle lies in the face and the
+    body above it.
+    """
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    top = corners.max(axis=1)
+    # a triangle in a face with the body above ends in no low face
+    top[(corners.min(axis=1) == top) & (normal < 0)] = -1.0
+    bits = np.zeros(len(triangle), np.uint8)
+    for axis, index in enumerate(unpacked(keys).T):
+        bits |= (top[triangle, axis] == index[cell]).astype(np.uint8) << axis
+    return bits
+
+
+def _ends_of_edges(
+    codes: Indices, size: int, number: Indices, one: Indices, other: Indices
+) -> Indices:
+    """Return the two rows (2, e) of a cell that mesh edges in the cell join.
+
+    number     : (e,) number of the cell, -1 if there is none
+    one, other : (e,) triangles at the edge
+    """
+    ends = np.stack([_find(codes, number * size + triangle) for triangle in (one, other)])
+    return ends[:, (number >= 0) & (ends >= 0).all(axis=0)]
+
+
+def _pieces(cell: Indices, cells: int, joined: Indices) -> tuple[Indices, Indices]:
+    """Return the piece (r,) of each row of a cell, and the number (cells,) of pieces of a cell.
+
+    cell   : (r,) cell of each row
+    joined : (2, e) joined rows
+    """
+    size = len(cell)
+    graph = coo_array((np.ones(joined.shape[1], np.int8), tuple(joined)), shape=(size, size))
+    label = connected_components(graph, directed=False)[1]
+    # pieces are numbered from 0 in each cell
+    distinct, piece = np.unique(cell * size + label, return_inverse=True)
+    pieces = np.bincount(distinct // max(size, 1), minlength=cells)
+    return piece - (np.cumsum(pieces) - pieces)[cell], pieces
+
+
+def _crossing_rows(
+    codes: Indices, keys: Indices, size: int, flush: Array, ends: Indices
+) -> list[Indices]:
+    """Return for each axis the rows (2, n) of two neighbouring cells whose surface crosses a face.
+
+    Either a triangle is in both cells, or two triangles meet in a mesh edge in the face. Then one
+    triangle ends in the face, and its row in the upper cell is flush.
+    """
+    ijk, cell, triangle = unpacked(keys), codes // size, codes % size
+    crossing = []
+    for axis, step in enumerate(np.eye(3, dtype=np.int64)):
+        beyond = _find(keys, packed(ijk + step))
+        other = np.where(beyond[cell] >= 0, _find(codes, beyond[cell] * size + triangle), -1)
+        low = np.flatnonzero(other >= 0)
+        below = np.full(len(codes), -1)
+        below[other[low]] = low
+        at_edge = [
+            np.stack([below[a], b])[:, (flush[a] == 1 << axis) & (flush[b] == 0) & (below[a] >= 0)]
+            for a, b in (ends, ends[::-1])
+        ]
+        crossing.append(np.concatenate([np.stack([low, other[low]]), *at_edge], axis=1))
+    return crossing
+
+
+class Sides(NamedTuple):
+    """Parts at the faces of the cells with several parts.
+
+    row   : (b, 6) row of each face of each cut cell, the low faces first; -1 for a single part
+    parts : (r, LINES^2) part at each line of a face, -1 outside the body
+    """
+
+    row: Indices
+    parts: Array
+
+    def masks(self) -> Array:
+        """Return the parts at each face (b, 6) of each cell as bit masks."""
+        bits = np.where(self.parts >= 0, 1 << np.maximum(self.parts, 0), 0)
+        of_rows = np.append(np.bitwise_or.reduce(bits, axis=1), 1)
+        return of_rows[self.row].astype(np.uint8)
+
+
+def _links(
+    surface: Surface,
+    grid: Grid,
+    keys: Indices,
+    cell: Indices,
+    part: Indices,
+    crossing: list[Indices],
+    sides: Sides,
+) -> tuple[Links, Mask]:
+    """Return the parts of neighbouring cut cells that meet, and the mask (b,) of ``apart``.
+
+    cell     : (r,) cell of each row
+    part     : (r,) part of each row, -1 for a piece that bounds no part of the cell
+    crossing : for each axis, the rows of ``_crossing_rows``
+    """
+    ijk, masks, steps = unpacked(keys), sides.masks(), np.eye(3, dtype=np.int64)
+    beyond = np.stack([_find(keys, packed(ijk + step)) for step in steps])
+    # rows of pieces that bound parts
+    bounding = [rows[:, (part[rows] >= 0).all(axis=0)] for rows in crossing]
+    # a point of an uncrossed face tells whether two cells of a single part meet
+    is_single = sides.row[:, 0] < 0
+    asked = (beyond >= 0) & is_single & is_single[beyond]
+    for axis, (below, _) in enumerate(bounding):
+        asked[axis, cell[below]] = False
+    axes, low = np.nonzero(asked)
+    middles = ijk[low] + 0.5 + (0.5 - BESIDE) * steps[axes]
+    asked[axes, low] = is_inside(surface, grid.node_positions(middles))
+    links: list[Indices] = []
+    apart = np.zeros(len(keys), bool)
+    for axis, (below, above) in enumerate(bounding):
+        found = [np.stack([cell[below], part[below], part[above]])]
+        low = np.flatnonzero(beyond[axis] >= 0)
+        high = beyond[axis, low]
+        # lines of cells with several parts tell which parts are inside at the face
+        rows = sides.row[low, 3 + axis], sides.row[high, axis]
+        both = (rows[0] >= 0) & (rows[1] >= 0)
+        neither = is_single[low] & is_single[high]
+        for p in range(COPIES):
+            for q in range(COPIES):
+                meet = (masks[low, 3 + axis] >> p & 1) & (masks[high, axis] >> q & 1) > 0
+                meet[neither] &= asked[axis, low[neither]]
+                lines = [sides.parts[row[meet & both]] for row in rows]
+                meet[meet & both] = ((lines[0] == p) & (lines[1] == q)).any(axis=1)
+                own = low[meet]
+                found.append(np.stack([own, np.full_like(own, p), np.full_like(own, q)]))
+        own, p, q = np.unique(np.concatenate(found, axis=1), axis=1)
+        links.append(np.stack([own, beyond[axis, own], np.full_like(own, axis), p, q]))
+        lonely = np.setdiff1d(low, own)
+        apart[lonely] = apart[beyond[axis, lonely]] = True
+    low, high, axes, p, q = np.concatenate(links, axis=1)
+    return Links(low, high, axes, np.stack([p, q], axis=1)), apart
+
+
+class Split(NamedTuple):
+    """Parts of cells with several pieces.
+
+    part   : (k,) part of each piece, cell after cell; -1 for a piece that bounds no part
+    parts  : (c,) number of parts in each cell
+    faces  : (m, 6, LINES^2) part at each line of each face of the m cells with several parts
+    shares : (s, 2, 2, 2) share of each part of several of the fill of the corners
+    spread : (s, 3) share of each part of several of the second moments
+    """
+
+    part: Indices
+    parts: Indices
+    faces: Array
+    shares: Rows
+    spread: Rows
+
+
+def _split(
+    corners: Rows,
+    triangle: Indices,
+    piece: Indices,
+    flush: Array,
+    begin: Indices,
+    ijk: Indices,
+    pieces: Indices,
+) -> Split:
+    """Return the parts of cells (c, 3) of several pieces.
+
+    corners         : (f, 3, 3) triangles, wound outwards
+    triangle, piece : (r,) triangles of the cells and their pieces, cell after cell
+    flush           : (r,) bits of ``_flush``
+    begin           : (c + 1,) first row of each cell
+    pieces          : (c,) number of pieces of each cell
+    """
+    part, count = np.zeros(pieces.sum(), np.int64), np.ones(len(ijk), np.int64)
+    faces, shares = [np.empty((0, 6, LINES**2), np.int8)], [np.empty((0, 11))]
+    first = np.cumsum(pieces) - pieces
+    for c in range(len(ijk)):
+        rows, own = slice(begin[c], begin[c + 1]), slice(first[c], first[c] + pieces[c])
+        at_faces, of_parts = np.full((6, LINES**2), -1, np.int8), np.zeros((COPIES, 11))
+        count[c] = split_cell(
+            corners[triangle[rows]] - ijk[c],
+            piece[rows],
+            flush[rows],
+            part[own],
+            at_faces,
+            of_parts,
+        )
+        if count[c] > 1:
+            faces.append(at_faces[None])
+            total = of_parts.sum(axis=0)
+            share = np.divide(of_parts, total, out=np.zeros_like(of_parts), where=total > 0)
+            shares.append(share[: count[c]])
+    of_all = np.concatenate(shares)
+    fills, moments = of_all[:, :8].reshape(-1, 2, 2, 2), of_all[:, 8:]
+    return Split(part, count, np.concatenate(faces), fills, moments)

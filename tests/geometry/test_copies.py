@@ -1,0 +1,299 @@
+"""Slits narrower than a cell: parts of cells, their copies, and bodies that open.
+
+Convex bodies need no copies. The lattice of a body must hang together as the body does. A fork is
+compared with theory and with itself on cells that its slit does not fit into.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+import trimesh
+from block_scene import play
+from conftest import result_on
+from mpi4py import MPI
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from surfaces import body_of
+
+from msmpetsc.geometry.cages import Cages, fill
+from msmpetsc.geometry.copies import Copies
+from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.grid import CORNERS
+from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.lattice.topology import Topology, topology_of
+
+H = 0.1
+LENGTH, BASE, WIDTH, DEPTH = 20, 4, 5, 2  # of the fork [cells]; its slit runs along x
+YOUNG, FORCE = 1e6, 0.5  # [Pa], [N]
+COMM = MPI.COMM_SELF
+
+
+def box(low: list[float], high: list[float]) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=[low, high])
+
+
+def fork(slit: float, shift: float = 0.0) -> trimesh.Trimesh:
+    """A bar with a slit of so many cells from its end to its base."""
+    middle = WIDTH / 2 + shift
+    bar = box([0, 0, 0], [LENGTH, WIDTH, DEPTH])
+    gap = box([BASE, middle - slit / 2, -1], [LENGTH + 1, middle + slit / 2, DEPTH + 1])
+    body = trimesh.boolean.difference([bar, gap], engine="manifold")
+    body.apply_scale(H)
+    return body.subdivide_to_size(1.5 * H)
+
+
+def folded_sheet(gap: float) -> trimesh.Trimesh:
+    """A sheet folded on itself: two layers of 0.7 cells that hang together at x = 0."""
+    layers = [
+        box([0, 0, 0.13], [12, 4, 0.83]),
+        box([0, 0, 0.83 + gap], [12, 4, 1.53 + gap]),
+        box([0, 0, 0.13], [1, 4, 1.53 + gap]),
+    ]
+    body = trimesh.boolean.union(layers, engine="manifold")
+    body.apply_scale(H)
+    return body.subdivide_to_size(1.5 * H)
+
+
+def cages_of(mesh: trimesh.Trimesh, h: float = H) -> tuple[Cages, Topology]:
+    cages = fill([body_of(mesh)], h)
+    return cages, topology_of(cages)
+
+
+def components(net: Topology) -> int:
+    """Number of connected parts of a lattice."""
+    ends = coo_array((np.ones(len(net.springs)), net.springs.T), shape=(len(net.ijk),) * 2)
+    return connected_components(ends, directed=False)[0]
+
+
+def rotated(mesh: trimesh.Trimesh, rng: np.random.Generator) -> trimesh.Trimesh:
+    mesh.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
+    return mesh
+
+
+CONVEX = {
+    "block": lambda rng: trimesh.creation.box(rng.uniform(0.3, 6, 3)),
+    "sheet": lambda rng: trimesh.creation.box([4, 5, rng.uniform(0.02, 0.6)]),
+    "ball": lambda rng: trimesh.creation.icosphere(subdivisions=2, radius=rng.uniform(0.5, 4)),
+    "rod": lambda rng: trimesh.creation.cylinder(rng.uniform(0.05, 1), rng.uniform(2, 8)),
+}
+
+
+@pytest.mark.parametrize("name", CONVEX)
+def test_a_convex_body_has_no_copies(name: str):
+    """In a cell it has one part, and two cells of it meet in their face."""
+    rng = np.random.default_rng(0)
+    for turned in (False, True) * 5:
+        mesh = CONVEX[name](rng)
+        cages, net = cages_of(rotated(mesh, rng) if turned else mesh, 1.0)
+        assert cages.copies is None
+        assert components(net) == 1
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_lattice_hangs_together_as_the_body_does(seed: int):
+    """Unions of boxes, and blocks with holes and slits, which fall into several parts."""
+    rng = np.random.default_rng(seed)
+    boxes = []
+    for _ in range(rng.integers(2, 7)):
+        part = rotated(trimesh.creation.box(rng.uniform(0.15, 3, 3)), rng)
+        boxes.append(part.apply_translation(rng.uniform(-1.5, 1.5, 3)))
+    if seed % 2:
+        boxes = [trimesh.creation.box([4, 3, 3]), *boxes]
+        body = trimesh.boolean.difference(boxes, engine="manifold")
+    else:
+        body = trimesh.boolean.union(boxes, engine="manifold")
+    parts = [part.volume > 0 for part in body.split(only_watertight=False)]
+    cages, net = cages_of(body, rng.uniform(0.3, 1.0))
+    assert components(net) == sum(parts)
+    h = cages.grids.cell_size
+    assert cages.fills.mean(axis=(1, 2, 3)).sum() * h**3 == pytest.approx(body.volume, rel=0.02)
+
+
+@pytest.mark.parametrize(("slit", "shift"), [(0.2, 0.0), (0.4, 0.2), (0.8, 0.0)])
+def test_the_two_parts_of_a_slit_have_their_volumes_and_moments(slit: float, shift: float):
+    """Walls along the grid: both are exact, since the lines across the slit meet both walls."""
+    cages, _ = cages_of(fork(slit, shift))
+    ijk = decode_morton(cages.table.keys)
+    middle = (ijk[:, 1] == WIDTH // 2) & (ijk[:, 0] > BASE)
+    thickness = 0.5 - slit / 2 + np.array([shift, -shift])
+    for number, near in enumerate(thickness):
+        fills = cages.fills[middle].mean(axis=(1, 2, 3))
+        own = np.isclose(fills, near, atol=1e-5)
+        assert own.sum() == middle.sum() // (1 if shift == 0 else 2)
+        # integral of y^2 about the cell's middle, from its face inwards
+        begins = [-0.5, 0.5 - near][number]
+        expected = ((begins + near) ** 3 - begins**3) / 3
+        np.testing.assert_allclose(cages.moments[middle][own, 1], expected, atol=1e-5)
+
+
+def test_copies_share_corners_at_the_end_of_the_slit_alone():
+    """Cells at x = BASE have the nodes of the base in common; the nodes beyond are separate."""
+    cages, net = cages_of(fork(0.3))
+    ijk = decode_morton(net.keys)
+    in_slit = (ijk[:, 1] == WIDTH // 2) & (ijk[:, 2] == 0)
+    for i in range(BASE, LENGTH):
+        copies = net.cells[in_slit & (ijk[:, 0] == i)]
+        volumes = cages.of_cells(net.keys[in_slit & (ijk[:, 0] == i)], cages.fills).mean(
+            axis=(1, 2, 3)
+        )
+        # the end of the slit lies in the face of the cells: its copy has no volume
+        copies = copies[volumes > 0.01]
+        shared = np.intersect1d(*copies)
+        assert len(copies) == 2
+        assert (net.ijk[shared][:, 0] == BASE).all()
+        assert len(shared) == (4 if i == BASE else 0)
+
+
+def test_the_surface_follows_its_own_part(tmp_path: Path):
+    """Each side of the slit moved by itself carries the points of its own wall along."""
+    body = body_of(fork(0.3))
+    cages = fill([body], H)
+    net = topology_of(cages)
+    for kind in ("affine", "cages", "mvc"):
+        weights = embed([body.surface.points], cages, net.table, kind)
+        nodes = cages.grids.node_positions(net.ijk)
+        np.testing.assert_allclose(weights @ nodes, body.surface.points, atol=1e-6)
+        # nodes beyond the end of the slit are labelled by the prong that their cells fill
+        fills = cages.of_cells(net.keys, cages.fills).mean(axis=(1, 2, 3))
+        ijk = decode_morton(net.keys)
+        side = np.zeros(len(net.ijk))
+        for low in (True, False):
+            beside = ijk[:, 1] < WIDTH // 2 if low else ijk[:, 1] > WIDTH // 2
+            reached = net.cells[beside & (ijk[:, 0] > BASE + 1)].ravel()
+            for _ in range(2):
+                touching = np.isin(net.cells, reached).any(axis=1)
+                touching &= (ijk[:, 0] > BASE + 1) & (fills > 0.01)
+                reached = np.unique(net.cells[touching])
+            side[reached] = -1.0 if low else 1.0
+        points = body.surface.points
+        far = points[:, 0] > (BASE + 4) * H
+        moved = (weights @ side)[far]
+        np.testing.assert_allclose(moved, np.sign(points[far, 1] - WIDTH * H / 2), atol=1e-9)
+
+
+def pulled(folder: Path, mesh: trimesh.Trimesh, low: list, high: list, **tables: object) -> Path:
+    """A body held at x = 0 whose parts in two boxes are pulled apart, as a static scene."""
+    mesh.export(folder / "body.ply")
+    axis = 1 if mesh.extents[2] < 0.25 and mesh.extents[1] > 0.45 else 2
+    pull = [0.0, 0.0, 0.0]
+    pull[axis] = FORCE
+    forces = [
+        {"region": {"box": low}, "total": [-f for f in pull]},
+        {"region": {"box": high}, "total": pull},
+    ]
+    scene = {
+        "mesh": {"source": "body.ply"},
+        "cages": {"cell_size": H},
+        "material": {
+            "young_modulus": YOUNG, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3,
+        },
+        "time": {"step": 1.0, "duration": 1.0, "integrator": "static"},
+        "pin": [{"region": {"box": [[-1, -1, -1], [0.01, 2, 2]]}}],
+        "force": forces,
+        "solver": {"error": 1e-4},
+        "output": {"surface": True},
+    }  # fmt: skip
+    path = folder / "body.toml"
+    path.write_text(tomli_w.dumps(scene | tables))
+    return path
+
+
+TIPS = [[1.85, -1, -1], [2.1, 0.15, 2]], [[1.85, 0.35, -1], [2.1, 1, 2]]
+
+
+def opening(path: Path, *overrides: str) -> tuple[float, int]:
+    """How far the ends of the prongs move apart [m], and the products with the Hessian."""
+    model, frames = play(path, *overrides)
+    q = frames[-1].surface
+    points = model.surface.points
+    tip = points[:, 0] > LENGTH * H - 1e-6
+    apart = (q - points)[:, 1]
+    high = points[:, 1] > WIDTH * H / 2
+    return float(apart[tip & high].mean() - apart[tip & ~high].mean()), frames[-1].ksp_its
+
+
+@pytest.mark.parametrize("slit", [0.2, 0.4, 0.8])
+def test_a_fork_opens_through_a_slit_narrower_than_a_cell(tmp_path: Path, slit: float):
+    """As on cells of half the size, which a slit of 0.8 separates without copies.
+
+    Each prong is a cantilever of length l and height b on a base that gives way: two beams give
+    2 F l^3 / (3 E I), the base adds up to a quarter. Glued, the fork opens by 0.1% of it. Multigrid
+    must know the copies: coarse grids that join the prongs take four times as many products.
+    """
+    path = pulled(tmp_path, fork(slit), *TIPS)
+    found, products = opening(path)
+    finer, _ = opening(path, "cages.cell_size=0.05")
+    assert found == pytest.approx(finer, rel=0.05)
+    length, b, depth = (LENGTH - BASE) * H, (WIDTH - slit) / 2 * H, DEPTH * H
+    beams = 2 * 4 * FORCE * length**3 / (YOUNG * b**3 * depth)
+    assert 1.0 < found / beams < 1.25
+    assert products < 70
+
+
+def test_a_fork_is_the_same_on_any_number_of_ranks(tmp_path: Path):
+    path = pulled(tmp_path, fork(0.3, 0.2), *TIPS, solver={"error": 1e-8})
+    one, three = (result_on(ranks, path) for ranks in (1, 3))
+    with one, three:
+        q = [run["frames/position"][1] for run in (one, three)]
+        np.testing.assert_array_equal(one["lattice/cells"][:], three["lattice/cells"][:])
+    np.testing.assert_allclose(q[0], q[1], atol=1e-8)
+
+
+def test_two_free_forks_move_as_each_alone(tmp_path: Path):
+    """Multigrid separates free bodies by other keys; their coarse copies follow."""
+    fork(0.3).export(tmp_path / "fork.ply")
+    spin = {"velocity": [0.0, 0.0, 0.0], "spin": [0.0, 0.0, 4.0]}
+    scene = {
+        "cages": {"cell_size": H},
+        "material": {
+            "young_modulus": YOUNG, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3,
+        },
+        "time": {"step": 0.05, "duration": 0.1},
+        "solver": {"preset": "newton-multigrid", "error": 1e-8},
+        "output": {"surface": False},
+    }  # fmt: skip
+    bodies = [
+        {"mesh": {"source": "fork.ply", "base": base}, "start": spin}
+        for base in ([0, 0, 0], [0, 3, 0])
+    ]
+    ends = []
+    for name, some in (("two", bodies), ("one", bodies[:1])):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(tomli_w.dumps(scene | {"body": some}))
+        model, frames = play(path)
+        ends.append((frames[-1].position - model.lattice.nodes, len(model.lattice.mass)))
+    (two, _), (one, nodes) = ends
+    np.testing.assert_allclose(two[:nodes], one, atol=1e-7)
+    np.testing.assert_allclose(two[nodes:], one, atol=1e-7)
+
+
+def sheet_opening(folder: Path, gap: float) -> float:
+    """How far the free ends of a folded sheet move apart [m]."""
+    folder.mkdir()
+    low, high = [[1.1, -1, 0], [2, 1, 0.09]], [[1.1, -1, 0.1], [2, 1, 1]]
+    path = pulled(folder, folded_sheet(gap), low, high)
+    model, frames = play(path, "force.0.total=[0, 0, -0.005]", "force.1.total=[0, 0, 0.005]")
+    points = model.surface.points
+    end, up = points[:, 0] > 12 * H - 1e-6, (frames[-1].surface - points)[:, 2]
+    above = points[:, 2] > (0.83 + gap / 2) * H
+    return float(up[end & above].mean() - up[end & ~above].mean())
+
+
+def test_the_layers_of_a_folded_sheet_move_apart(tmp_path: Path):
+    """Through a gap of a quarter of a cell as through a gap of 1.2 cells, which needs no copies."""
+    narrow, wide = (sheet_opening(tmp_path / str(gap), gap) for gap in (0.25, 1.2))
+    assert narrow == pytest.approx(wide, rel=0.05)
+
+
+def test_corner_keys_of_ordinary_cells_are_those_of_their_index():
+    cells = np.array([[3, 1, 4], [1, 5, 9]])
+    keys = encode_morton(cells)
+    ordinary = encode_morton(cells[:, None] + CORNERS)
+    own = ordinary[1] + 1
+    copies = Copies(keys[1:] + 1, own[None], np.empty((0, 8), np.int64))
+    asked = np.array([keys[0], keys[1], keys[1] + 1])
+    found = copies.corner_keys(asked, cells[[0, 1, 1]])
+    np.testing.assert_array_equal(found, [*ordinary, own])
+    assert (decode_morton(found) == decode_morton(found // COPIES * COPIES)).all()

@@ -11,7 +11,15 @@ from scipy.sparse import csr_array
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.holders import Holders, Regions, clamped, taken
-from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, shares_by_mass, total_of
+from msmpetsc.constraints.loads import (
+    Anchor,
+    Load,
+    Motion,
+    OwnForce,
+    Pressure,
+    shares_by_mass,
+    total_of,
+)
 from msmpetsc.contact.friction import smallest
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.moving_solid import Obstacle, build_obstacles
@@ -36,14 +44,15 @@ from msmpetsc.geometry.surface import (
     examine,
     joined,
 )
+from msmpetsc.lattice.embedded_surface import surface_part
 from msmpetsc.lattice.initial_state import InitialState, ReadState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
 from msmpetsc.lattice.topology import Topology, topology_of
-from msmpetsc.scene.motion import Gravity
+from msmpetsc.scene.motion import Gravity, Traction
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import OfBody, held_by
+from msmpetsc.scene.schema import OfBody, held_by, surface_loads
 
 # range of a body's longest side [m]; its fourth power stays within a double
 SIDE_LIMITS = 1e-60, 1e60
@@ -59,7 +68,9 @@ class Model:
 
     surface     : surfaces of all bodies, joined in the scene's order
     embedding   : this rank's rows of W (geometry.embedding); None if the scene stores no surface
-    loads       : gravity, if there is any, then the forces of given total
+    loads       : gravity, if there is any, then the forces of given total, then the tractions
+    tractions   : number of tractions, the last of the loads
+    pressures   : pressures on the surface
     exchanges   : obstacles with response = "exchange"
     penalties   : obstacles with response = "reflect" or "penalty"
     start       : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
@@ -87,6 +98,8 @@ class Model:
     damping: float = 0.0
     retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
+    tractions: int = 0
+    pressures: tuple[Pressure, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     holders: Holders = field(
         default_factory=lambda: Holders((), np.zeros(0, np.int64), np.zeros((0, 3)))
@@ -203,15 +216,19 @@ def build_model(
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
     points = geometry.nearest if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
+    held = {t.key: masks[t.key][:, None] & np.array(t.table.held) for t in held_by(scene)}
     lattice = lattice.pin(
-        reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned)
+        reduce(np.logical_or, (held[pin.key] for pin in scene.tables("pin")), lattice.held)
     )
-    holders = Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice)
-    anchors = _anchors(scene.tables("anchor"), lattice, masks, holders)
-    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
+    holders = Holders.of_masks(held, lattice)
+    anchors = _anchors(scene.tables("anchor"), lattice, held, holders)
+    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.held)
     outside = geometry.outside(lattice.nodes) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
+    areas, pressures = _surface_loads(scene, finder, lattice)
+    loads += areas
+    lattice = replace(lattice, pressed=tuple(pressure.part for pressure in pressures))
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     return Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
@@ -219,6 +236,8 @@ def build_model(
         embedding=geometry.embedding if scene.output.surface else None,
         loads=loads,
         own_forces=own_forces,
+        tractions=len(areas),
+        pressures=tuple(pressures),
         anchors=anchors,
         exchanges=exchanges,
         penalties=penalties,
@@ -248,7 +267,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
             lattice,
             nodes=send(lattice.nodes),
             mass=send(lattice.mass),
-            pinned=send(lattice.pinned),
+            held=send(lattice.held),
             local_cells=send(lattice.local_cells),
             solid=solid and solid._replace(forms=send(solid.forms)),
         ),
@@ -331,16 +350,18 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
 
 
 def _anchors(
-    tables: Iterable[OfBody], lattice: Lattice, masks: Regions, holders: Holders
+    tables: Iterable[OfBody], lattice: Lattice, held: Regions, holders: Holders
 ) -> list[Anchor]:
-    """Return the anchors (collective). A node follows its pin, or else the first of its anchors.
+    """Return the anchors (collective). A component follows its pin, else its first anchor.
+
+    held : components (l, 3) in the region of each table
 
     Raises InputError if pins and anchors leave no node to move.
     """
     anchors = []
-    prescribed = lattice.pinned
+    prescribed = lattice.held
     for anchor in tables:
-        where = masks[anchor.key] & ~prescribed
+        where = held[anchor.key] & ~prescribed
         center_of_mass = holders.centers[holders.keys.index(anchor.key)]
         center = center_of_mass if anchor.table.center is None else np.array(anchor.table.center)
         path = Motion.through(anchor.table.path, center)
@@ -367,19 +388,37 @@ def _loads(
     """
     loads, own_forces = [], []
     if gravity is not None:
-        loads.append(Load(lattice.mass[:, None], total_of(gravity.acceleration)))
+        loads.append(Load(share=lattice.mass[:, None], total=total_of(gravity.acceleration)))
     for table in forces:
         force = table.table
         where = masks[table.key][: lattice.owned]
         acts = {"start": force.start, "stop": force.stop}
         if force.total is not None:
             share = shares_by_mass(comm, where, lattice.mass)
-            loads.append(Load(share, total_of(force.total), **acts))
+            loads.append(Load(share=share, total=total_of(force.total), **acts))
         else:
             rows = np.flatnonzero(where)
             function = FORCES.find(force.function)
             own_forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], **acts))
     return loads, tuple(own_forces)
+
+
+def _surface_loads(
+    scene: Scene, finder: Finder, lattice: Lattice
+) -> tuple[list[Load], list[Pressure]]:
+    """Return the tractions and the pressures (collective).
+
+    Raises InputError for a region without triangles, or a pressure without a potential.
+    """
+    tractions, pressures = [], []
+    for table in surface_loads(scene):
+        part, load = surface_part(table, finder, lattice), table.table
+        acts = {"start": load.start, "stop": load.stop, "total": total_of(load.value)}
+        if isinstance(load, Traction):
+            tractions.append(Load(share=part.areas(), **acts))
+        else:
+            pressures.append(Pressure(part=part, **acts))
+    return tractions, pressures
 
 
 def _contacts(

@@ -36,7 +36,7 @@ class Environment:
         self.lattice = model.lattice
         self.damping = model.damping
         self.retardation = model.retardation
-        self.forces = ActingForces(model.lattice, model.loads, model.own_forces)
+        self.forces = ActingForces(model.lattice, model.loads, model.own_forces, model.pressures)
         self.anchors = Anchors(model.lattice, model.anchors)
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
@@ -60,7 +60,7 @@ class Environment:
         """Return whether loads, anchors and obstacles are equal at two times [s]."""
 
         def at(time: float) -> list[Any]:
-            loads: list[Any] = [load.state_at(time) for load in self.forces.all]
+            loads: list[Any] = [tuple(load.state_at(time)) for load in self.forces.all]
             return loads + [
                 moving.acts_at(time) and tuple(moving.path.value_at(time)) for moving in self.moving
             ]

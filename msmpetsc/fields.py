@@ -129,6 +129,9 @@ class Frame:
     contact_push: Annotated[
         Rows | None, Field("f8", ("T", "b", 3), "N", "contact force of surfaces on a body")
     ] = None
+    surface_load: Annotated[
+        Rows | None, Field("f8", ("T", "l", 3), "N", "force of a traction or pressure")
+    ] = None
     probe: Annotated[Rows | None, Field("f8", ("T", "w", 3), "m", "position of a probe")] = None
     stress: Annotated[
         Rows | None, Field("f4", ("T", "n", 6), "Pa", "Cauchy stress: xx, yy, zz, xy, yz, xz")
@@ -171,7 +174,7 @@ STRESS = tuple(
 # like a field with several axes, which netCDF readers would take for coordinates.
 DIMENSIONS: dict[int | str, str] = {
     "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle",
-    "b": "body", "w": "probe_number", 3: "axis", 6: "component",
+    "b": "body", "l": "surface_load_number", "w": "probe_number", 3: "axis", 6: "component",
 }  # fmt: skip
 LABELS = {"axis": ("x", "y", "z"), "component": ("xx", "yy", "zz", "xy", "yz", "xz")}
 # letters of dimensions that are distributed over ranks

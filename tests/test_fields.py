@@ -26,7 +26,7 @@ def test_what_is_written_is_what_the_table_says(tmp_path: Path):
             if name in FIELDS or name.removeprefix("frames/") not in DIMENSIONS.values()
         ]
         always = {
-            name for name, field in FRAME_FIELDS.items() if not {*field.shape[1:]} & {*"acobw"}
+            name for name, field in FRAME_FIELDS.items() if not {*field.shape[1:]} & {*"acoblw"}
         } - {*STRESS}
         assert {f"frames/{name}" for name in always} < set(names) < set(FIELDS)
         for name in names:

@@ -50,11 +50,11 @@ def refuse_existing(request: RunRequest) -> None:
 def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes") -> None:
     """Write the state as frame 0, then a frame for each shape (collective). Raises InputError."""
     from msmpetsc.app.running import open_output, write_companions
+    from msmpetsc.lattice.embedded_surface import EmbeddedPoints
     from msmpetsc.results.writer import write_model
-    from msmpetsc.solve.simulate import SurfaceMotion
 
     embedding, side = model.embedding, model.lattice.longest_side()
-    surface_at = None if embedding is None else SurfaceMotion(comm, model.lattice, embedding)
+    surface_at = None if embedding is None else EmbeddedPoints(comm, model.lattice, embedding)
     with open_output(comm, plan, {"frequencies": modes.frequencies}) as file:
         write_model(comm, file, model)
         rows = {} if surface_at is None else {"surface": surface_at.weights.shape[0]}

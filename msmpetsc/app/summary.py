@@ -123,7 +123,7 @@ class Cost:
             "cells": len(lattice.cells),
             "nodes": lattice.owned,
             "springs": lattice.springs_owned,
-            "unknowns": int((~fixed).sum()),
+            "unknowns": int((~fixed).any(axis=1).sum()),
         }
         self.counts = {name: comm.allreduce(number) for name, number in own_counts.items()}
 

@@ -1,21 +1,49 @@
 """External forces and prescribed displacements that act at a time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Mask, Positions, Rows, like, to_host
-from msmpetsc.constraints.loads import Anchor, Load, OwnForce
+from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, like, to_host
+from msmpetsc.constraints.loads import Anchor, Load, OwnForce, Pressure, Varying
+from msmpetsc.elasticity.pressure import Pressures
 from msmpetsc.lattice.lattice import Lattice
+
+
+class ExternalForces(NamedTuple):
+    """External forces at a time, or their means over a time.
+
+    force     : (owned, 3) [N] that do not depend on positions, as a read-only array
+    pressures : pressures, whose forces follow the surface
+    """
+
+    force: Rows
+    pressures: Pressures
+
+    def at(self, q: Positions) -> Rows:
+        """Return the force f_ext (owned, 3) [N] at positions q (l, 3) [m] (collective)."""
+        if not self.pressures.parts:
+            return self.force
+        gradient = -self.force
+        self.pressures.add_gradient(q, gradient)
+        return -gradient
 
 
 class ActingForces:
     """External forces on the nodes of a rank. Local positions (l, 3) [m] include ghosts."""
 
-    def __init__(self, lattice: Lattice, loads: Sequence[Load], own_forces: Sequence[OwnForce]):
+    def __init__(
+        self,
+        lattice: Lattice,
+        loads: Sequence[Load],
+        own_forces: Sequence[OwnForce],
+        pressures: Sequence[Pressure] = (),
+    ):
         self.lattice, self.loads, self.own_forces = lattice, loads, own_forces
-        self.all: list[Load | OwnForce] = [*loads, *own_forces]
+        self.pressures = pressures
+        self.all: list[Varying] = [*loads, *own_forces, *pressures]
         self._own = [np.zeros((0, 3))] * len(own_forces)
         self._totals: list[tuple[float, ...]] = []
         self._load = np.zeros((lattice.owned, 3), like=lattice.nodes)
@@ -35,35 +63,42 @@ class ActingForces:
                 q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time)
             )
 
-    def at(self, time: float) -> Rows:
-        """Return the external force f_ext (owned, 3) [N] at a time [s], as a read-only array."""
-        return self._with_own(self.given(time), [force.acts_at(time) for force in self.own_forces])
+    def at(self, time: float, users: bool = True) -> ExternalForces:
+        """Return the external forces at a time [s].
 
-    def mean(self, begin: float, end: float) -> Rows:
-        """Return the mean of f_ext (owned, 3) [N] from begin to end [s], as a read-only array."""
-        load = self._shared([load.mean(begin, end) for load in self.loads])
-        return self._with_own(load, [force.share(begin, end) for force in self.own_forces])
+        users : whether with the users' functions, the part without a potential
+        """
+        return self._with(lambda load: load.state_at(time), users)
 
-    def given(self, time: float) -> Rows:
-        """Return f_ext (owned, 3) [N] without the users' functions: the part with a potential."""
-        return self._shared([load.state_at(time) for load in self.loads])
+    def mean(self, begin: float, end: float) -> ExternalForces:
+        """Return the means of the external forces from begin to end [s]."""
+        return self._with(lambda load: load.mean(begin, end))
 
-    def _shared(self, totals: list[tuple[float, ...]]) -> Rows:
-        """Return the force (owned, 3) [N] of the loads with these totals."""
+    def ahead(self, before: float, begin: float, end: float) -> ExternalForces:
+        """Return (3 f - f') / 2 with the means f from begin to end, f' from before to begin [s]."""
+
+        def total(load: Varying) -> Floats:
+            mean = load.mean(begin, end)
+            return mean + 0.5 * (mean - load.mean(before, begin))
+
+        return self._with(total)
+
+    def _with(self, total: Callable[[Varying], Floats], users: bool = True) -> ExternalForces:
+        """Return the external forces with these totals of each load."""
+        totals = [tuple(total(load).tolist()) for load in self.loads]
         if totals != self._totals:
             self._totals = totals
             self._load = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
-            for load, total in zip(self.loads, totals, strict=True):
-                if any(total):
-                    self._load += load.share * like(load.share, np.array(total))
-        return self._load
-
-    def _with_own(self, load: Rows, shares: Sequence[float]) -> Rows:
-        """Return a force (owned, 3) [N] plus shares of the users' forces."""
-        for share, own in zip(shares, self._own, strict=True):
-            if share and len(own):
-                load = load + share * own
-        return load
+            for load, vector in zip(self.loads, totals, strict=True):
+                if any(vector):
+                    self._load += load.share * like(load.share, np.array(vector))
+        force = self._load
+        for function, own in zip(self.own_forces, self._own, strict=True):
+            share = float(total(function)[0])
+            if users and share and len(own):
+                force = force + share * own
+        values = [float(total(pressure)[0]) for pressure in self.pressures]
+        return ExternalForces(force, Pressures([p.part for p in self.pressures], values))
 
 
 class Anchors:
@@ -77,9 +112,9 @@ class Anchors:
         return [anchor for anchor in self.all if anchor.acts_at(time)]
 
     def fixed_at(self, time: float) -> Mask:
-        """Return the mask (l,) of nodes that are pinned or anchored at a time [s]: no unknowns."""
+        """Return the mask (l, 3) of components that are held at a time [s]: no unknowns."""
         return reduce(
-            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.pinned
+            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.held
         )
 
     def prescribed(
@@ -94,5 +129,5 @@ class Anchors:
             return None
         for anchor in anchors:
             pose = (1 - share) * anchor.path.value_at(begin) + share * anchor.path.value_at(time)
-            q = np.where(anchor.where[:, None], anchor.path.moved(self.lattice.nodes, pose), q)
+            q = np.where(anchor.where, anchor.path.moved(self.lattice.nodes, pose), q)
         return q

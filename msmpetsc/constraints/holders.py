@@ -8,6 +8,9 @@ clamp oblique to the grid is second-order accurate, like the Poisson equation of
 Cheng and Kang (2002). A solid's cell uses the mean of sigma theta over its pairs of a free and a
 held corner. This is too stiff along the clamp, but no strain occurs there.
 
+A pin of single components, a roller, ends at its nodes: the rest of their motion is free in its
+region, so that no spring is stiffer.
+
 The reaction on a held node is  m a + grad E - f_ext - push.  grad E sums to zero over a body, so
 reactions + loads + pushes = sum of m a.
 """
@@ -42,10 +45,10 @@ Regions = Mapping[str, Mask]
 
 @dataclass(frozen=True)
 class Holders:
-    """The pins and then the anchors of a scene, and the pin or anchor that holds each node.
+    """The pins and then the anchors of a scene, and the pin or anchor that holds each component.
 
     keys    : keys of their tables in the scene
-    number  : (owned,) index in ``keys`` of a node's holder; len(keys) for a free node
+    number  : (owned, 3) index in ``keys`` of a component's holder; len(keys) for a free one
     centers : (a, 3) centre of mass of each holder's nodes at rest [m]
     """
 
@@ -55,13 +58,14 @@ class Holders:
 
     @classmethod
     def of_masks(cls, masks: dict[str, Mask], lattice: Lattice) -> "Holders":
-        """Return the holders with these nodes (l,). A shared node is the first's (collective)."""
-        number = np.full(lattice.owned, len(masks))
+        """Return the holders of components (l, 3). A shared one is the first's (collective)."""
+        number = np.full((lattice.owned, 3), len(masks))
         for holder, where in reversed([*enumerate(masks.values())]):
             number[where[: lattice.owned]] = holder
         mass = lattice.mass[:, None]
-        sums = sums_by(number, np.hstack([mass * lattice.nodes[: lattice.owned], mass]), len(masks))
-        whole = lattice.table.comm.allreduce(sums)
+        moments = np.hstack([mass * lattice.nodes[: lattice.owned], mass])
+        sums = [moments[(number == holder).any(axis=1)].sum(axis=0) for holder in range(len(masks))]
+        whole = lattice.table.comm.allreduce(np.array(sums).reshape(-1, 4))
         return cls(
             tuple(masks), number, whole[:, :3] / np.maximum(whole[:, 3:], np.finfo(float).tiny)
         )
@@ -75,18 +79,21 @@ class Holders:
 
         points : (a, 3) reference point of each holder [m]
         """
-        of_node = like(q, np.vstack([points, np.zeros(3)]))[self.number]
-        return self.totals(np.cross(q - of_node, forces))
+        torques = np.zeros((len(self.keys), 3))
+        for holder, point in enumerate(points):
+            taken = np.where(self.number == holder, forces, 0.0)
+            torques[holder] = to_host(np.cross(q - like(q, point), taken).sum(axis=0))
+        return torques
 
 
 def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
     """Return the sum (count, k) of vectors (n, k) for each number below count.
 
-    number : (n,) number of each vector, on the same device
+    number : (n, 1) number of each vector, or (n, k) of its components, on the same device
     """
     sums = np.zeros((count, vectors.shape[1]))
     for which in range(count):
-        sums[which] = to_host(vectors[number == which].sum(axis=0))
+        sums[which] = to_host(np.where(number == which, vectors, 0.0).sum(axis=0))
     return sums
 
 
@@ -99,7 +106,11 @@ def clamped(
     points : (l, 3) body points nearest to the nodes [m]
     """
     lasting = (table for table in scene.tables("anchor") if table.table.stop is None)
-    tables = [t for t in chain(scene.tables("pin"), lasting) if not t.table.region.is_of_mesh]
+    tables = [
+        t
+        for t in chain(scene.tables("pin"), lasting)
+        if all(t.table.held) and not t.table.region.is_of_mesh
+    ]
     held = np.any([np.zeros(len(points), bool), *(masks[table.key] for table in tables)], axis=0)
 
     def stiffening(free: Indices, fixed: Indices) -> Floats:
@@ -177,12 +188,16 @@ def taken(
     def count(where: Mask) -> int:
         return int(comm.allreduce(int(where[: lattice.owned].sum())))
 
-    words = []
+    words = [
+        f"{table.key} holds {', '.join(table.table.fix)} of {count(masks[table.key])} nodes"
+        for table in scene.tables("pin")
+        if not all(table.table.held)
+    ]
     for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
         where = masks[table.key]
         nodes = count(where)
-        pinned = count(where & lattice.pinned)
-        anchored = count(anchor.where)
+        pinned = count(where & lattice.held[:, table.table.held].all(axis=1))
+        anchored = count(anchor.where.any(axis=1))
         if anchored < nodes:
             text = f"{table.key}: of {nodes} nodes in its region pins hold {pinned}, "
             text += f"and anchors before it lead {nodes - pinned - anchored}"
@@ -196,7 +211,7 @@ def taken(
         # An anchor annuls a force only if it holds the node as long as the force acts.
         lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
         nodes = count(where)
-        held = count(where & reduce(np.logical_or, lasting, lattice.pinned))
+        held = count(where & reduce(np.logical_or, lasting, lattice.held).all(axis=1))
         if held == nodes and force.pulls:
             raise InputError(
                 f"{table.key} moves nothing: of {nodes} nodes in its region none is free "

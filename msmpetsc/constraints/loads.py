@@ -1,7 +1,7 @@
 """Forces on nodes, anchors, and the prescribed motion of anchors and obstacles."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import ForceFunction
+from msmpetsc.lattice.embedded_surface import SurfacePart
 from msmpetsc.scene.motion import ForceTable, Pose
 from msmpetsc.scene.values import Vector
 
@@ -123,11 +124,11 @@ class Motion(Lines):
 ALWAYS = Lines(np.zeros(1), np.ones((1, 1)))
 
 
-def total_of(total: Vector | ForceTable) -> Lines:
-    """Return the total [N] of a scene's force over time; a constant force has a single time."""
+def total_of(total: Vector | ForceTable | float) -> Lines:
+    """Return a scene's load over time, [N] or [Pa]; a constant load has a single time."""
     if isinstance(total, ForceTable):
-        return Lines(np.array(total.times), np.array(total.values))
-    return Lines(np.zeros(1), np.array([total]))
+        return Lines(np.array(total.times), np.array(total.values).reshape(len(total.times), -1))
+    return Lines(np.zeros(1), np.array(total, ndmin=1)[None])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,65 +147,73 @@ class Timed:
         """Return the times [s] at which the load begins, ends or changes its slope."""
         return [self.start, *([] if self.stop is None else [self.stop])]
 
-    def state_at(self, time: float) -> bool | tuple[float, ...]:
-        """Return a state at a time [s]: times of equal state have the same load."""
-        return self.acts_at(time)
-
 
 @dataclass(frozen=True)
 class Anchor(Timed):
     """Nodes with a prescribed displacement along a path, until the anchor releases them.
 
-    where : (l,) bool, the nodes, ghosts included
+    where : (l, 3) bool, the prescribed components of the nodes, ghosts included
     """
 
     where: Mask
     path: Motion
 
 
-@dataclass(frozen=True)
-class Load(Timed):
-    """A force on nodes, a share of a total. Gravity is the acceleration times the mass.
+@dataclass(frozen=True, kw_only=True)
+class Varying(Timed):
+    """A load with a total over time."""
 
-    share : (owned, 1) share of each node in the total [-]; for gravity, its mass [kg]
-    total : total force [N]; for gravity, the acceleration [m/s^2]
-    """
-
-    share: Rows
     total: Lines
 
-    def state_at(self, time: float) -> tuple[float, ...]:
-        """Return the total at a time [s]; zeros if the force does not act."""
-        return tuple((self.acts_at(time) * self.total.value_at(time)).tolist())
+    def state_at(self, time: float) -> Floats:
+        """Return the total at a time [s]; zeros if the load does not act."""
+        return self.acts_at(time) * self.total.value_at(time)
 
-    def mean(self, begin: float, end: float) -> tuple[float, ...]:
+    def mean(self, begin: float, end: float) -> Floats:
         """Return the mean of the total from begin to end [s]."""
-        return tuple(self.total.mean(begin, end, self.start, self.stop).tolist())
+        return self.total.mean(begin, end, self.start, self.stop)
 
     @property
     def events(self) -> list[float]:
-        """Return the times [s] at which the force begins, ends or changes its slope."""
+        """Return the times [s] at which the load begins, ends or changes its slope."""
         return [*super().events, *self.total.times.tolist()]
 
 
 @dataclass(frozen=True)
-class OwnForce(Timed):
+class Load(Varying):
+    """A force on nodes, a share of a total.
+
+    share : (owned, 1) share of each node in the total [-]; mass [kg] of gravity, area [m^2] of
+            tractions
+    total : total force [N]; the acceleration [m/s^2] of gravity, a traction [Pa]
+    """
+
+    share: Rows
+
+
+@dataclass(frozen=True)
+class Pressure(Varying):
+    """A pressure [Pa] on a part of the surface, positive if it pushes into the body."""
+
+    part: SurfacePart
+
+
+@dataclass(frozen=True)
+class OwnForce(Varying):
     """A force that a user's function defines (extensions.register_force).
 
     key      : key of its table in the scene, for messages
     function : from positions (k, 3) [m], velocities (k, 3) [m/s] and time [s] to (k, 3) [N/kg]
     rows     : (k,) owned nodes in its region
     mass     : (k,) their masses [kg]
+    total    : factor of the function [-]
     """
 
     key: str
     function: ForceFunction
     rows: Indices
     mass: Floats
-
-    def share(self, begin: float, end: float) -> float:
-        """Return the share of the time from begin to end [s] in which the force acts."""
-        return float(ALWAYS.mean(begin, end, self.start, self.stop)[0])
+    total: Lines = field(default=ALWAYS, kw_only=True)
 
     def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
         """Return the force (owned, 3) [N] at positions q and velocities v (owned, 3).

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host
+from msmpetsc.elasticity.pressure import Pressures
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.springs import Product, SpringGather, SpringScatter
 from msmpetsc.elasticity.viscosity import Viscosity
@@ -16,7 +17,8 @@ class Elasticity:
 
     The law is a neo-Hookean solid (elasticity.solid) or linear springs (elasticity.springs).
     ``springs``, ``solid`` and ``viscosity`` are None if the law has no such part. If the solid is
-    viscous, E includes the dissipation potential D of the step that ``viscosity`` began last.
+    viscous, E includes the dissipation potential D of the step that ``viscosity`` began last. It
+    includes the potential of ``pressures``, which are 0 until a step sets their values.
 
     Positions are local (l, 3) [m]. Energies are sums over the springs or cells that this rank owns.
     Gradients and products are complete in the owned rows.
@@ -33,12 +35,15 @@ class Elasticity:
             self.springs = (SpringScatter if on_host(lattice.nodes) else SpringGather).of_lattice(
                 lattice
             )
-        self.parts = [part for part in (self.solid, self.springs, self.viscosity) if part]
+        self.pressures = Pressures(lattice.pressed) if lattice.pressed else None
+        laws = self.solid, self.springs, self.viscosity, self.pressures
+        self.parts = [part for part in laws if part]
 
     def energy(self, q: Positions) -> float:
         """Return this rank's part of E [J]: the energy change from rest, where E is 0, and D."""
         viscous = self.viscosity.energy(q) if self.viscosity else 0.0
-        return viscous + sum(law.change(q, self.rest) for law in (self.solid, self.springs) if law)
+        laws = self.solid, self.springs, self.pressures
+        return viscous + sum(law.change(q, self.rest) for law in laws if law)
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return this rank's part of E(q) - E(base) [J]."""
@@ -71,6 +76,8 @@ class Elasticity:
         law = self.solid or self.springs
         assert law is not None
         law.add_concavity(q, concavity)
+        if self.pressures:
+            self.pressures.add_concavity(q, concavity)
         return concavity[: self.owned]
 
     def hessian_at(

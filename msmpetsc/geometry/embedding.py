@@ -1,10 +1,11 @@
 """Build the embedding W, a sparse matrix: surface points = W @ node positions (paper 3.1).
 
-``stencil_weights`` computes the rows of W by one of three kinds of coordinates:
+``stencil_weights`` computes the rows of W by one of four kinds of coordinates:
 
 - "mvc": mean value coordinates of a cell (Eq. 1-6, geometry.mean_value_coordinates),
 - "cages": *Cages coordinates, smooth across cells (Eq. 7-9, geometry.blended_coordinates),
-- "affine": blended affine maps, smooth across cells (ours, geometry.blended_coordinates).
+- "affine": blended affine maps, smooth across cells (ours, geometry.blended_coordinates),
+- "trilinear": the cell's trilinear interpolation, for loads on the surface.
 """
 
 from collections.abc import Sequence
@@ -42,13 +43,15 @@ def embed(
     nodes  : node numbers of the lattice by grid key
     kind, smoothing : see ``stencil_weights``
 
-    Raises ValueError if a point lies in no valid cell.
+    Raises ValueError on all ranks if a point lies in no valid cell.
     """
     comm = cages.table.comm
     total = comm.allreduce(sum(map(len, points)))
     row, key, u = _to_cells(points, cages)
     cell_keys, cell = np.unique(key, return_inverse=True)
     neighbours, node_keys = _around(cages, cell_keys)
+    if not all(comm.allgather(bool(neighbours[:, MIDDLE].all()))):
+        raise ValueError("a point lies in a cell that is not valid")
     numbers = nodes.find(node_keys)
 
     def entries(part: slice) -> tuple[Indices, Indices, Floats]:
@@ -120,7 +123,7 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
 
     kind       : "mvc", mean value coordinates in the cell, continuous (Eq. 1-6); "cages", smooth
                  blends of coordinates in joined cells (Eq. 7-9); "affine", smooth blends of affine
-                 maps, the most accurate
+                 maps, the most accurate; "trilinear", the displacement of a solid's cell
     u          : (p,3) coordinates in the cell, in [0,1]
     neighbours : (p,27) bool, whether the cell at offset (dx, dy, dz) is valid, in the column
                  (dx+1)*9 + (dy+1)*3 + (dz+1)
@@ -138,6 +141,11 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
     u = np.ascontiguousarray(np.where(u < ON_FACE, 0.0, np.where(u > 1.0 - ON_FACE, 1.0, u)))
     # a single memory layout, so that the kernels are compiled once
     neighbours = np.ascontiguousarray(neighbours, bool)
+    if kind == "trilinear":
+        x, y, z = np.stack([1 - u, u], axis=2).transpose(1, 0, 2)
+        whole = np.zeros((len(u), 4, 4, 4))
+        whole[:, 1:3, 1:3, 1:3] = np.einsum("pi,pj,pk->pijk", x, y, z)
+        return whole.reshape(len(u), 64)
     weights = np.empty((len(u), 64))
     # mean value coordinates are *Cages coordinates of a cell without neighbours
     if kind == "mvc":

@@ -27,7 +27,7 @@ def initial_state(
     """Return initial positions and velocities of nodes from their bodies' starts (collective).
 
     starts : the start of each body; None for a body at rest
-    held   : (l,) bool, nodes that stay at rest in their rest positions
+    held   : (l, 3) bool, components that stay at rest in their rest positions
     bounds : (b, 2, 3) bounding box of each body at rest [m]
     """
     states = {}
@@ -46,8 +46,8 @@ def initial_state(
             at_rest = held[own]
             if start.from_ is not None:
                 q[own], velocity[own] = (rows[own] for rows in states[start.from_])
-                at_rest = held[own] & ~lattice.pinned[own]
-            q[own[at_rest]] = lattice.nodes[own[at_rest]]
+                at_rest = held[own] & ~lattice.held[own]
+            q[own] = np.where(at_rest, lattice.nodes[own], q[own])
             mass = lattice.mass[own[:owned]]
             total: Floats = comm.allreduce(np.append(mass @ q[own[:owned]], mass.sum()))
             about = total[:3] / total[3] if start.about is None else np.array(start.about)

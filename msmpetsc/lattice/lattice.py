@@ -5,6 +5,8 @@ ends. Global node numbers follow Morton order, so they do not depend on the numb
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -35,7 +37,7 @@ class Lattice:
                   the lower number. The rank of the lower-numbered end owns each further spring.
     rest_length : (s,) distance of the ends at rest [m]
     stiffness   : (s,) [N/m]; a solid has zero-length springs whose L bounds its Hessian at rest
-    pinned      : (l,) bool, nodes that do not move
+    held        : (l, 3) bool, components of nodes that do not move
     local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
                   first corner this rank owns. For a solid all cells around owned nodes follow.
     cell_stiffness : (d,) stiffness of an edge inside a body of the cell's material [N/m]
@@ -45,6 +47,7 @@ class Lattice:
     solid       : constants of a neo-Hookean solid; None if the law is springs
     volumetric  : name of a solid's volumetric energy (elasticity.neo_hookean)
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
+    pressed     : surfaces under pressure (lattice.embedded_surface.SurfacePart)
     """
 
     table: SortedKeys
@@ -58,7 +61,7 @@ class Lattice:
     springs_owned: int
     rest_length: Floats
     stiffness: Floats
-    pinned: Mask
+    held: Mask
     local_cells: Indices = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
     cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
@@ -68,6 +71,7 @@ class Lattice:
     solid: SolidCells | None = None
     volumetric: str = "quadratic"
     viscous: float = 0.0
+    pressed: tuple[Any, ...] = ()
 
     @property
     def owned(self) -> int:
@@ -99,9 +103,20 @@ class Lattice:
         low, high = np.array(self.table.comm.allgather(own)).transpose(1, 0, 2)
         return float((high.max(axis=0) - low.min(axis=0)).max())
 
+    @cached_property
+    def pinned(self) -> Mask:
+        """Mask (l,) of the nodes that do not move."""
+        pinned: Mask = self.held.all(axis=1)
+        return pinned
+
+    @cached_property
+    def rollers(self) -> tuple[Indices, ...]:
+        """Nodes (h,) and components (h,) that are held of nodes that are held in part."""
+        return np.nonzero(self.held & ~self.pinned[:, None])
+
     def pin(self, where: Mask) -> "Lattice":
-        """Return this lattice with the nodes ``where`` (l,) bool pinned, too."""
-        return replace(self, pinned=self.pinned | where)
+        """Return this lattice with the nodes (l,) or components (l, 3) ``where`` held, too."""
+        return replace(self, held=self.held | where.reshape(len(where), -1))
 
 
 def build_lattice(
@@ -141,7 +156,7 @@ def build_lattice(
         springs_owned=net.springs_owned,
         rest_length=h * np.sqrt(DIRECTION_KIND[net.direction]),
         stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
-        pinned=np.zeros(len(net.ijk), bool),
+        held=np.zeros((len(net.ijk), 3), bool),
         local_cells=net.cells[kept],
         cells_owned=int(first_owned.sum()),
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],

@@ -102,13 +102,13 @@ class Finder:
         )
         if selected == 0:
             raise InputError(
-                f"{table.key}.region holds no node of the lattice{self._extents(table)}"
+                f"{table.key}.region holds no node of the lattice{self.extents(table)}"
             )
         if selected < outside:
             log.warning(
                 "%s.region only grazes the body: it holds %d nodes, and leaves out %d nodes "
                 "that lie in the region but outside the body%s",
-                table.key, selected, outside, self._extents(table),
+                table.key, selected, outside, self.extents(table),
             )  # fmt: skip
         return where
 
@@ -149,12 +149,10 @@ class Finder:
         else:
             where = self.inside(table, middles, grids.body_of(ijk))
         if not self.comm.allreduce(bool(where.any()), MPI.LOR):
-            raise InputError(
-                f"{table.key}.region holds the centre of no cell{self._extents(table)}"
-            )
+            raise InputError(f"{table.key}.region holds the centre of no cell{self.extents(table)}")
         return where
 
-    def _extents(self, table: OfBody) -> str:
+    def extents(self, table: OfBody) -> str:
         """Return the extents of a table's bodies and of its region, for a message."""
         bounds = self.bounds if table.body is None else self.bounds[[table.body]]
         body = _box_text(bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))

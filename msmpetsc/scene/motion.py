@@ -9,6 +9,7 @@ from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.suggestions import TAGS
 from msmpetsc.scene.values import (
+    Components,
     Direction,
     FileName,
     FunctionName,
@@ -135,7 +136,22 @@ Path = Annotated[ListOf[Pose], AfterValidator(_ascending)]
 PATH = "poses, interpolated linearly from rest at time 0; the last pose is kept"
 
 
-class Pin(Table):
+class Holder(Table):
+    """Nodes of which some components are no unknowns."""
+
+    fix: Components = Field(
+        ("x", "y", "z"),
+        description='global components that are held, for example ["x"] for a roller or a plane '
+        "of symmetry [-]",
+    )
+
+    @property
+    def held(self) -> tuple[bool, ...]:
+        """Return whether each component is held."""
+        return tuple(axis in self.fix for axis in "xyz")
+
+
+class Pin(Holder):
     """Nodes that stay at their rest positions."""
 
     region: Region = Field(description="the pinned nodes")
@@ -145,12 +161,18 @@ class ForceTable(Table):
     """A force that is piecewise linear in time, and constant before and after the table."""
 
     times: ListOf[NotNegative] = Field(description="ascending times [s]")
-    values: ListOf[Vector] = Field(description="total force at each time [N]")
+    values: ListOf[Vector] = Field(description="force [N] or traction [Pa] at each time")
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "ForceTable":
+    def _fits_together(self) -> Self:
         refuse_unlike(self.times, self.values, "times", "values")
         return self
+
+
+class PressureTable(ForceTable):
+    """A pressure that is piecewise linear in time, and constant before and after the table."""
+
+    values: ListOf[float] = Field(description="pressure at each time [Pa]")  # type: ignore[assignment]
 
 
 # a tagged union: a plain union would report the problems of both alternatives
@@ -191,7 +213,50 @@ class Force(Table):
         return any(map(any, values))
 
 
-class AnchorTable(Table):
+class SurfaceLoad(Table):
+    """A load on the surface triangles of a region, by their centroids."""
+
+    region: Region = Field(
+        description="the triangles of the surface that the load acts on, by their centroids or by "
+        "their group"
+    )
+    start: float = Field(0.0, description="time from which the load acts [s]")
+    stop: float | None = Field(
+        None, description="time until which the load acts [s]; to the end if absent"
+    )
+
+    _after_start = field_validator("stop")(after_start)
+
+    @field_validator("region")
+    @classmethod
+    def _has_triangles(cls, region: Region) -> Region:
+        if region.painted is not None:
+            raise rule("must be a box, sphere, half_space or group: points choose no triangles")
+        return region
+
+
+class Traction(SurfaceLoad):
+    """A dead load: a force on each area of the surface at rest, of constant direction."""
+
+    value: Total = Field(
+        description="traction: a constant vector, or { times = [s], values = [Pa] }, interpolated "
+        "linearly [Pa]"
+    )
+
+
+class Pressure(SurfaceLoad):
+    """A pressure that follows the surface. The surface must be closed, or its edge be held."""
+
+    value: Annotated[
+        Annotated[float, Tag(TAGS[0])] | Annotated[PressureTable, Tag(TAGS[1])],
+        Discriminator(lambda value: TAGS[isinstance(value, dict | PressureTable)]),
+    ] = Field(
+        description="pressure, positive if it pushes into the body: a number, or "
+        "{ times = [s], values = [Pa] }, interpolated linearly [Pa]"
+    )
+
+
+class AnchorTable(Holder):
     """Nodes that move along a prescribed path as a rigid body."""
 
     region: Region = Field(description="the nodes that move along the path")

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import Field, field_validator, model_validator
 
 from msmpetsc.scene.body import CagesTable, Material, MeshTable, OwnMaterial, PartTable
-from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
+from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Pressure, Start, Traction
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable, SelfContactTable
 from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.time import Time, one_state, unlike_the_integrator
@@ -26,7 +26,7 @@ from msmpetsc.scene.values import (
 # largest ratio of stiffnesses or densities in a scene [-]; so that CG converges
 MAX_CONTRAST = 1e6
 # tables with a region, of a body or of the whole scene
-OF_REGIONS = ("part", "pin", "anchor", "force")
+OF_REGIONS = ("part", "pin", "anchor", "force", "traction", "pressure")
 
 
 class BodyTable(Table):
@@ -43,6 +43,8 @@ class BodyTable(Table):
     pin: ListOf[Pin] = Field((), description="nodes that stay at their rest positions")
     anchor: ListOf[AnchorTable] = Field((), description="nodes that move along a prescribed path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
+    traction: ListOf[Traction] = Field((), description="dead loads on parts of the surface")
+    pressure: ListOf[Pressure] = Field((), description="pressures on closed surfaces")
 
 
 class OfBody(NamedTuple):
@@ -65,6 +67,12 @@ class OfBody(NamedTuple):
 def held_by(scene: Any) -> Iterator[OfBody]:
     """Yield the tables of pins, then of anchors. A node in several tables belongs to the first."""
     for kind in ("pin", "anchor"):
+        yield from scene.tables(kind)
+
+
+def surface_loads(scene: Any) -> Iterator[OfBody]:
+    """Yield the tables of tractions, then of pressures."""
+    for kind in ("traction", "pressure"):
         yield from scene.tables(kind)
 
 
@@ -215,6 +223,8 @@ class SceneFile(Table):
     pin: ListOf[Pin] = Field((), description="nodes that stay at their rest positions")
     anchor: ListOf[AnchorTable] = Field((), description="nodes that move along a prescribed path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
+    traction: ListOf[Traction] = Field((), description="dead loads on parts of the surface")
+    pressure: ListOf[Pressure] = Field((), description="pressures on closed surfaces")
     solver: Solver = Field(
         default_factory=lambda: Solver.model_validate({}), description="solver of a time step"
     )

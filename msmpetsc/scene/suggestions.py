@@ -41,6 +41,8 @@ EXAMPLES = {
     "path = [{ time = 1.0, by = [0, 0, 0.1] }] }]",
     "path": "[{ time = 1.0, by = [0, 0, 0.1] }]",
     "force": "[{ region = { box = [[0, 0, 0.9], [1, 1, 1]] }, total = [0, 0, -1] }]",
+    "traction": "[{ region = { box = [[0, 0, 0.9], [1, 1, 1]] }, value = [0, 0, -1] }]",
+    "pressure": "[{ region = { box = [[0, 0, 0], [1, 1, 1]], relative = true }, value = 1 }]",
     "total": "[0, 0, -1]",
     "obstacle": '[{ shape = "plane", point = [0, 0, 0], normal = [0, 0, 1] }]',
     "probe": '[{ name = "tip", point = [0, 0, 0.1] }]',

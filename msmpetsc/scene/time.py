@@ -80,7 +80,7 @@ def one_state(data: Any) -> Any:
         return data
     for load in _loads(data):
         if (
-            isinstance(load.get("total"), dict)
+            isinstance(load.get("total", load.get("value")), dict)
             or "function" in load
             or any(name in load for name in TIME_KEYS)
         ):
@@ -90,8 +90,8 @@ def one_state(data: Any) -> Any:
 
 
 def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the unchecked tables of anchors, forces and obstacles, with those of each body."""
-    for name in ("anchor", "force", "obstacle", "body"):
+    """Yield the unchecked tables of anchors, loads and obstacles, with those of each body."""
+    for name in ("anchor", "force", "traction", "pressure", "obstacle", "body"):
         given = tables.get(name)
         for table in given if isinstance(given, list | tuple) else ():
             if isinstance(table, dict):

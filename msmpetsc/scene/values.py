@@ -37,6 +37,12 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
+def _distinct(components: tuple[str, ...]) -> tuple[str, ...]:
+    if not components or len(set(components)) < len(components):
+        raise rule("must name one to three components, each once")
+    return components
+
+
 # below 1e60, so that the fourth power is finite
 Positive = Annotated[float, Field(gt=0, lt=1e60)]
 NotNegative = Annotated[float, Field(ge=0, lt=1e60)]
@@ -47,6 +53,7 @@ T = TypeVar("T")
 ListOf = Annotated[tuple[T, ...], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
 Direction = Annotated[Vector, AfterValidator(_nonzero)]
+Components = Annotated[tuple[Literal["x", "y", "z"], ...], Strict(False), AfterValidator(_distinct)]
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
 
 

@@ -32,7 +32,7 @@ from typing import SupportsFloat
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
@@ -109,15 +109,15 @@ class EnergyBalance:
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
         at, v = q[owned], v[owned]
-        contact = environment.obstacles.push(time, sides)
+        contact, given = environment.obstacles.push(time, sides), environment.forces.at(time, False)
         momenta = lattice.mass[:, None] * v
         free = ~environment.anchors.fixed_at(time)[owned]
         sums = self._sums(
             0.5 * np.vdot(momenta, v),
-            0.5 * np.vdot(momenta * free[:, None], v),
+            0.5 * np.vdot(momenta * free, v),
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
-            -np.vdot(environment.forces.given(time), at),
+            given.pressures.change(q, lattice.nodes) - np.vdot(given.force, at),
             *(lattice.mass @ v),
         )
         return Energies(
@@ -158,18 +158,17 @@ class EnergyBalance:
         pressing, dragged = self.environment.obstacles.way_of_pressing(
             (result.position[owned], after.sides), time, time_step
         )
-        is_held = self.environment.anchors.fixed_at(time)[owned].any()
+        is_held = self.environment.anchors.fixed_at(time)[owned].any(axis=0)
         sums = self._sums(
             lattice.mass.sum(),
             pressing,
-            is_held,
+            *to_host(is_held),
             *dragged,
             *(lattice.mass @ displacement / time_step),
         )
-        mass, pressing, is_held = sums[:3]
-        momentum = sums[6:]
+        mass, pressing, is_held, momentum = sums[0], sums[1], sums[2:5], sums[8:]
         if pressing > 0:
-            frame = sums[3:6] / (pressing * time_step)
+            frame = sums[5:8] / (pressing * time_step)
         else:
             frame = np.where(is_held, 0.0, momentum / mass)
         start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
@@ -281,16 +280,21 @@ class EnergyBalance:
         contact = environment.obstacles.push(when, sides)
         known = self.known[1] if self.known and q is self.known[0] else None
         ended = result.position[owned], after.sides
-        load = None if result.explicit else environment.forces.mean(time - time_step, time)
         along = time_step * np.broadcast_to(frame, 3)
         shift, drift = like(lattice.nodes, along), like(lattice.nodes, along / time_step)
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
+        work = 0.0
+        # Explicit steps count the work of loads themselves.
+        if not result.explicit:
+            loads = environment.forces.mean(time - time_step, time)
+            work = np.vdot(loads.force, ended[0] - q[owned] - shift)
+            work -= loads.pressures.change(result.position, q)
         sums = self._sums(
-            0.5 * np.vdot((lattice.mass * free)[:, None] * (v - drift), v - drift),
+            0.5 * np.vdot(lattice.mass[:, None] * free * (v - drift), v - drift),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned] + shift) if contact else 0.0,
-            (0.0 if load is None else np.vdot(load, result.position[owned] - q[owned] - shift))
+            work
             + environment.obstacles.friction_work_bound(
                 (q[owned], sides), ended, time, time_step, along
             )

@@ -192,7 +192,7 @@ class Monitors:
         for obstacle in self.environment.obstacles.all:
             if not obstacle.acts_at(time) or (index and obstacle.acts_at(time - self.time_step)):
                 continue
-            fixed = self.environment.anchors.fixed_at(time)
+            fixed = self.environment.anchors.fixed_at(time).all(axis=1)
             overlap = describe_overlap(self.comm, self.lattice, obstacle, q, fixed, time)
             if overlap:
                 self._warn(

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import AT_END, Checkpoint
-from msmpetsc.comm import Route
 from msmpetsc.constraints.holders import sums_by
 from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.elasticity.energy import Elasticity
@@ -21,10 +19,10 @@ from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
-from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.lattice.embedded_surface import EmbeddedPoints
 from msmpetsc.lattice.region import ProbePoints, probe_points
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.schema import Solver, held_by
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, TrueErrors
@@ -75,6 +73,12 @@ def refuse_bad_options(scene: Scene, true_error: int | None = None) -> None:
         raise InputError(
             f"contact of surfaces needs one of newton's presets, not {scene.solver.preset}"
         )
+    rolls = [table.key for table in held_by(scene) if not all(table.table.held)]
+    if rolls and not all(preset.true_hessian for preset, _ in solvers.values()):
+        raise InputError(
+            f"{rolls[0]}.fix: single components need one of newton's presets, not "
+            f"{scene.solver.preset}: the matrix A of the others holds whole nodes"
+        )
     if scene.time.error and true_error:
         raise InputError("true errors need steps of constant length: leave out time.error")
     if "" not in solvers and true_error:
@@ -94,6 +98,8 @@ class TimeLoop:
         model = to_device(model, sender(comm))
         if model.collision and not on_host(model.lattice.nodes):
             raise InputError("contact of surfaces is computed on CPUs: --device cpu")
+        if model.pressures and not on_host(model.lattice.nodes):
+            raise InputError("pressure is computed on CPUs: --device cpu")
         self.comm, self.model = comm, model
         self.true_error, self.time_step = true_error, scene.time.step
         self.steps, self.every = scene.time.steps, scene.output.every
@@ -115,15 +121,14 @@ class TimeLoop:
             take = self.adaptive.advance
         self.recovery = Recovery(scene, self._make, self.balance, take)
         self.monitors, self.true_errors = Monitors(self.environment, self.time_step), TrueErrors()
-        self.surface = (
-            None if model.embedding is None else SurfaceMotion(comm, model.lattice, model.embedding)
-        )
+        w = model.embedding
+        self.surface = None if w is None else EmbeddedPoints(comm, model.lattice, w)
         self.forces = Forces(model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
         sides = self.environment.obstacles.contact_faces(
-            q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0)
+            q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0).all(axis=1)
         )
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
         # The first solve reads options that the set-up leaves unread.
@@ -311,27 +316,6 @@ class TimeLoop:
         self.integrator.destroy()
 
 
-class SurfaceMotion:
-    """Compute the surface W @ positions of a frame.
-
-    weights  : this rank's rows of W
-    to_owner : exchange of the node positions that these rows need
-    asked    : this rank's nodes that other ranks need
-    """
-
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
-        columns, local = np.unique(embedding.indices, return_inverse=True)
-        shape = embedding.shape[0], len(columns)
-        self.weights = csr_array((embedding.data, local.ravel(), embedding.indptr), shape=shape)
-        self.to_owner = Route(comm, lattice.table.owner_of_index(columns))
-        self.asked = self.to_owner.send(columns) - lattice.table.first
-
-    def __call__(self, position: Positions) -> Rows:
-        """Return the surface points (v_local, 3) [m] of positions (owned, 3) [m] (collective)."""
-        surface: Rows = self.weights @ self.to_owner.answer(position[self.asked])
-        return surface
-
-
 class Forces:
     """Compute the force fields of a frame (fields.Frame) that the scene needs.
 
@@ -348,11 +332,13 @@ class Forces:
         self.keys = [obstacle.key for obstacle in model.obstacles]
         bodies = len(model.lattice.first_of_body) if model.collision else 0
         holders = len(model.holders.keys)
+        self.tractions = model.loads[len(model.loads) - model.tractions :]
         rows = {
             "reaction": holders,
             "torque": holders,
             "push": len(model.obstacles),
             "contact_push": bodies,
+            "surface_load": model.tractions + len(model.pressures),
         }
         self.rows = {name: count for name, count in rows.items() if count}
 
@@ -369,10 +355,14 @@ class Forces:
         problem = step.problem if step else None
         acting = problem.contact if problem else environment.obstacles.push(time, sides)
         contact = acting.at(q) if acting else None
-        load = environment.forces.at(time)
+        loads = environment.forces.at(time)
+        load = loads.at(q)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
+        if "surface_load" in self.rows:
+            dead = [float(load.share.sum()) * load.state_at(time) for load in self.tractions]
+            sums["surface_load"] = np.array([*dead, *loads.pressures.resultants(q)])
         if "reaction" in self.rows:
-            fixed = environment.anchors.fixed_at(time)[:owned, None]
+            fixed = environment.anchors.fixed_at(time)[:owned]
             held = (self._holding_forces(q, contact, step) - load) * fixed
             sums["reaction"] = self.model.holders.totals(held)
             sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
@@ -423,5 +413,5 @@ class Forces:
             push[contact.surface.contacts.obstacles.numbers] += obstacles / self.comm.size
             own = np.zeros_like(q[:owned])
             contact.surface.add_gradient(q, own)
-            touching -= sums_by(lattice.body[:owned], own, bodies)
+            touching -= sums_by(lattice.body[:owned, None], own, bodies)
         return {"push": push, "contact_push": touching}

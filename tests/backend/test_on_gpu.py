@@ -62,6 +62,12 @@ SOLID = {
     }
 }
 VISCOUS = {"material": {**SOLID["material"], "retardation_time": 0.01}}
+ROLLS = {
+    "pin": [*HELD["pin"], {"region": {"half_space": {"point": [0, 0.01, 0], "normal": [0, -1, 0]}},
+                           "fix": ["y"]}],
+    "traction": [{"region": {"box": [[0.9, 0, 0], [1, 1, 1]], "relative": True},
+                  "value": [200, 100, 50], "stop": 4 * T}],
+}  # fmt: skip
 CASES = {
     "newton": FALL,
     "solid": {**FALL, **SOLID, **HELD, **LED},
@@ -74,8 +80,10 @@ CASES = {
         "material": {**SOLID["material"], "poisson_ratio": 0.499, "volume": "log"},
         "output": {"stress": True},
     },
-    "solid, verlet": {**FALL, **SOLID, **LED, "time": {**FALL["time"], "integrator": "verlet"}},
-    "solid, multigrid": {**FALL, **VISCOUS, **HELD,
+    "solid, verlet": {
+        **FALL, **SOLID, **ROLLS, **LED, "time": {**FALL["time"], "integrator": "verlet"},
+    },
+    "solid, multigrid": {**FALL, **VISCOUS, **ROLLS,
     "solver": {"preset": "newton-multigrid", "error": 1e-9}},
     "held, led and let go": {**FALL, **HELD, **LED},
     "reflected": {**FALL, "obstacle": [{**FLOOR, "response": "reflect"}]},

@@ -53,7 +53,7 @@ def test_half_space_absolute_and_relative():
 def test_force_is_shared_out_by_mass():
     mass = np.array([1.0, 2.0, 5.0, 4.0])
     where = np.array([True, True, False, True])
-    load = Load(shares_by_mass(MPI.COMM_SELF, where, mass), total_of((7.0, 0.0, -14.0)))
+    load = Load(share=shares_by_mass(MPI.COMM_SELF, where, mass), total=total_of((7.0, 0.0, -14.0)))
     assert load.share * load.state_at(1.0) == pytest.approx(
         np.array([[1, 0, -2], [2, 0, -4], [0, 0, 0], [4, 0, -8]])
     )

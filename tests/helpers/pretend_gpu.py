@@ -22,7 +22,7 @@ from msmpetsc.solve.petsc import device
 KNOWN = [
     "array_equal", "asarray", "bincount", "concatenate", "copyto", "cross", "einsum", "empty",
     "empty_like",
-    "flatnonzero", "linalg.norm", "tile", "vdot", "where", "zeros", "zeros_like",
+    "flatnonzero", "linalg.norm", "nonzero", "tile", "vdot", "where", "zeros", "zeros_like",
 ]  # fmt: skip
 FEW = 9  # numbers are no array that grows with a body
 counted = Counter()

@@ -211,6 +211,22 @@ def test_a_state_of_equilibrium_stays_at_rest_on_any_number_of_ranks(tmp_path: P
     assert sag > 0.1 * SIDES[0]
 
 
+def test_held_components_keep_their_places_in_the_file(tmp_path: Path):
+    """A grip lifts the far side; then rollers hold its height, and the side slides and falls."""
+    far = {"region": {"half_space": {"point": [0.499, 0, 0], "normal": [1, 0, 0]}}, "fix": ["z"]}
+    lift = [far | {"path": [{"time": 4 * T, "by": [0, 0, 0.02]}]}]
+    time = {"step": T, "duration": 4 * T}
+    lifted = result_on(1, hung(tmp_path, "lifted", anchor=lift, time=time))["frames/position"][-1]
+    rolls = hung(tmp_path, "rolls", pin=[*NEAR, far], start={"from": "lifted_1.h5"}, time=time)
+    rest = result_on(1, rolls)
+    nodes, frames = rest["lattice/nodes"][:], rest["frames/position"][:]
+    held = nodes[:, 0] == SIDES[0]
+    np.testing.assert_allclose(lifted[held, 2], nodes[held, 2] + 0.02, atol=1e-12)
+    np.testing.assert_array_equal(frames[0], lifted)
+    assert (frames[:, held, 2] == lifted[held, 2]).all()
+    assert np.ptp(frames[:, held, 0], axis=0).min() > 1e-5
+
+
 def test_a_run_from_a_moving_state_is_the_rest_of_a_longer_run(tmp_path: Path):
     """Implicit Euler knows no more than positions and velocities; a velocity of the table is
     added."""

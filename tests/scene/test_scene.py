@@ -223,8 +223,8 @@ def test_all_problems_at_once_each_with_its_line(tmp_path):
         "scene.toml: time.setp: unknown key, did you mean 'step'? (line 6)",
         "scene.toml: colour: unknown key, valid: title, mesh, cages, material, time, body, part, "
         "start, "
-        "gravity, obstacle, self_contact, pin, anchor, force, solver, safety, output, picture "
-        "(line 8)",
+        "gravity, obstacle, self_contact, pin, anchor, force, traction, pressure, solver, safety, "
+        "output, picture (line 8)",
     ]
 
 

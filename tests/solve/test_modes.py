@@ -53,7 +53,7 @@ def modes(path: Path, count: int) -> Modes:
 def dense_frequencies(path: Path, q: np.ndarray) -> np.ndarray:
     """All frequencies [Hz] about positions q (n, 3), by a dense eigensolver."""
     lattice = build_model(COMM, load_scene(path)).lattice
-    free = np.repeat(~lattice.pinned, 3)
+    free = ~lattice.held.ravel()
     stiffness = dense_hessian(Elasticity(lattice), q)[np.ix_(free, free)]
     squares = eigh(stiffness, np.diag(np.repeat(lattice.mass, 3)[free]), eigvals_only=True)
     return np.sign(squares) * np.sqrt(np.abs(squares)) / (2 * np.pi)
@@ -72,6 +72,23 @@ def test_modes_at_rest_are_those_of_dense_matrices(tmp_path: Path, law: str):
         assert (found.frequencies[: found.rigid] == 0).all()
         rest = slice(found.rigid, None)
         np.testing.assert_allclose(found.frequencies[rest], expected[rest], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("fix", "ends", "rigid"), [("x", CLAMP, 3), ("yz", ENDS, 1)])
+def test_a_bar_on_rollers_keeps_the_rigid_motions_they_leave(
+    tmp_path: Path, fix: str, ends: list, rigid: int
+):
+    """At one end along the bar: it moves along y and z, turns about x, and is half of a free bar of
+    2 m, whose longitudinal modes are exact. Across the bar at both ends: it slides along x."""
+    pins = [pin | {"fix": list(fix)} for pin in ends]
+    path = body(tmp_path, [1, 0.25, 0.25], 0.125, pin=pins)
+    found, lattice = modes(path, 8), build_model(COMM, load_scene(path)).lattice
+    expected = dense_frequencies(path, lattice.nodes)[:8]
+    assert found.rigid == rigid
+    np.testing.assert_allclose(found.frequencies[rigid:], expected[rigid:], rtol=1e-6)
+    assert lattice.held.any() and (found.shapes[:, lattice.held] == 0).all()
+    of_free_bar = SPEED / (np.pi * 0.125) * np.sin(np.pi * 0.125 / 4)
+    assert (np.abs(found.frequencies / of_free_bar - 1).min() < 1e-7) == (fix == "x")
 
 
 def test_modes_of_a_loaded_body_are_those_of_its_state(tmp_path: Path):

@@ -11,12 +11,12 @@ from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import plain_damage, refuse_deadly
-from msmpetsc.scene.schema import SceneFile, held_by
+from msmpetsc.scene.schema import SceneFile, held_by, surface_loads
 from msmpetsc.view.drawable import read_scene
 
 SERIES = (
     "kinetic", "elastic", "potential", "contact", "self_contact", "momentum", "load", "reaction",
-    "torque", "push", "contact_push", "probe",
+    "torque", "push", "contact_push", "surface_load", "probe",
 )  # fmt: skip
 
 
@@ -46,6 +46,7 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
         "torque": [table.key for table in held_by(scene)],
         "push": [f"obstacle.{number}" for number in range(len(scene.obstacle))],
         "contact_push": [f"body.{number}" for number in range(max(1, len(scene.body)))],
+        "surface_load": [table.key for table in surface_loads(scene)],
         "probe": [probe.name for probe in scene.output.probe],
     }
     for name in filter(run.frames.__contains__, SERIES):

@@ -199,9 +199,9 @@ class NodeObstacles:
         The arrays are the same objects if no node strikes.
 
         step : the completed step, with the sides (o, l) for all obstacles
-        held : (l,) bool, the nodes that are not free
+        held : (l, 3) bool, the components that are not free
         """
-        free = ~held[:, None]
+        free = ~held
         work = 0.0
         sides = self.no_sides if step.sides is None else step.sides
         for exchange, side in zip(self.exchanges, sides[self.exchanging], strict=True):

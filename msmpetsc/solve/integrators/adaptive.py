@@ -346,11 +346,11 @@ class Adaptive(Integrator):
         mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
         end = self._end_time(self.tick + self.ticks.length(level))
-        free = mass * ~self.environment.anchors.fixed_at(end)[owned]
+        free = ~self.environment.anchors.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
-        local = local_error(self.order, q, v, x, w, t)
+        local = free * local_error(self.order, q, v, x, w, t)
         sums = [
-            free @ (local**2).sum(axis=1),
+            mass @ (local**2).sum(axis=1),
             mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1),
         ]
         # At rest, the size of the motion is the displacement until the next frame.
@@ -358,10 +358,12 @@ class Adaptive(Integrator):
         if not self.control.motion:
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
         # An impact or a change of contact force may come anywhere within the step.
-        late = t * (free @ np.sqrt((struck**2).sum(axis=1)))
+        late = t * (mass @ np.sqrt((free * struck**2).sum(axis=1)))
         if self.environment.obstacles.penalties:
             ends = (before.q[owned], before.sides), (x, after.sides)
-            late += t**2 * ((free > 0) @ self.environment.obstacles.change_of_push(*ends, end, t))
+            late += t**2 * (
+                free.any(axis=1) @ self.environment.obstacles.change_of_push(*ends, end, t)
+            )
         sums += [mass @ (coming**2).sum(axis=1), late]
         means = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         error, motion, coming, late = means

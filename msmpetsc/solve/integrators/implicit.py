@@ -28,6 +28,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint, Range
+from msmpetsc.constraints.acting import ExternalForces
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
@@ -61,7 +62,8 @@ class ContactFaces:
     these contacts. If there are no contacts, they take none. If the solution shows other contacts,
     the step is solved again. This replaces a broad phase at each iterate.
 
-    q, y, load : as in StepProblem
+    q, y       : as in StepProblem
+    load       : external forces
     before     : (o, l) faces at the start of the step; None: the nearest faces
     fixed      : (l,) bool, nodes that are not unknowns
     q_before   : (l, 3) [m] positions one step before q, for BDF2
@@ -75,7 +77,7 @@ class ContactFaces:
     environment: Environment
     q: Positions
     y: Positions
-    load: Rows
+    load: ExternalForces
     time: float
     time_step: float
     before: Indices | None
@@ -106,7 +108,8 @@ class ContactFaces:
         before, step = self.q_before, self.time_step
         self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
         prescribed = environment.anchors.prescribed(self.q, time)
-        return StepProblem(self.q, self.y, self.load, self.contact, prescribed)
+        load, pressures = self.load.force, self.load.pressures.values
+        return StepProblem(self.q, self.y, load, self.contact, prescribed, None, pressures)
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the result of ``step`` with settled contacts. Raises StepFailed."""
@@ -237,7 +240,7 @@ class ImplicitEuler(Integrator):
             result.position,
             result.previous,
             StepTaken(time, time_step, sides),
-            self.stepper.lattice.pinned,
+            self.stepper.lattice.held,
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
@@ -245,7 +248,7 @@ class ImplicitEuler(Integrator):
         self,
         state: State,
         y: Positions,
-        load: Rows,
+        load: ExternalForces,
         time: float,
         time_step: float,
         q_before: Positions | None = None,
@@ -253,7 +256,7 @@ class ImplicitEuler(Integrator):
         """Return the solution of the step to ``time`` [s] and its contact faces (o, l).
 
         y        : (l, 3) [m] positions without forces
-        load     : (owned, 3) [N] f_ext
+        load     : external forces
         q_before : (l, 3) [m] positions one step before the state, for BDF2
         """
         fixed = self.stepper.lattice.pinned
@@ -370,8 +373,7 @@ class Bdf2(ImplicitEuler):
         if history is None:
             history, begun_error, work_before = self._history(state, load, time)
         else:
-            before = forces.mean(begin - (state.span or self.time_step), begin)
-            load = load if before is load else 1.5 * load - 0.5 * before
+            load = forces.ahead(begin - (state.span or self.time_step), begin, time)
         q_0, v_0 = history
         y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
         result, sides = self._solve(state, y, load, time, self.time_step, q_0)
@@ -383,7 +385,7 @@ class Bdf2(ImplicitEuler):
             result.position,
             previous,
             StepTaken(time, self.time_step, sides),
-            self.stepper.lattice.pinned,
+            self.stepper.lattice.held,
         )
         cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
         result = replace(result, previous=previous, cost=cost, work=work, begun_error=begun_error)
@@ -395,7 +397,7 @@ class Bdf2(ImplicitEuler):
         return result, State(result.position, before, (q, v), sides)
 
     def _history(
-        self, state: State, load: Rows, time: float
+        self, state: State, load: ExternalForces, time: float
     ) -> tuple[tuple[Positions, Rows], float, Work]:
         """Return a history for a state without history, its error, and the work of finding it.
 

@@ -20,7 +20,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Positions, Rows, to_host
+from msmpetsc.backend.arrays import Mask, Positions, Rows, to_host
 from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
@@ -171,10 +171,10 @@ class LoadPath:
         if reached == share_before:
             return q
         functional = self.stepper.functional
-        pinned = self.stepper.lattice.pinned[:, None]
+        held = self.stepper.lattice.held
         ahead = q + (share - reached) / (reached - share_before) * (q - before)
         functional.begin(problem)
-        values = [functional.value(np.where(pinned, problem.fixed, guess)) for guess in (q, ahead)]
+        values = [functional.value(np.where(held, problem.fixed, guess)) for guess in (q, ahead)]
         return ahead if values[1] < values[0] else q
 
 
@@ -263,20 +263,35 @@ class Static(ImplicitEuler):
         return result, path
 
 
+def _rigid_rank(unknowns: Unknowns, held: Mask) -> int:
+    """Return how many rigid motions the few held components (owned, 3) prevent (collective)."""
+    lattice = unknowns.lattice
+    node, component = np.nonzero(held)
+    x = to_host(lattice.nodes)[node] / lattice.cell_size
+    # rotations about each axis, along the component
+    turns = np.cross(np.eye(3), x[:, None])[np.arange(len(node)), :, component]
+    rows = np.concatenate(unknowns.comm.allgather(np.hstack([np.eye(3)[component], turns])))
+    return int(np.linalg.matrix_rank(rows))
+
+
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError if a body is free to move or fewer than three nodes are held (collective).
+    """Raise InputError if a body is free to move or too little of it is held (collective).
 
     A part that no spring joins with the rest counts as a body.
     """
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
     support = "held at a point or two, about which it turns"
-    if bodies.free.any():
-        support = "held by nothing"
-    elif lattice.table.total - unknowns.total > 2:
+    free = bodies.free.any(axis=1)
+    held = to_host(lattice.held[: lattice.owned])
+    count = unknowns.comm.allreduce(int(held.sum()))
+    if free.any():
+        along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
+        support = f"held by nothing along {', '.join(along)}"
+    elif count > 6 or _rigid_rank(unknowns, held) == 6:
         return
     subject = "the body"
     if len(bodies.free) > 1:
-        number = int(np.argmax(bodies.free))
+        number = int(np.argmax(free))
         rows = np.flatnonzero(bodies.number[: lattice.owned] == number)
         own = to_host(lattice.nodes[: lattice.owned])[rows]
         sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))

@@ -25,7 +25,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest
+from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -104,8 +104,7 @@ class Verlet(Integrator):
         self.end = 0.0
         self.known: Floats | None = None
         self.anchors: int | None = None
-        self.fixed = environment.anchors.fixed_at(self.time_step)[:owned]
-        self.free = np.flatnonzero(~self.fixed)
+        self._fix(environment.anchors.fixed_at(self.time_step)[:owned])
         self.unstable_energy = UNSTABLE * comm.allreduce(crushing_energy(self.lattice))
 
     def save(self, checkpoint: Checkpoint) -> None:
@@ -135,7 +134,7 @@ class Verlet(Integrator):
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
             dt = self.time_step / count
-            self.load = self.environment.forces.mean(start, start + 0.5 * dt)
+            self.load = self._mean_load(start, start + 0.5 * dt)
             squared_start = self._squared_acceleration()
             # The energy below shows an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
@@ -169,7 +168,7 @@ class Verlet(Integrator):
             if before is not None:
                 before = before[:, : self.lattice.owned]
             self.sides = self.environment.obstacles.contact_faces(
-                self.q, self.q, start, 0.0, before, self.fixed
+                self.q, self.q, start, 0.0, before, self.fixed.all(axis=1)
             )
             self._update_gradient(start)
             self.highest.squared = 0.0
@@ -191,7 +190,7 @@ class Verlet(Integrator):
             self._update_gradient(end)
             duration = end - begin
             kicked = min(end + 0.5 * duration, time)
-            self.load = self.environment.forces.mean(end - 0.5 * duration, kicked)
+            self.load = self._mean_load(end - 0.5 * duration, kicked)
             self._count_work(moved, held)
         self._kick(time, 0.5 * duration, begin, time)
 
@@ -199,10 +198,10 @@ class Verlet(Integrator):
         """Add half the work [J] of the present forces to the work of springs, loads and anchors.
 
         moved : (owned, 3) [m] displacements of the substep
-        held  : (owned,) bool, nodes that anchors move against all forces
+        held  : (owned, 3) bool, components that anchors move against all forces
         """
         self.springs_work += 0.5 * np.vdot(self.elastic, moved)
-        forces = np.where(held[:, None], self.gradient[: self.lattice.owned], self.load)
+        forces = np.where(held, self.gradient[: self.lattice.owned], self.load)
         self.work += 0.5 * float(np.vdot(forces, moved))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
@@ -236,8 +235,8 @@ class Verlet(Integrator):
 
     def _squared_acceleration(self) -> float:
         """Return |M^(-1) (f_ext - grad E)|_M^2 [J/s^2] of this rank's free nodes."""
-        force = (self.load - self.gradient[: self.lattice.owned])[self.free]
-        return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
+        force = self.load - self.gradient[: self.lattice.owned]
+        return float(self.per_mass @ (~self.fixed * force**2).sum(axis=1))
 
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
         """Return the result of a step of ``count`` substeps, and the state after it (collective).
@@ -267,12 +266,18 @@ class Verlet(Integrator):
 
         begin, end : times [s] of the substep whose motion the obstacles have
         """
+        kept = self.v[self.partly]
         self._damp(0.5 * duration)
         kick(len(self.free), self.load, duration, self._movers())
         self._damp(0.5 * duration)
         if self.contact:
             self.work += duration * self.contact.power(begin, end)
             self.contact.apply_friction(self._movers(), duration, begin, end)
+        self.v[self.partly] = kept
+
+    def _mean_load(self, begin: float, end: float) -> Rows:
+        """Return the mean of f_ext (owned, 3) [N] between times [s], at q (collective)."""
+        return self.environment.forces.mean(begin, end).at(self.position.values)
 
     def _movers(self) -> Movers:
         return Movers(self.v, self.free, self.per_mass, self.gradient)
@@ -288,19 +293,21 @@ class Verlet(Integrator):
         drift(len(self.free), self.q, end - begin, self._movers())
         prescribed = self.environment.anchors.prescribed(self.position.values, end)
         if prescribed is not None:
-            anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
-            freed = anchored[~self.environment.anchors.fixed_at(self.end)[anchored]]
+            owned = self.lattice.owned
+            moved = self.fixed & ~self.lattice.held[:owned]
+            anchored = np.nonzero(moved)
+            freed = moved & ~self.environment.anchors.fixed_at(self.end)[:owned]
             self.work -= self._kinetic(freed)
-            self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
-            self.q[anchored] = prescribed[anchored]
+            self.v[anchored] = (prescribed[:owned] - self.q)[anchored] / (end - begin)
+            self.q[anchored] = prescribed[:owned][anchored]
             self.work += self._kinetic(freed)
         if self.environment.obstacles.strikes or self.environment.obstacles.has_sides:
             self._strike(begin, end)
         self.position.update()
 
-    def _kinetic(self, nodes: Indices) -> float:
-        """Return the kinetic energy [J] of this rank's ``nodes`` (k,)."""
-        return 0.5 * float(self.lattice.mass[nodes] @ (self.v[nodes] ** 2).sum(axis=1))
+    def _kinetic(self, where: Mask) -> float:
+        """Return the kinetic energy [J] of this rank's components ``where`` (owned, 3)."""
+        return 0.5 * float(self.lattice.mass @ (where * self.v**2).sum(axis=1))
 
     def _strike(self, begin: float, end: float) -> None:
         """Find the contact faces of a substep and reflect the nodes that strike an obstacle.
@@ -309,7 +316,7 @@ class Verlet(Integrator):
         """
         start = self.q - (end - begin) * self.v
         self.sides = self.environment.obstacles.contact_faces(
-            start, self.q, end, end - begin, self.sides, self.fixed
+            start, self.q, end, end - begin, self.sides, self.fixed.all(axis=1)
         )
         step = StepTaken(end, end - begin, self.sides)
         after, before, work = self.environment.obstacles.strike(self.q, start, step, self.fixed)
@@ -324,13 +331,18 @@ class Verlet(Integrator):
         anchors = len(self.environment.anchors.acting(time))
         if anchors != self.anchors:
             self.anchors = anchors
-            self.fixed = self.environment.anchors.fixed_at(time)[: self.lattice.owned]
-            self.free = np.flatnonzero(~self.fixed)
+            self._fix(self.environment.anchors.fixed_at(time)[: self.lattice.owned])
             self.highest.hold(self.fixed)
+
+    def _fix(self, fixed: Mask) -> None:
+        """Set the held components (owned, 3), the nodes that move, and their held components."""
+        pinned = fixed.all(axis=1)
+        self.fixed, self.free = fixed, np.flatnonzero(~pinned)
+        self.partly = np.nonzero(fixed & ~pinned[:, None])
 
     def _contact_bound(self, start: float, time: float) -> float:
         """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
-        fall = self.environment.forces.mean(start, time) * self.per_mass[:, None] * self.time_step
+        fall = self._mean_load(start, time) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
         stiffness = self.environment.obstacles.contact_stiffness_bound(

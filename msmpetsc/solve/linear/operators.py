@@ -57,14 +57,15 @@ class ContactBlocks:
                 if len(free):
                     self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
 
-    def add(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Add the product of the blocks with x to y."""
+    def add(self, x: PETSc.Vec, vector: PETSc.Vec) -> None:
+        """Add the product of the blocks with x to a vector."""
         if not self.parts:
             return
         with CONTACT:
-            x, y = self.unknowns.columns(x), self.unknowns.columns_to_write(y)
+            x, y = self.unknowns.columns(x), self.unknowns.columns_to_write(vector)
             for rows, blocks in self.parts:
                 y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
+            self.unknowns.project(vector)
 
 
 class ThreeColumns:

@@ -110,7 +110,10 @@ class Multigrid:
             raise InputError(
                 f"-{self.prefix}pc_mg_levels {asked}: the nearest for this lattice is {nearest}"
             )
-        galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, offsets, copies)
+        stiff = 1 / self.fine.compliance
+        galerkin = GalerkinSum(
+            unknowns, elasticity, t2, coarse[0], everywhere, offsets, copies, stiff
+        )
         rows = np.arange(size)[:, None] + size * np.arange(3)
         sizes = 3 * size, 3 * unknowns.total
         levels: list[Level] = []

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
@@ -20,7 +20,8 @@ class ProjectedHessian:
     H belongs to the positions of the last ``update`` and is positive definite.
 
     products   : number of products so far
-    inverse    : (m, 9) D^-1 [1/kg]
+    inverse    : (m, 9) D^-1 [1/kg], zero in held components
+    moves      : (m, 3) bool, the components that are not held
     compliance : (owned,) [m/N] estimated compliance of a node at rest
     """
 
@@ -34,6 +35,7 @@ class ProjectedHessian:
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
+        self.moves = ~lattice.held[unknowns.free]
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         elasticity.add_bound(lattice.nodes, blocks)
         self.compliance = 1 / (
@@ -52,7 +54,7 @@ class ProjectedHessian:
         self.contact = contact
         unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
         self.elasticity.add_bound(q, blocks)
-        nodes = FreeNodes(unknowns.free, unknowns.ballast, contact, self.t2)
+        nodes = FreeNodes(unknowns.free, self.moves, unknowns.ballast, contact, self.t2)
         invert_blocks(unknowns.size, self.inverse, blocks, nodes)
         self.joined = joined
         self.smoother = (
@@ -117,12 +119,14 @@ class FreeNodes(NamedTuple):
     """Terms of the diagonal blocks of H.
 
     free    : (m,) numbers of the free nodes
+    moves   : (m, 3) bool, the components that are not held
     mass    : (owned,) [kg]
     contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
     t2      : t^2 [s^2]
     """
 
     free: Indices
+    moves: Mask
     mass: Floats
     contact: Rows
     t2: float
@@ -132,8 +136,8 @@ class FreeNodes(NamedTuple):
 def invert_blocks(
     first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes
 ) -> None:
-    """Invert the diagonal blocks m I + t^2 (blocks + contact) of the free nodes."""
-    free, mass, contact, t2 = nodes
+    """Invert the diagonal blocks m I + t^2 (blocks + contact) of components that are not held."""
+    free, moves, mass, contact, t2 = nodes
     for i in range(first, count, step):
         node = free[i]
         m, d = mass[node], blocks[node]
@@ -144,16 +148,18 @@ def invert_blocks(
             a, b, c = a + t2 * p[0], b + t2 * p[1], c + t2 * p[2]
             e, f, g = e + t2 * p[4], f + t2 * p[5], g + t2 * p[8]
         a, e, g = a + m, e + m, g + m
+        x, y, z = moves[i]
+        b, c, f = x * y * b, x * z * c, y * z * f
         u, v, w = e * g - f * f, c * f - b * g, b * f - c * e
         over = 1.0 / (a * u + b * v + c * w)
-        inverse[i, 0], inverse[i, 1], inverse[i, 2] = over * u, over * v, over * w
+        inverse[i, 0], inverse[i, 1], inverse[i, 2] = x * over * u, over * v, over * w
         inverse[i, 3], inverse[i, 4], inverse[i, 5] = (
             over * v,
-            over * (a * g - c * c),
+            y * over * (a * g - c * c),
             over * (b * c - a * f),
         )
         inverse[i, 6], inverse[i, 7], inverse[i, 8] = (
             over * w,
             over * (b * c - a * f),
-            over * (a * e - b * b),
+            z * over * (a * e - b * b),
         )

@@ -28,7 +28,7 @@ class Bodies:
     """Bodies of a lattice.
 
     number : (l,) body of each local node, -1 if pinned
-    free   : (b,) bool, whether no spring joins the body with a pinned node
+    free   : (b, 3) bool, whether no node of the body, or joined with it, is held along each axis
     """
 
     number: Indices
@@ -61,9 +61,11 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
     label = _labels(unknowns, part)
     table = SortedKeys(comm, label[: lattice.owned][moves[: lattice.owned]])
     number = np.where(moves, table.find(np.where(moves, label, -1)), -1)
-    held = np.zeros(table.total, bool)
+    held = np.zeros((table.total, 3), bool)
     ends = springs[either & ~both]
     held[number[ends[moves[ends]]]] = True
+    node, component = map(to_host, lattice.rollers)
+    held[number[node], component] = True
     comm.Allreduce(MPI.IN_PLACE, held, MPI.LOR)
     return Bodies(number, ~held)
 
@@ -94,22 +96,27 @@ def _labels(unknowns: Unknowns, part: Indices) -> Indices:
 class Translations:
     """Treat translations of free bodies exactly in a multigrid cycle. All methods are collective.
 
+    A body that is held along some axes is free along the others.
+
     count   : number b of free bodies
+    free    : (3, b) 1 along the axes on which each free body is free, otherwise 0
     body    : (m,) free body of each free node; b if its body is held
     mass    : (m,) mass of each free node [kg]
     of_body : (b,) mass of each free body [kg]
     """
 
     def __init__(self, unknowns: Unknowns, bodies: Bodies):
-        self.unknowns, self.count = unknowns, int(bodies.free.sum())
-        rank = np.where(bodies.free, np.cumsum(bodies.free) - 1, self.count)
+        is_free = bodies.free.any(axis=1)
+        self.unknowns, self.count = unknowns, int(is_free.sum())
+        self.free = bodies.free[is_free].T.astype(float)
+        rank = np.where(is_free, np.cumsum(is_free) - 1, self.count)
         self.body = like(unknowns.lattice.nodes, rank[bodies.number[to_host(unknowns.free)]])
         self.mass = unknowns.lattice.mass[unknowns.free]
         self.of_body = self._sums(self.mass[None])[0]
 
     def of(self, forces: Rows) -> Rows:
         """Return T (T^T M T)^-1 T^T f (3, m) of forces f (3, m)."""
-        moved = self._sums(forces) / self.of_body
+        moved = self.free * self._sums(forces) / self.of_body
         return like(forces, np.append(moved, np.zeros((3, 1)), axis=1))[:, self.body]
 
     def around(self, cycle: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:

@@ -6,6 +6,7 @@ weights (8,) of the cell's corners at end a of a spring, or 0 if the end is pinn
 
 - a spring with block B: (w_a - w_b)(w_a - w_b)^T (x) t^2 B
 - a node of mass m with contact block C: w w^T (x) (m I + t^2 C)
+- a held component of a node that is held in part: a spring to the ground, HELD as stiff as the node
 - a solid cell: its Hessian in the strains of the coarse corners (elasticity.neo_hookean)
 """
 
@@ -43,6 +44,9 @@ from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 PINNED = 27
 # the upper triangle in a 3 x 3 block, and the diagonal in the upper triangle
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
+# stiffness of the spring that holds a component on coarse levels, over its node's [-];
+# the coarse matrix must not be much softer than the components that move
+HELD = 100.0
 # entries of a row of ``_write_coarse`` [-]
 COARSE = 41
 # place value of each corner's copy in a number, and their limit [-]
@@ -149,6 +153,7 @@ class GalerkinSum:
     keys    : (l,) key of each local node
     offsets : (l,) key of the offset of each node's body (free_bodies.Bodies.offsets)
     copies  : copies of the coarse nodes
+    stiff   : (owned,) stiffness of each node at rest [N/m]
     matrix  : AIJ of block size 3; it has values after the first ``update``
     """
 
@@ -161,6 +166,7 @@ class GalerkinSum:
         keys: Indices,
         offsets: Indices,
         copies: CoarseCopies,
+        stiff: Floats,
     ):
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
@@ -173,6 +179,11 @@ class GalerkinSum:
             Products(*(like(lattice.nodes, part) for part in products))
             for products in (of_springs, OF_NODES)
         )
+        # Matrix of single nodes [kg] without contact
+        self.own = np.zeros((lattice.owned, 6), like=lattice.nodes)
+        self.own[:, DIAGONAL] = unknowns.ballast[:, None]
+        node, component = (rows[lattice.rollers[0] < lattice.owned] for rows in lattice.rollers)
+        self.own[node, like(node, np.array(DIAGONAL))[component]] += HELD * t2 * stiff[node]
         first, second, places = self._pairs(grid, corners)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)
@@ -227,10 +238,7 @@ class GalerkinSum:
         if self.elasticity.springs:
             of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
             add_springs(count, q, of_springs, self.elasticity.springs.owned)
-        own = np.zeros((self.unknowns.lattice.owned, 6), like=q)
-        own[:, DIAGONAL] = self.unknowns.ballast[:, None]
-        if len(contact):
-            own += self.t2 * contact[:, UPPER]
+        own = self.own + self.t2 * contact[:, UPPER] if len(contact) else self.own
         add_nodes(count, own, PairSum(symmetric, self.places, self.nodes, self.of_nodes))
         into = CellSum(symmetric[:, self.full], self.places, self.cells, self.weights)
         scratch = np.empty((1 if on_host(q) else count, 8, COARSE), like=q)

@@ -78,7 +78,7 @@ class CarriedStart:
         for way in (moved, 0 * moved):
             if obstacles.total:
                 way = self._moved_with_obstacles(contacts, way)
-            carried = np.where(functional.lattice.pinned[:, None], problem.fixed, problem.q + way)
+            carried = np.where(functional.lattice.held, problem.fixed, problem.q + way)
             if functional.free_share(problem.q, carried, contacts.begin) == 1.0:
                 return carried
         obstacles.straight = contacts.begin, end
@@ -111,7 +111,7 @@ class CarriedStart:
     def _carry(self, contacts: Contacts, end: float) -> Positions:
         """Return the start at s = 1 by Newton's directions. Raises StepFailed."""
         functional, problem, begin = self.functional, self.functional.problem, contacts.begin
-        is_fixed, still = functional.lattice.pinned[:, None], np.zeros((1, 3))
+        is_fixed, still = functional.lattice.held, np.zeros((1, 3))
         q, s, gained = problem.q, 0.0, 1.0
         while gained > PROGRESS:
             begun = s

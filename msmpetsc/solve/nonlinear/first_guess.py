@@ -14,8 +14,8 @@ class FirstGuess:
 
     def __init__(self, functional: StepFunctional, extrapolate: bool):
         self.functional, self.extrapolate = functional, extrapolate
-        # Whether some nodes are fixed and thus no unknowns
-        self.has_fixed = functional.unknowns.total < functional.lattice.table.total
+        # Whether some components are held and thus no unknowns
+        self.has_fixed = functional.unknowns.is_held
         # c = x - y of the last steps (l, 3) [m], at most two, the newest first
         self.corrections: list[Positions] = []
 
@@ -77,7 +77,7 @@ class FirstGuess:
         """Return the guess (l, 3) [m] with fixed nodes at their places after the step."""
         lattice = self.functional.lattice
         return (
-            np.where(lattice.pinned[:, None], self.functional.problem.fixed, guess)
+            np.where(lattice.held, self.functional.problem.fixed, guess)
             if self.has_fixed
             else guess
         )

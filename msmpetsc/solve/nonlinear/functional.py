@@ -47,6 +47,7 @@ class StepProblem:
     prescribed : q_n with anchored nodes where they are after the step (l, 3) [m]; None if they stay
     rates      : two positions (l, 3) [m] whose difference gives the strain rates of a viscous solid
                  (elasticity.viscosity.Viscosity.begin)
+    pressures  : pressures on the lattice's surfaces [Pa]
     """
 
     q: Positions
@@ -55,6 +56,7 @@ class StepProblem:
     contact: Contact | None = None
     prescribed: Positions | None = None
     rates: tuple[Positions, Positions] | None = None
+    pressures: tuple[float, ...] = ()
 
     @property
     def fixed(self) -> Positions:
@@ -104,6 +106,8 @@ class StepFunctional:
         self.problem = problem
         if self.elasticity.viscosity and problem.rates:
             self.elasticity.viscosity.begin(*problem.rates)
+        if self.elasticity.pressures and problem.pressures:
+            self.elasticity.pressures.values = problem.pressures
         self.extent = self.comm.allreduce(greatest(np.abs(problem.q)), MPI.MAX)
 
     def positions(self, x: PETSc.Vec) -> Positions:
@@ -207,9 +211,8 @@ class StepFunctional:
         lattice, free = self.lattice, to_host(self.unknowns.free)
         numbers = lattice.global_numbers[: lattice.owned][free]
         seeds = lattice.table.total * np.arange(count)
-        return like(
-            self.mass, np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
-        )
+        noise = [uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds]
+        return self.unknowns.projected(like(self.mass, np.stack(noise)))
 
     def _inner(self, a: Rows, b: Rows) -> float:
         """Return a^T M b of this rank's (owned, 3); 0 in statics."""

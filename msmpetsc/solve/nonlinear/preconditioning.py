@@ -390,6 +390,7 @@ class StepPreconditioner:
     def apply(self, _: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Write P^-1 x to y (PCApply calls it)."""
         self.applied.apply(x, y)
+        self.applied.unknowns.project(y)
 
     def least_norm(self, r: PETSc.Vec) -> float:
         """Return a lower bound of |r|_(H^-1) that does not depend on P.

@@ -1,0 +1,85 @@
+"""Pressure p on surfaces that the lattice carries: a potential p V, and its derivatives.
+
+A triangle (a, b, c) has the force -p (b - a) x (c - a) / 6 at each corner: the uniform pressure on
+the linear triangle, at its present position. On a closed surface the forces are -p grad V, with V
+the volume to which the normals point away. So the resultant is zero, and the Hessian p grad grad V
+is symmetric. V is cubic along a straight way, so that Simpson's rule gives its change exactly.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Array, Floats, Positions, Rows
+from msmpetsc.elasticity.springs import Product
+from msmpetsc.lattice.embedded_surface import SurfacePart, doubled_areas
+
+
+class Pressures:
+    """The potential of pressures, with the methods that Elasticity needs of a law (collective).
+
+    parts  : surfaces under pressure
+    values : pressure on each [Pa]; 0 until it is set
+    """
+
+    def __init__(self, parts: Sequence[SurfacePart], values: Sequence[float] = ()):
+        self.parts, self.values = parts, tuple(values) or (0.0,) * len(parts)
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return this rank's part of p (V(q) - V(base)) [J]."""
+        change = 0.0
+        for part, pressure in self._acting():
+            start, way = part(base), part(q - base)
+            ends = doubled_areas(start) + doubled_areas(start + way)
+            mean = (ends + 4 * doubled_areas(start + 0.5 * way)) / 6
+            change += pressure / 6 * float(np.vdot(mean, way.sum(axis=0)))
+        return change
+
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
+        """Add p grad V [N] to the owned rows of ``gradient`` (l, 3)."""
+        for part, pressure in self._acting():
+            _add(part, pressure / 6 * doubled_areas(part(q)), gradient)
+
+    def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
+        """Return the product with p grad grad V at q; zero if ``projected``: it is indefinite."""
+        if projected:
+            return lambda v, product: None
+        corners = [(part, pressure, part(q)) for part, pressure in self._acting()]
+
+        def add_product(v: Array, product: Array) -> None:
+            for part, pressure, (a, b, c) in corners:
+                u, w, x = part(v)
+                turned = np.cross(w - u, c - a) + np.cross(b - a, x - u)
+                _add(part, pressure / 6 * turned, product)
+
+        return add_product
+
+    def add_concavity(self, q: Positions, concavity: Floats) -> None:
+        """Add a bound of the Hessian's negative part to the owned rows (l,) [N/m].
+
+        The block of corners i, j of a triangle is p / 6 [e_j]x, with e_j the edge opposite j. A
+        row of the symmetric part is at most p / 12 times the sum of |e_i| + |e_j| over j.
+        """
+        for part, pressure in self._acting():
+            at = part(q)
+            edges = np.linalg.norm(np.roll(at, -1, axis=0) - np.roll(at, 1, axis=0), axis=2)
+            rows = 3 * edges + edges.sum(axis=0)
+            _add(part, abs(pressure) / 12 * rows[:, :, None], concavity[:, None])
+
+    def add_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add nothing: multigrid leaves pressure out."""
+
+    def resultants(self, q: Positions) -> Rows:
+        """Return the force (p, 3) [N] of each pressure on this rank's triangles at q (l, 3) [m]."""
+        areas = [0.5 * doubled_areas(part(q)).sum(axis=0) for part in self.parts]
+        forces: Rows = -np.array(self.values)[:, None] * np.array(areas).reshape(-1, 3)
+        return forces
+
+    def _acting(self) -> list[tuple[SurfacePart, float]]:
+        return [pair for pair in zip(self.parts, self.values, strict=True) if pair[1]]
+
+
+def _add(part: SurfacePart, forces: Rows, rows: Rows) -> None:
+    """Add forces (f, k) on each corner, or (3, f, k), to the owned rows of ``rows`` (l, k)."""
+    of_nodes = part.to_nodes(forces)
+    rows[: len(of_nodes)] += of_nodes

@@ -1,0 +1,184 @@
+"""Points and triangles of the surface that the lattice carries, on any number of ranks.
+
+Points are W q, linear within a triangle. So a uniform force on a triangle acts with a third at each
+corner, and forces f on points act with W^T f on nodes. Resultant and moment are exact: each row of
+W sums to 1 and reproduces linear fields.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+from mpi4py import MPI
+from scipy.sparse import csr_array, vstack
+
+from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.comm import Route, on_root
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.surface import Surface, compact, first_of_equal
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.lattice.region import Finder, groups_named
+from msmpetsc.scene.motion import Pressure
+from msmpetsc.scene.schema import OfBody
+
+# triangles beyond which a surface is halved no more [-]; it bounds memory
+MOST_TRIANGLES = 1_000_000
+NO_SURFACE = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
+
+
+class EmbeddedPoints:
+    """Points W q of this rank, from the nodes of all ranks. All methods are collective.
+
+    weights : this rank's rows of W over the nodes that they need
+    """
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
+        columns, local = np.unique(embedding.indices, return_inverse=True)
+        shape = embedding.shape[0], len(columns)
+        self.weights = csr_array((embedding.data, local.ravel(), embedding.indptr), shape=shape)
+        self.to_owner = Route(comm, lattice.table.owner_of_index(columns))
+        self.asked = self.to_owner.send(columns) - lattice.table.first
+        entries = np.ones(len(self.asked)), (self.asked, np.arange(len(self.asked)))
+        self.sums = csr_array(entries, shape=(lattice.owned, len(self.asked)))
+
+    def __call__(self, q: Positions) -> Rows:
+        """Return W q (v, k) of q (owned or more, k)."""
+        points: Rows = self.weights @ self.to_owner.answer(q[self.asked])
+        return points
+
+    def to_nodes(self, forces: Rows) -> Rows:
+        """Return W^T f (owned, k) of f (v, k)."""
+        on_nodes: Rows = self.sums @ self.to_owner.send(self.weights.T @ forces)
+        return on_nodes
+
+
+class SurfacePart:
+    """Edges or triangles of a surface, with c corners, shared out to ranks. Calls are collective.
+
+    W is trilinear, whatever coordinates draw the surface. So the work of a load is that on the
+    cells themselves, and a uniform traction leaves a nearly uniform stress.
+
+    rest : (c, f, 3) [m] corners at rest
+    """
+
+    def __init__(self, finder: Finder, lattice: Lattice, corners: Sequence[Sequence[Positions]]):
+        """Share out faces on rank 0: for each corner, for each body (f, 3) [m]."""
+        parts = [embed(of, finder.cages, lattice.table, "trilinear") for of in corners]
+        self.corners = len(parts)
+        self.points = EmbeddedPoints(finder.comm, lattice, csr_array(vstack(parts)))
+        self.rest = self(lattice.nodes)
+
+    def __call__(self, q: Positions) -> Rows:
+        """Return the corners (c, f, 3) [m] of this rank's faces at q (owned or more, 3)."""
+        return self.points(q).reshape(self.corners, -1, 3)
+
+    def to_nodes(self, forces: Rows) -> Rows:
+        """Return the forces (owned, k) on nodes of forces (c, f, k), or (f, k) on each corner."""
+        f, k = forces.shape[-2:]
+        return self.points.to_nodes(np.broadcast_to(forces, (self.corners, f, k)).reshape(-1, k))
+
+    def areas(self) -> Rows:
+        """Return the area at rest (owned, 1) [m^2] that each node carries."""
+        return self.to_nodes(np.linalg.norm(doubled_areas(self.rest), axis=1)[:, None] / 6)
+
+
+def doubled_areas(corners: Rows) -> Rows:
+    """Return the normals (f, 3), twice the area long, of triangles (3, f, 3)."""
+    a, b, c = corners
+    normals: Rows = np.cross(b - a, c - a)
+    return normals
+
+
+def _refined(surface: Surface, longest: float) -> Surface:
+    """Return a surface whose triangles are halved along each edge until no edge is too long.
+
+    All triangles are halved alike, so that a closed surface stays closed. The points lie on the
+    surface at rest, so that the lattice carries the inside of a large triangle, too.
+
+    longest : [m]
+    """
+    points, triangles = surface.points, surface.triangles
+    while 0 < len(triangles) < MOST_TRIANGLES:
+        ends = np.roll(points[triangles], -1, axis=1)
+        if np.linalg.norm(ends - points[triangles], axis=2).max() <= longest:
+            break
+        points, triangles = trimesh.remesh.subdivide(  # type: ignore[no-untyped-call]
+            points, triangles
+        )
+    return Surface(points, np.asarray(triangles, np.int64))
+
+
+def _open_edges(surface: Surface) -> Rows:
+    """Return the ends (2, e, 3) [m] of edges whose opposite edge no triangle has."""
+    start = first_of_equal(surface.points)[surface.triangles]
+    end, size = np.roll(start, -1, axis=1), len(surface.points)
+    is_open = ~np.isin(start * size + end, end * size + start)
+    ends: Rows = surface.points[np.array([start[is_open], end[is_open]])]
+    return ends
+
+
+def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart:
+    """Return the triangles in the region of a scene's table, wound outwards (collective).
+
+    A region of space has the triangles whose centroids it contains.
+
+    Raises InputError on all ranks if the region has no triangle, or a pressure no potential.
+    """
+    comm, region = finder.comm, table.table.region
+    if region.group is not None:
+        groups = groups_named(finder.bodies, f"{table.key}.region", region.group, table.body)
+
+    def chosen(number: int) -> Surface:
+        surface = finder.bodies[number].surface
+        assert surface is not None
+        if region.group is not None:
+            surface = groups.get(number, NO_SURFACE)
+            where = np.ones(len(surface.triangles), bool)
+        else:
+            middles = surface.points[surface.triangles].mean(axis=1)
+            where = finder.inside(table, middles, np.full(len(middles), number))
+        inwards = finder.bodies[number].report.volume < 0
+        part = compact(surface.points, surface.triangles[where][:, :: -1 if inwards else 1])
+        return _refined(part, 0.5 * lattice.cell_size)
+
+    bodies = range(len(finder.bodies))
+    surfaces = on_root(comm, lambda: [*map(chosen, bodies)]) or [NO_SURFACE] * len(bodies)
+    if not comm.bcast(sum(len(surface.triangles) for surface in surfaces)):
+        raise InputError(
+            f"{table.key}.region holds the centre of no triangle of the surface"
+            f"{finder.extents(table)}"
+        )
+    corners = [[x.points[x.triangles[:, c]] for x in surfaces] for c in range(3)]
+    try:
+        part = SurfacePart(finder, lattice, corners)
+    except ValueError as error:
+        raise InputError(
+            f"{table.key}.region: its triangles leave the cells: mesh.prepare has changed the "
+            "surface, but not the group; give a box, a sphere or a half_space"
+        ) from error
+    if isinstance(table.table, Pressure):
+        ends = [_open_edges(surface) for surface in surfaces]
+        refuse_open(table, SurfacePart(finder, lattice, [*zip(*ends, strict=True)]), lattice)
+    return part
+
+
+def refuse_open(table: OfBody, edges: SurfacePart, lattice: Lattice) -> None:
+    """Raise InputError if the pressure on a part with open edges has no potential (collective).
+
+    It has a potential if the part is closed, or if its edge may move only along itself: in a
+    direction, or in the plane of a symmetry that contains the edge.
+    """
+    moves = (edges((~lattice.held).astype(float)) > 1e-9).any(axis=0)
+    along = np.abs(edges.rest[1] - edges.rest[0])
+    count = moves.sum(axis=1)
+    leaves = np.where(moves, 0.0, along).max(axis=1) > 1e-6 * along.max(axis=1)
+    # free in two directions: the edge must not leave their plane
+    is_bad = (count == 3) | ((count == 2) & leaves)
+    bad, of_all = lattice.table.comm.allreduce(np.array([is_bad.sum(), len(is_bad)]))
+    if bad:
+        raise InputError(
+            f"{table.key}.region: the surface in it is open ({of_all} edges, {bad} of them free "
+            "to move), and a pressure needs a closed one, or pins that hold its edge or keep it in "
+            "its plane; a traction may act on any"
+        )

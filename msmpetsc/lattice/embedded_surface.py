@@ -24,6 +24,8 @@ from msmpetsc.scene.schema import OfBody
 
 # triangles beyond which a surface is halved no more [-]; it bounds memory
 MOST_TRIANGLES = 1_000_000
+# distance outside the bounds of the body that is rounding [cells]
+EDGE = 1e-6
 NO_SURFACE = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
 
 
@@ -123,9 +125,14 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
 
     A region of space has the triangles whose centroids it contains.
 
-    Raises InputError on all ranks if the region has no triangle, or a pressure no potential.
+    Raises InputError on all ranks if the region has no triangle or leaves the cells, or if a
+    pressure has no potential.
     """
     comm, region = finder.comm, table.table.region
+    left = InputError(
+        f"{table.key}.region: its triangles leave the cells: mesh.prepare has changed the "
+        "surface, but not the group; give a box, a sphere or a half_space"
+    )
     if region.group is not None:
         groups = groups_named(finder.bodies, f"{table.key}.region", region.group, table.body)
 
@@ -140,6 +147,13 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
             where = finder.inside(table, middles, np.full(len(middles), number))
         inwards = finder.bodies[number].report.volume < 0
         part = compact(surface.points, surface.triangles[where][:, :: -1 if inwards else 1])
+        low, high = finder.bounds[number]
+        # The grid moves points outside it to its faces.
+        if (
+            np.maximum(low - part.points, part.points - high).max(initial=0)
+            > EDGE * lattice.cell_size
+        ):
+            raise left
         return _refined(part, 0.5 * lattice.cell_size)
 
     bodies = range(len(finder.bodies))
@@ -153,10 +167,7 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
     try:
         part = SurfacePart(finder, lattice, corners)
     except ValueError as error:
-        raise InputError(
-            f"{table.key}.region: its triangles leave the cells: mesh.prepare has changed the "
-            "surface, but not the group; give a box, a sphere or a half_space"
-        ) from error
+        raise left from error
     if isinstance(table.table, Pressure):
         ends = [_open_edges(surface) for surface in surfaces]
         refuse_open(table, SurfacePart(finder, lattice, [*zip(*ends, strict=True)]), lattice)

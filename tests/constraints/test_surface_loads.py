@@ -264,3 +264,9 @@ def test_a_group_has_its_own_triangles(tmp_path: Path):
     assert (ends[:, 0] == SIDES[0]).all()
     message = "traction.0.region.group: the mesh has no group 'and'"
     assert message in command_error("run", scene, "--set", 'traction.0.region.group="and"')
+    # a part that mesh.prepare drops
+    away = ["v 3 3 3", "v 3.1 3 3", "v 3 3.1 3", "g away", "f 9 10 11"]
+    (tmp_path / "grouped.obj").write_text("\n".join(lines + away))
+    prepared = 'mesh.prepare=["largest_part"]', 'traction.0.region.group="away"'
+    said = command_error("run", scene, "--set", prepared[0], "--set", prepared[1])
+    assert "traction.0.region: its triangles leave the cells" in said

@@ -70,7 +70,6 @@ EXTRAS = {
     "usd": ("pxr",),
     "repair": ("pymeshfix",),
     "cuda": ("cupy",),
-    "peers": ("newton",),
 }
 
 

@@ -1,6 +1,6 @@
-"""Bending and twist of cells: what must hold in any cell, and tables of scripts/cell_study.py."""
+"""Bending and twist of cells: what must hold in any cell, and errors of few cells."""
 
-import cell_study as study
+import few_cells as study
 import numpy as np
 import pytest
 from lattices import dense_hessian

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
-import material_study
 import numpy as np
 import pytest
-import solid_study as study
+import small_strain
+import solid_runs as study
 from scipy.optimize import brentq
 from skfem.models.elasticity import lame_parameters
 
@@ -49,7 +49,7 @@ def test_statics_find_one_state_wherever_a_bar_starts(poisson: float, start: str
 
 def textbook(F: np.ndarray, poisson: float) -> np.ndarray:
     """Return P = mu (F - F^-T) + lambda (J - 1) J F^-T [Pa]."""
-    lame, mu = lame_parameters(material_study.E, poisson)
+    lame, mu = lame_parameters(small_strain.E, poisson)
     J, inverse = np.linalg.det(F), np.linalg.inv(F).T
     return mu * (F - inverse) + lame * (J - 1) * J * inverse
 
@@ -77,7 +77,7 @@ def strains(poisson: float) -> Iterator[tuple[str, np.ndarray]]:
 def test_the_forces_are_the_textbooks(poisson: float):
     """P n on the faces of a block, half of it at edges, and nothing inside."""
     h, cells = 0.125, (4, 3, 2)
-    lattice = material_study.box(cells, h, poisson)
+    lattice = small_strain.box(cells, h, poisson)
     sides = h * np.array(cells)
     for name, F in strains(poisson):
         force, exact = np.zeros((2, *lattice.nodes.shape))

@@ -4,7 +4,7 @@ them."""
 from collections.abc import Iterator
 
 import numpy as np
-from material_study import DENSITY, E, hessian
+from small_strain import DENSITY, E, hessian
 
 from msmpetsc.lattice.lattice import Lattice
 

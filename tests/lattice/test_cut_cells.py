@@ -5,9 +5,9 @@ from functools import cache
 
 from lab import slope
 
-import material_study as study
 import numpy as np
 import pytest
+import small_strain as study
 import trimesh
 from strains import uniform_strains
 from surfaces import body_of

@@ -5,13 +5,13 @@ from functools import cache
 
 from lab import slope
 
-import material_study as study
 import numpy as np
 import pytest
 import skfem
-from material_study import ACROSS, BEAM, DENSITY, GRAVITY, NU, WIDTH, E, factorise, hessian
+import small_strain as study
 from scipy.spatial.transform import Rotation
 from skfem.models.elasticity import lame_parameters, linear_elasticity
+from small_strain import ACROSS, BEAM, DENSITY, GRAVITY, NU, WIDTH, E, factorise, hessian
 from strains import elastic_constant, uniform_strains
 
 from msmpetsc.elasticity.energy import Elasticity

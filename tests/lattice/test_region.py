@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import solid_study as study
+import solid_runs as study
 import trimesh
 from block_scene import CELL, block_scene
 from conftest import ROOT

@@ -1,5 +1,4 @@
-"""scripts/bench.py: how figures are made of runs, and a real run; bench_peers.py: what programs of
-others are given."""
+"""scripts/bench.py: how figures are made of runs, and a real run."""
 
 import sys
 from pathlib import Path
@@ -7,7 +6,6 @@ from pathlib import Path
 import lab
 
 import bench
-import bench_peers
 import numpy as np
 import pytest
 
@@ -60,25 +58,3 @@ def test_without_a_gpu_it_says_so(capsys: pytest.CaptureFixture, monkeypatch: py
     monkeypatch.setattr(sys, "argv", ["bench.py", "--gpu"])
     assert bench.main() == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory):
-    """A beam of 4 x 2 x 2 cells and three frames of it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench_peers, "FOLDER", tmp_path_factory.mktemp("bench_peers"))
-        yield bench_peers.set_up([4, 2, 2], 3)
-
-
-def test_the_beam_that_peers_get_is_that_of_the_run(small: bench_peers.Setup):
-    given = bench_peers.read_beam(small.reference)
-    assert len(given.nodes) == 5 * 3 * 3 and given.pinned.sum() == 9
-    assert given.corner.max(axis=0).tolist() == [4, 2, 2]
-    assert given.mass.sum() == pytest.approx(1000 * 16 * bench_peers.CELL**3)
-
-
-def test_the_error_of_verlet_s_trajectory_is_small(small: bench_peers.Setup):
-    verlet = next(case for case in bench_peers.CASES if case.method.startswith("Verlet"))
-    (row,) = bench_peers.rows([verlet], small)
-    assert 1e-7 < row["trajectory error"] < 1e-2 and row["step error"] is None
-    assert row["10%"] <= row["ms a frame"] <= row["90%"]

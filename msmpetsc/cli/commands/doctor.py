@@ -67,7 +67,7 @@ BRINGS = {
     "cupy": "pip install 'msmpetsc[cuda]'",
 }
 # extras for few machines, not reported if they are missing
-NO_INSTALL = {"cuda", "peers"}
+NO_INSTALL = {"cuda"}
 # requirements of every run
 NEEDED = {"PETSc", "MPI", "HDF5", "extra run"}
 

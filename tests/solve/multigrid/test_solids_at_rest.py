@@ -15,9 +15,8 @@ import msmpetsc
 from msmpetsc.build import build_model
 from msmpetsc.errors import InputError
 
-study = pytest.importorskip(
-    "solid_study"
-)  # scripts/solid_study.py, which needs scikit-fem and manifold3d
+# needs manifold3d
+study = pytest.importorskip("solid_runs")
 
 TOLERANCE = 3e-2  # -ksp_rtol of newton's presets
 STATIC = 1e3  # [s]: a step so long that mass counts for nothing

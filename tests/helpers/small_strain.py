@@ -1,20 +1,11 @@
-#!/usr/bin/env python3
-"""Compare both material laws with linear elasticity of Poisson's ratio 1/4.
+"""Bodies at small strain against elasticity: bars along the grid and askew, a wave, a ball.
 
-    scripts/material_study.py [beam wave round turned ball]
-
-Boxes along the grid: a clamped beam, and a wave in a bar. Other bodies: clamped bars, round and
-turned, and the frequency of a ball, each with whole boundary cells, with partly filled boundary
-cells, and as neo-Hookean solid. For bars the table gives the mean over offsets of the grid, and in
-brackets the range. Static problems and eigenfrequencies use the Hessian of E at rest; the wave uses
-the program's own steps. All errors are relative.
+Static problems and eigenfrequencies use the Hessian of E at rest; the wave uses the program's own
+steps. All errors are relative.
 """
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
-
-import lab
-from lab import percent, slope
 
 import numpy as np
 import trimesh
@@ -373,80 +364,3 @@ def ball_error(h: float, kind: str) -> tuple[int, float, float]:
     lattice = lattice_of(ball, h, *KINDS[kind], offset=(0.3, 0.7, 0.5))
     exact = root * np.sqrt(SHEAR / DENSITY) / RADIUS
     return len(lattice.cells), frequencies(lattice, 5).mean() / exact - 1, mass_error(lattice, ball)
-
-
-# ---- the tables
-
-
-def beam_rows(poisson: float | None) -> lab.Rows:
-    """Yield the errors of the beam for each number of cells across, and their orders."""
-    exact_sag = timoshenko_sag()
-    exact_frequency = timoshenko_frequency()
-    errors = []
-    for across in ACROSS:
-        sag, frequency = lattice_beam(across, poisson)
-        row = {"deflection": sag / exact_sag - 1, "frequency": frequency / exact_frequency - 1}
-        if poisson is SPRINGS:
-            row["expected"] = timoshenko_sag(across) / exact_sag - 1
-            row["expected frequency"] = timoshenko_frequency(across) / exact_frequency - 1
-        errors.append([*row.values()])
-        yield {"cells across": across} | {name: percent(x, 2) for name, x in row.items()}
-    slopes = (f"{slope(1 / np.array(ACROSS), error):.2f}" for error in np.transpose(errors))
-    yield {"cells across": "slope"} | dict(zip(row, slopes, strict=True))
-
-
-def wave_rows(poisson: float | None) -> lab.Rows:
-    """Yield the errors of the wave speed for each Courant number."""
-    for courant in (1 / 4, 1 / 8, 1 / 16):
-        centre, peak, height = wave_speeds(*struck_bar(courant, poisson))
-        speeds = {"centre": percent(centre, 4), "peak": percent(peak, 2)}
-        yield {"c t / h": courant} | speeds | {"height left": f"{height:.2f}"}
-
-
-def of_both(rows: Callable[[float | None], lab.Rows]) -> lab.Rows:
-    """Yield the rows of both laws."""
-    for name, poisson in LAWS.items():
-        yield from ({"law": name, **row} for row in rows(poisson))
-
-
-def bar_rows(mesh: trimesh.Trimesh, exact: float, sizes: tuple[float, ...]) -> lab.Rows:
-    """Yield the errors of a clamped bar for each cell size, and their orders."""
-    means = []
-    for size in sizes:
-        errors_of = {kind: bar_errors(mesh, exact, size * RADIUS, kind) for kind in KINDS}
-        means.append([errors_of[kind][1].mean() for kind in KINDS])
-        row: dict[str, object] = {"h / R": f"{size:.3f}", "cells": errors_of["fill"][0]}
-        for kind, (_, *errors) in errors_of.items():
-            texts = (f"{percent(error.mean())} ({100 * np.ptp(error):.1f})" for error in errors)
-            row |= dict(zip((f"{kind}: sag", f"{kind}: mass"), texts, strict=True))
-        yield row
-    slopes = (f"{slope(sizes, errors):.2f}" for errors in np.transpose(means))
-    yield {"h / R": "slope"} | dict(zip((f"{kind}: sag" for kind in KINDS), slopes, strict=True))
-
-
-def ball_rows() -> lab.Rows:
-    """Yield the errors of the ball for each cell size."""
-    for size in (0.4, 1 / 4, 1 / 6, 1 / 8):
-        errors_of = {kind: ball_error(size * RADIUS, kind) for kind in KINDS}
-        row: dict[str, object] = {"h / R": f"{size:.3f}", "cells": errors_of["fill"][0]}
-        for kind, (_, frequency, mass) in errors_of.items():
-            row |= {f"{kind}: frequency": percent(frequency), f"{kind}: mass": percent(mass)}
-        yield row
-
-
-TABLES: dict[str, Callable[[], lab.Rows]] = {
-    "beam": lambda: of_both(beam_rows),
-    "wave": lambda: of_both(wave_rows),
-    "round": lambda: bar_rows(round_bar(), ROUND_SAG, (2 / 3, 0.4, 1 / 3, 1 / 4, 1 / 6)),
-    "turned": lambda: bar_rows(turned_bar(), SQUARE_SAG, (0.5, 1 / 3, 1 / 4, 1 / 6)),
-    "ball": ball_rows,
-}
-
-
-def main() -> None:
-    """Print the tables that the command line names."""
-    lab.tables(__doc__, TABLES)
-
-
-if __name__ == "__main__":
-    main()

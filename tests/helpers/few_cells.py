@@ -1,22 +1,14 @@
-#!/usr/bin/env python3
-"""Compare bending and twist of few cells with theory and finite elements. Needs scikit-fem.
+"""Bending and twist of few cells at small strain, against theory and finite elements.
 
-    scripts/cell_study.py [torsion plate twist strip cantilever ...]
-
-Displacements are small: a table solves K u = f with the Hessian K at rest. An error is that of a
-stiffness in ``torsion`` and of a deflection elsewhere.
+A problem solves K u = f with the Hessian K at rest. An error is that of a stiffness in torsion, and
+of a deflection elsewhere.
 """
-
-from collections.abc import Callable
-
-import lab
-from lab import percent
 
 import numpy as np
 import skfem
 import trimesh
-from material_study import E, box, factorise, hessian, lattice_of
 from skfem.models.elasticity import lame_parameters, linear_elasticity
+from small_strain import E, box, factorise, hessian, lattice_of
 
 from msmpetsc.lattice.lattice import Lattice
 
@@ -74,13 +66,6 @@ def torsion_error(across: int, poisson: float) -> float:
     return 3 / (compliance[1] - compliance[0]) / (SQUARE * E / (2 * (1 + poisson))) - 1
 
 
-def torsion_rows() -> lab.Rows:
-    """Yield the errors of the torsional stiffness of a square bar."""
-    for poisson in POISSON:
-        errors = {f"{n} cells": percent(torsion_error(n, poisson)) for n in (2, 4, 8)}
-        yield {"Poisson's ratio": str(poisson)} | errors
-
-
 # ---- plates
 
 
@@ -111,15 +96,6 @@ def plate_error(through: int, poisson: float, clamp: bool, side: int = 20) -> fl
     return float(w / ((0.00126532 if clamp else 0.00406235) * side**4 / rigidity + shear) - 1)
 
 
-def plate_rows() -> lab.Rows:
-    """Yield the errors of a plate's deflection."""
-    for poisson in POISSON:
-        row: dict[str, object] = {"Poisson's ratio": str(poisson)}
-        for clamp, name in ((False, "supported"), (True, "clamped")):
-            row |= {f"{name}, {n} through": percent(plate_error(n, poisson, clamp)) for n in (1, 2)}
-        yield row
-
-
 def twist_error(through: int, poisson: float, side: int = 6) -> float:
     """Return the error of the twist of a plate of thickness 1 m whose edges twist it.
 
@@ -132,13 +108,6 @@ def twist_error(through: int, poisson: float, side: int = 6) -> float:
     u, forces = solve(lattice, np.repeat(edge[:, None], 3, axis=1), u, np.zeros_like(u))
     exact = E / (2 * (1 + poisson)) * 4 * side**2 / 12
     return float(exact / (u * forces).sum() - 1)
-
-
-def twist_rows() -> lab.Rows:
-    """Yield the errors of a plate's twist."""
-    for poisson in POISSON:
-        errors = {f"{n} through": percent(twist_error(n, poisson)) for n in (1, 2, 4)}
-        yield {"Poisson's ratio": str(poisson)} | errors
 
 
 # ---- beams
@@ -157,13 +126,6 @@ def strip_error(thickness: float, poisson: float, length: int = 20, width: int =
     lattice = lattice_of(mesh, 1.0, poisson=poisson, offset=(0, 0, (1 - thickness) / 2))
     tip = clamped(lattice, np.array([0.0, 0.0, 1.0]))
     return tip / beam(poisson, length, width, thickness) - 1
-
-
-def strip_rows() -> lab.Rows:
-    """Yield the errors of strips thinner than a cell, along the grid."""
-    for poisson in POISSON:
-        errors = {f"{t:g} cells": percent(strip_error(t, poisson)) for t in (1.0, 0.5, 0.25, 0.1)}
-        yield {"Poisson's ratio": str(poisson)} | errors
 
 
 def fem_tip(poisson: float) -> float:
@@ -188,34 +150,3 @@ def cantilever_error(across: int, poisson: float, exact: float | None = None) ->
     lattice = box((LENGTH * across, across, across), 1 / across, poisson)
     exact = exact or fem_tip(poisson)
     return clamped(lattice, np.array([0.0, 0.0, 1.0])) / exact - 1
-
-
-def cantilever_rows() -> lab.Rows:
-    """Yield the errors of a square cantilever."""
-    for poisson in POISSON:
-        exact = fem_tip(poisson)
-        row: dict[str, object] = {
-            "Poisson's ratio": str(poisson),
-            "hexahedra over Timoshenko": percent(exact / beam(poisson, LENGTH, 1, 1) - 1, 2),
-        }
-        yield row | {
-            f"{n} cells": percent(cantilever_error(n, poisson, exact), 2) for n in (1, 2, 4)
-        }
-
-
-TABLES: dict[str, Callable[[], lab.Rows]] = {
-    "torsion": torsion_rows,
-    "plate": plate_rows,
-    "twist": twist_rows,
-    "strip": strip_rows,
-    "cantilever": cantilever_rows,
-}
-
-
-def main() -> None:
-    """Print the tables that the command line names."""
-    lab.tables(__doc__, TABLES)
-
-
-if __name__ == "__main__":
-    main()

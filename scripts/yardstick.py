@@ -1,0 +1,348 @@
+#!/usr/bin/env python3
+"""Hold runs of scenes against published values: a table, a chart.
+
+    scripts/yardstick.py [--fast] [WORD ...] | tee scripts/results/yardstick.md
+
+The cases stand in scenes/studies/yardstick/cases.toml, each with a scene beside it. A WORD chooses
+the cases whose names contain it. --fast runs the coarse sizes of each, which the tests run.
+Seconds are of the steps of a run, without its set-up.
+"""
+
+import math
+import sys
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import lab
+
+import numpy as np
+from mpi4py import MPI
+
+import msmpetsc
+from msmpetsc.app.modes import find_modes
+from msmpetsc.app.request import RunRequest
+from msmpetsc.build import build_model
+from msmpetsc.fields import FRAME_FIELDS
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.scene.reading import Scene
+
+FOLDER = lab.SCENES / "studies" / "yardstick"
+# |error| shown as "exact", that of the solver in most cases [-]
+EXACT = 1e-6
+# cells that give the stress at a place: their distance less the degree [cells], their
+# fill over the largest [-]; least singular value of the fit [-]
+NEAR, WHOLE, FIT = 2.0, 0.99, 1e-9
+INTRODUCTION = """
+Values, errors and costs stand from coarse to fine. An error is relative, *exact* below 1e-6. The
+order is observed: by the differences of three sizes, or the errors of two. Seconds are of the steps
+on one core, without set-up. Products are with the Hessian.
+
+![Errors over seconds and over cells](../../scenes/studies/yardstick/yardstick.png)"""
+
+
+@dataclass(frozen=True)
+class Value:
+    """A quantity of a case.
+
+    ours      : Python expression of the names that ``names_of`` returns
+    reference : number, or Python expression of the case's constants
+    within    : largest |error| of the finest fast size; the tests assert it
+    note      : cause of a deviation over 2% at the finest size
+    """
+
+    name: str
+    ours: str
+    reference: float | str
+    within: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another program's published values of a case's first quantity, by numbers of cells."""
+
+    name: str
+    cells: Sequence[float]
+    values: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A published problem.
+
+    scene   : name of the scene beside the table
+    setup   : the problem in a line; source: where a reader finds the reference
+    theory  : why the values are ``within``
+    sizes   : numbers n of cells across, or of steps; ``fast``: how many of them the fast half runs
+    keys    : changes of the scene; a text is a Python expression of n
+    let     : constants, numbers or Python expressions, for ``reference`` and ``ours``
+    own     : the reference is of our own finite elements, not public
+    modes   : number of modes, of a scene that is not stepped
+    """
+
+    name: str
+    scene: str
+    setup: str
+    source: str
+    theory: str
+    sizes: Sequence[float]
+    keys: dict[str, Any]
+    value: Sequence[Value]
+    fast: int = 1
+    let: dict[str, float | str] = field(default_factory=dict)
+    modes: int = 0
+    own: bool = False
+    peer: Sequence[Peer] = ()
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Constants by name."""
+        names: dict[str, Any] = dict(vars(math))
+        for name, text in self.let.items():
+            names[name] = evaluated(text, names)
+        return names
+
+    def reference(self, value: Value) -> float:
+        """Return the reference of a value."""
+        return float(evaluated(value.reference, self.constants))
+
+    def error(self, value: Value, ours: float) -> float:
+        """Return the relative error of a value."""
+        return (ours - self.reference(value)) / abs(self.reference(value))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of a case: its size, costs, and a number for each value."""
+
+    size: float
+    cells: int
+    seconds: float
+    products: int
+    ours: Sequence[float]
+
+
+def cases() -> list[Case]:
+    """Return all cases."""
+    tables = tomllib.loads((FOLDER / "cases.toml").read_text())["case"]
+    return [
+        Case(
+            **table
+            | {"value": [Value(**row) for row in table["value"]]}
+            | {"peer": [Peer(**row) for row in table.get("peer", ())]}
+        )
+        for table in tables
+    ]
+
+
+def evaluated(text: float | str | Sequence[Any], names: dict[str, Any]) -> Any:
+    """Return the value of a Python expression; return anything but a text as it is."""
+    # the table is a file of this tree, as this script is
+    return eval(text, dict(names)) if isinstance(text, str) else text
+
+
+# ---- runs
+
+
+def measured(case: Case, size: float) -> Run:
+    """Run a case at a size."""
+    keys = {key: evaluated(text, case.constants | {"n": size}) for key, text in case.keys.items()}
+    print(case.name, keys, file=sys.stderr, flush=True)
+    file = FOLDER / f"{case.scene}.toml"
+    scene = Scene.load(file, keys)
+    names = case.constants
+    if case.modes:
+        begin = perf_counter()
+        modes = find_modes(MPI.COMM_SELF, RunRequest(file, set=keys), case.modes)
+        seconds, products = perf_counter() - begin, 0
+        lattice = build_model(MPI.COMM_SELF, scene).lattice
+        names |= {"frequencies": modes.frequencies, "np": np}
+    else:
+        simulation = msmpetsc.Simulation(scene)
+        frames = list(simulation.frames())
+        assert simulation.model is not None
+        lattice = simulation.model.lattice
+        seconds = sum(frame.wall_time for frame in frames)
+        products = sum(frame.products for frame in frames)
+        names |= vars(lattice) | names_of(scene, frames, lattice)
+    ours = [float(evaluated(value.ours, names)) for value in case.value]
+    return Run(size, len(lattice.cells), seconds, products, ours)
+
+
+def names_of(scene: Scene, frames: list[msmpetsc.Frame], lattice: Lattice) -> dict[str, Any]:
+    """Return names for expressions: fields of all frames (T, ...), and functions.
+
+    at(probe)     : its positions (T, 3) [m]
+    moved(probe)  : its displacements (T, 3) [m] from the start
+    peaks(y)      : times and heights (k, 2) of the local maxima of y (T,)
+    stress_at(*x) : stress (6,) [Pa] of the last frame at a place at rest, by a fit of a degree
+    """
+    fields = {
+        name: np.array([getattr(frame, name) for frame in frames])
+        for name in FRAME_FIELDS
+        if getattr(frames[-1], name) is not None
+    }
+    probes = [probe.name for probe in scene.output.probe]
+
+    def at(name: str) -> np.ndarray:
+        return fields["probe"][:, probes.index(name)]
+
+    def moved(name: str) -> np.ndarray:
+        return at(name) - at(name)[0]
+
+    def peaks(y: np.ndarray) -> np.ndarray:
+        return np.array([*maxima(fields["time"], y)]).reshape(-1, 2)
+
+    def stress_at(*place: float, degree: int = 1) -> np.ndarray:
+        # a polynomial through the stresses of whole cells near the place
+        x = (lattice.nodes[lattice.cells].mean(axis=1) - place) / lattice.cell_size
+        near = np.linalg.norm(x, axis=1) < NEAR + degree
+        near &= lattice.cell_fill > WHOLE * lattice.cell_fill.max()
+        ones = np.column_stack([np.ones(len(x)), x])[near]
+        terms = [ones[:, i] * ones[:, j] for i in range(4) for j in range(i, 4)]
+        basis = ones if degree == 1 else np.column_stack(terms)
+        return np.linalg.lstsq(basis, fields["cell_stress"][-1][near], rcond=FIT)[0][0]
+
+    functions = {"at": at, "moved": moved, "peaks": peaks, "stress_at": stress_at}
+    return fields | functions | {"np": np, "norm": np.linalg.norm}
+
+
+def maxima(t: np.ndarray, y: np.ndarray) -> Iterator[tuple[float, float]]:
+    """Yield times and heights of local maxima, vertices of parabolas."""
+    for k in 1 + np.flatnonzero((y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:])):
+        a, b, c = np.polyfit(t[k - 1 : k + 2] - t[k], y[k - 1 : k + 2], 2)
+        yield t[k] - b / (2 * a), c - b**2 / (4 * a)
+
+
+def order(case: Case, value: Value, runs: Sequence[Run]) -> float | None:
+    """Return the observed order of convergence, None if there is none.
+
+    Three sizes in a geometric row give it by their differences, two by their errors.
+    """
+    k = case.value.index(value)
+    numbers = [run.ours[k] for run in runs[-3:]]
+    if len(runs) > 2:
+        coarse, fine = (b - a for a, b in pairwise(numbers))
+    elif len(runs) == 2:
+        coarse, fine = (case.error(value, x) for x in numbers)
+    else:
+        return None
+    if coarse * fine <= 0 or abs(fine) >= abs(coarse) or abs(fine) < EXACT * abs(numbers[-1]):
+        return None
+    return math.log(coarse / fine) / math.log(runs[-1].size / runs[-2].size)
+
+
+# ---- table, notes, chart
+
+
+def shown(numbers: Sequence[float], digits: int = 4) -> str:
+    """Return numbers from coarse to fine in a cell of the table."""
+    return " · ".join(f"{x:,}" if isinstance(x, int) else f"{x:.{digits}g}" for x in numbers)
+
+
+def error_shown(error: float) -> str:
+    """Return an error in percent."""
+    return "exact" if abs(error) < EXACT else f"{100 * error:+.2g}%"
+
+
+def rows(number: int, case: Case, runs: Sequence[Run]) -> lab.Rows:
+    """Yield a row for each value of a case."""
+    for k, value in enumerate(case.value):
+        errors = [case.error(value, run.ours[k]) for run in runs]
+        p = order(case, value, runs)
+        yield {
+            "": f"{number}",
+            "case": "" if k else case.name,
+            "quantity": value.name,
+            "reference": f"{case.reference(value):.5g}",
+            "ours": shown([run.ours[k] for run in runs]),
+            "error": " · ".join(map(error_shown, errors)),
+            "order": "" if p is None else f"{p:.1f}",
+            "cells": "" if k else shown([run.cells for run in runs]),
+            "seconds": "" if k else shown([run.seconds for run in runs], 2),
+            "products": "" if k else shown([run.products for run in runs]),
+        }
+
+
+def notes(number: int, case: Case) -> Iterator[str]:
+    """Yield the set-up of a case, its source and the causes of deviations."""
+    scene = f"../../scenes/studies/yardstick/{case.scene}.toml"
+    yield f"{number}. **{case.name}** ([scene]({scene})). {case.setup} *Reference:* {case.source}"
+    within = " and ".join(sorted({f"{100 * value.within:.2g}%" for value in case.value}))
+    yield f"    *Bound at {case.sizes[case.fast - 1]}:* {within}. {case.theory}"
+    for value in case.value:
+        if value.note:
+            yield f"    *Deviation of {value.name}:* {value.note}"
+
+
+def chart(found: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
+    """Draw errors over seconds, and over cells beside the peers' published values."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, (time, size) = pyplot.subplots(1, 2, figsize=(12, 6), layout="constrained")
+    colours = pyplot.get_cmap("tab20")(range(20))
+    for number, (case, runs) in enumerate(found.values(), 1):
+        values = [zip(case.value, run.ours, strict=True) for run in runs]
+        errors = [max(EXACT, *(abs(case.error(*pair)) for pair in pairs)) for pairs in values]
+        style: dict[str, Any] = {"color": colours[number % 20], "marker": "o", "ms": 4}
+        time.loglog([max(run.seconds, 1e-3) for run in runs], errors, **style)
+        time.annotate(f"{number}", (max(runs[-1].seconds, 1e-3), errors[-1]), fontsize=8)
+        if not case.peer:
+            continue
+        ours = [abs(case.error(case.value[0], run.ours[0])) for run in runs]
+        size.loglog([run.cells for run in runs], ours, **style, label=f"{case.name}: ours")
+        for mark, peer in zip("sv^D*Pxd", case.peer, strict=False):
+            theirs = [max(abs(case.error(case.value[0], x)), EXACT) for x in peer.values]
+            style = {"color": colours[number % 20], "marker": mark, "ms": 4, "ls": ":"}
+            size.loglog(peer.cells, theirs, **style, label=f"{case.name}: {peer.name}")
+    time.set(
+        xlabel="seconds of the steps", ylabel="largest relative error of a case, by its number"
+    )
+    size.set(xlabel="cells", ylabel="relative error")
+    if size.has_data():
+        size.legend(fontsize=7)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    """Print the table and draw the chart."""
+    parser = lab.parser(__doc__)
+    parser.add_argument("words", nargs="*", metavar="WORD", help="run cases whose names contain it")
+    parser.add_argument("--fast", action="store_true", help="run the coarse sizes only")
+    parser.add_argument("--chart", type=Path, default=FOLDER / "yardstick.png", help="a PNG file")
+    args = parser.parse_args()
+    lab.heading()
+    found: dict[str, tuple[Case, list[Run]]] = {}
+
+    def all_rows(chosen: Sequence[Case]) -> lab.Rows:
+        for case in chosen:
+            sizes = case.sizes[: case.fast] if args.fast else case.sizes
+            runs = [measured(case, size) for size in sizes]
+            found[case.name] = case, runs
+            yield from rows(len(found), case, runs)
+
+    print(INTRODUCTION)
+    everything = [
+        case for case in cases() if not args.words or any(word in case.name for word in args.words)
+    ]
+    titles = {False: "Against published values", True: "Against our own finite elements"}
+    for own, title in titles.items():
+        if chosen := [case for case in everything if case.own is own]:
+            print(f"\n## {title}")
+            lab.table(all_rows(chosen))
+    print("\n## Set-ups, sources, deviations\n")
+    for number, (case, _) in enumerate(found.values(), 1):
+        print("\n".join(notes(number, case)))
+    chart(found, args.chart)
+
+
+if __name__ == "__main__":
+    main()

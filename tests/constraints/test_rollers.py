@@ -223,3 +223,15 @@ def test_the_matrix_of_whole_nodes_is_refused(tmp_path: Path):
     scene = block_scene(tmp_path, pin=[roller(0)], time={"step": 0.01, "duration": 0.01})
     said = command_error("run", scene, "--set", 'solver.preset="fast-msm"')
     assert "pin.0.fix: single components need one of newton's presets, not fast-msm" in said
+
+
+def test_a_plane_strain_body_on_rollers_alone_comes_to_rest_at_once(tmp_path: Path):
+    """A translation along z, which is held everywhere, is no mode without stiffness."""
+    press = {"region": {"box": [[0.5 - EPS, -9, -9], [9, 9, 9]]}, "value": [-2e4, 0.0, 0.0]}
+    path = block_scene(
+        tmp_path, SIDES,
+        pin=[roller(2, 9.0), roller(0), roller(1)], traction=[press], material=SOLID,
+        time={"integrator": "static"}, solver={"error": 1e-6},
+    )  # fmt: skip
+    _, frames = play(path)
+    assert frames[-1].iterations < 20 and frames[-1].ksp_its < 200

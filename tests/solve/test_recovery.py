@@ -168,13 +168,10 @@ def test_a_nearly_flat_body_comes_back_to_its_rest_shape_or_the_mirror_image():
 # ---- bodies that hang
 
 
-@pytest.mark.parametrize(
-    "name", ["beam", "light half", "stiff half", "one cell", "sheet", "by a node", "by an edge"]
-)
+@pytest.mark.parametrize("name", ["beam", "light half", "stiff half", "one cell", "sheet"])
 def test_it_hangs_at_rest(name: str):
     played = play(name)
-    # the one cell that two blocks share along an edge is cut: the joint is soft and swings longer
-    assert played.last.kinetic < (0.1 if name == "by an edge" else 0.03) * played.last.elastic
+    assert played.last.kinetic < 0.03 * played.last.elastic
     assert played.inverted(played.last) == 0
     far = played.lattice.nodes[:, 0] == played.lattice.nodes[:, 0].max()
     assert played.moved[far, 2].max() < -1e-3

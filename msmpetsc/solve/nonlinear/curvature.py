@@ -228,9 +228,9 @@ class LowestCurvature:
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].
 
-        They are orthonormal in M. Return None if nodes are fixed.
+        They are orthonormal in M. Return None if nodes or components are held.
         """
-        if self.unknowns.total < self.functional.lattice.table.total:
+        if self.unknowns.is_held:
             return None
         columns = q[self.unknowns.free].T
         motions = np.zeros((6, *columns.shape), like=columns)

@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import ForceFunction
-from msmpetsc.lattice.embedded_surface import SurfacePart
 from msmpetsc.scene.motion import ForceTable, Pose
 from msmpetsc.scene.values import Vector
 
+# for type checkers only: pictures need this file, and no MPI or trimesh
 if TYPE_CHECKING:
     from mpi4py import MPI
+
+    from msmpetsc.lattice.embedded_surface import SurfacePart
 
 # relative tolerance of times [-]; a multiple of the time step may be rounded down
 SAME_TIME = 1e-12
@@ -195,7 +197,7 @@ class Load(Varying):
 class Pressure(Varying):
     """A pressure [Pa] on a part of the surface, positive if it pushes into the body."""
 
-    part: SurfacePart
+    part: "SurfacePart"
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ def drawable_of(points: np.ndarray, triangles: np.ndarray) -> Drawable:
         name="x.h5",
         scene=SceneFile.model_validate(toml_of(BARE)),
         rest=BodiesAtRest(points, np.array([[*ends, 0, 0]]), points, body, body),
-        held=np.zeros((len(points), 3), bool),
+        pinned=np.zeros(len(points), bool),
         triangles=triangles,
         times=np.zeros(1),
         nodes=lambda _: points,

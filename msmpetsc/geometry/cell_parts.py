@@ -131,25 +131,9 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     axes   : (3,) cycled axes of the search for the cut cells (geometry.cages)
     volume : the surface's volume [m^3]; negative if its triangles are wound inwards
     """
-    at = grid.to_cells(surface.points)
-    corners = at[surface.triangles] if volume > 0 else at[surface.triangles[:, ::-1]]
-    limits = np.zeros(3, np.int64), grid.shape[axes]
-
-    def touched(triangles: Rows) -> tuple[Indices, Indices]:
-        return touched_cells(np.ascontiguousarray(triangles[..., axes]), *limits)
-
-    of_row, triangle = touched(corners)
-    cycled, cell = np.unique(of_row, return_inverse=True)
-    back = packed(unpacked(cycled)[:, np.argsort(axes)])
-    order = np.argsort(back)
-    keys, cell = back[order], np.argsort(order)[cell]
+    keys, codes, flush, ends, corners = _rows_in_cells(surface, grid, axes, volume)
     size = len(corners)
-    codes = np.unique(cell * size + triangle)
     cell, triangle = codes // size, codes % size
-    flush = _flush(corners, triangle, keys, cell)
-    in_cell, one, other = _edges_in_cells(surface, at, touched)
-    number = np.append(np.argsort(order), -1)[_find(cycled, in_cell)]
-    ends = _ends_of_edges(codes, size, number, one, other)
     piece, pieces = _pieces(cell, len(keys), ends[:, flush[ends[0]] == flush[ends[1]]])
     several = np.flatnonzero(pieces > 1)
     own, first_piece = _rows_of(cell, several), np.cumsum(pieces) - pieces
@@ -173,6 +157,41 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     of_several = np.searchsorted(several, cell[own])
     points = PartsOfPoints(surface, keys[several], of_several, triangle[own], part[own])
     return CellParts(keys, count, links, sides.masks(), apart, split.shares, split.spread, points)
+
+
+def _rows_in_cells(
+    surface: Surface, grid: Grid, axes: Indices, volume: float
+) -> tuple[Indices, Indices, Array, Indices, Rows]:
+    """Return the rows of a cell and a triangle that touch; arguments are those of ``parts_of``.
+
+    The result is
+
+    - the packed grid indices (b,) of the cells, ascending,
+    - the codes (r,) of the rows, cell number times number of triangles plus triangle, ascending,
+    - the bits (r,) of ``_flush``,
+    - the pairs of rows (2, e) that mesh edges in a cell join,
+    - the triangles (f, 3, 3), wound outwards.
+    """
+    at = grid.to_cells(surface.points)
+    corners = at[surface.triangles] if volume > 0 else at[surface.triangles[:, ::-1]]
+    limits = np.zeros(3, np.int64), grid.shape[axes]
+
+    def touched(triangles: Rows) -> tuple[Indices, Indices]:
+        return touched_cells(np.ascontiguousarray(triangles[..., axes]), *limits)
+
+    of_row, triangle = touched(corners)
+    cycled, cell = np.unique(of_row, return_inverse=True)
+    back = packed(unpacked(cycled)[:, np.argsort(axes)])
+    order = np.argsort(back)
+    keys, cell = back[order], np.argsort(order)[cell]
+    size = len(corners)
+    codes = np.unique(cell * size + triangle)
+    cell, triangle = codes // size, codes % size
+    flush = _flush(corners, triangle, keys, cell)
+    in_cell, one, other = _edges_in_cells(surface, at, touched)
+    number = np.append(np.argsort(order), -1)[_find(cycled, in_cell)]
+    ends = _ends_of_edges(codes, size, number, one, other)
+    return keys, codes, flush, ends, corners
 
 
 def _find(keys: Indices, wanted: Indices) -> Indices:

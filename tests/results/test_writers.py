@@ -193,7 +193,6 @@ BY_HAND = re.compile(
 ALLOWED = {
     "results/disk.py": "the one way",
     "results/writer.py": "a result, which grows",
-    "app/exported_systems.py": "PETSc writes binary files itself",
     "app/summary.py": "asks before a run whether it could write",
     "export/formats.py": "under the name that the one way gave",
     "backend/kernel_cache.py": "a cache",

@@ -45,8 +45,13 @@ def _refined(subject: Drawable) -> Drawable:
         rest.points, subject.triangles, max(cell, np.sqrt(2 * area / MAX_TRIANGLES))
     )
     body = np.append(rest.body_of_point, np.empty(len(points) - len(rest.points), int))
-    body[triangles] = body[subject.triangles[part_of, :1]]
-    T = trilinear(rest, points[len(rest.points) :], body[len(rest.points) :])
+    given = subject.triangles[part_of]
+    body[triangles] = body[given[:, :1]]
+    # a given triangle at each point
+    around = np.zeros((len(points), 3), int)
+    around[triangles] = given[:, None]
+    new = slice(len(rest.points), None)
+    T = trilinear(rest, points[new], body[new], (around[new], subject.embedding))
     return replace(
         subject,
         rest=replace(rest, points=points, body_of_point=body),
@@ -75,15 +80,42 @@ def subdivided(
     return fine.points, fine.regular_faces, fine.cell_data["part of"]
 
 
-def trilinear(rest: BodiesAtRest, points: Positions, body: Indices) -> csr_array:
-    """Return the matrix (p, n) of trilinear weights of nodes at points (p, 3) of bodies (p,)."""
-    corners = rest.cells[rest.cells_around(points, body)]
+def trilinear(
+    rest: BodiesAtRest,
+    points: Positions,
+    body: Indices,
+    carried: tuple[Indices, csr_array] | None = None,
+) -> csr_array:
+    """Return the matrix (p, n) of trilinear weights of nodes at points (p, 3) of bodies (p,).
+
+    carried : surface points (p, k) beside each point, and the embedding of the surface points; of
+              several copies of a cell, the copy counts that shares the most nodes with theirs
+    """
+    cells = rest.cells_around(points, body)
+    if carried is not None:
+        _choose_copies(rest, cells, *carried)
+    corners = rest.cells[cells]
     low = rest.nodes[corners[:, 0]]
     high = rest.nodes[corners[:, 6]]
     u = np.clip((points - low) / (high - low), 0, 1)[:, None]
     weights = np.where(CORNERS, u, 1 - u).prod(axis=2)
     starts = 8 * np.arange(len(points) + 1)
     return csr_array((weights.ravel(), corners.ravel(), starts), (len(points), len(rest.nodes)))
+
+
+def _choose_copies(
+    rest: BodiesAtRest, cells: Indices, beside: Indices, embedding: csr_array
+) -> None:
+    """Replace cells (p,) by the copies at their places that carry the points ``beside`` (p, k)."""
+    order = np.lexsort(rest.middles.T)
+    is_copy = (np.diff(rest.middles[order], axis=0) == 0).all(axis=1)
+    place = np.empty(len(order), int)
+    place[order] = np.append(0, np.cumsum(~is_copy))
+    copies = np.bincount(place)[place] > 1
+    for row in np.flatnonzero(copies[cells]):
+        found = np.flatnonzero(place == place[cells[row]])
+        nodes = embedding[beside[row]].indices
+        cells[row] = found[np.isin(rest.cells[found], nodes).sum(axis=1).argmax()]
 
 
 def _split(subject: Drawable) -> Drawable:

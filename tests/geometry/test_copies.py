@@ -17,12 +17,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from surfaces import body_of
 
+from msmpetsc import open as open_result
 from msmpetsc.geometry.cages import Cages, fill
 from msmpetsc.geometry.copies import Copies
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.lattice.topology import Topology, topology_of
+from msmpetsc.view.drawable import drawable_of_result
+from msmpetsc.view.mesh import drawn
 
 H = 0.1
 LENGTH, BASE, WIDTH, DEPTH = 20, 4, 5, 2  # of the fork [cells]; its slit runs along x
@@ -267,6 +270,19 @@ def test_two_free_forks_move_as_each_alone(tmp_path: Path):
     (two, _), (one, nodes) = ends
     np.testing.assert_allclose(two[:nodes], one, atol=1e-7)
     np.testing.assert_allclose(two[nodes:], one, atol=1e-7)
+
+
+def test_the_surface_drawn_follows_its_own_part(tmp_path: Path):
+    """Triangles longer than a cell are divided; their new points are on their own prong, too."""
+    path = pulled(tmp_path, fork(0.4), *TIPS)
+    with result_on(1, path) as run:
+        name = run.filename
+    subject = drawn(drawable_of_result(open_result(name)))
+    assert len(subject.rest.points) > len(fork(0.4).vertices)
+    points = subject.rest.points
+    far = points[:, 0] > (BASE + 4) * H
+    aside = (subject.embedding @ (subject.nodes(1) - subject.rest.nodes))[far, 1]
+    np.testing.assert_array_equal(np.sign(aside), np.sign(points[far, 1] - WIDTH * H / 2))
 
 
 def sheet_opening(folder: Path, gap: float) -> float:

@@ -19,11 +19,11 @@ def test_a_cantilever_two_cells_thick_bends_as_timoshenkos(poisson: float):
     assert study.sag_error(2, poisson) == pytest.approx(0, abs=0.05)
 
 
-@pytest.mark.parametrize(("poisson", "iterations"), [(0.25, 30), (0.49, 50), (0.4999, 70)])
+@pytest.mark.parametrize(("poisson", "iterations"), [(0.25, 35), (0.49, 50), (0.4999, 70)])
 def test_an_elastica_two_cells_thick_ends_where_it_should(poisson: float, iterations: int):
     """P L^2 / (E I) = 5: the tip is 0.71379 L down, 0.38763 L back; springs are 9% of the length
     off. All at once: without softer solids that lead on, the second takes 64 and the third
-    1,108."""
+    1,108. The first takes 28 to 30, by the rounding of freshly compiled or stored kernels."""
     of = study.elastica(2, poisson)
     back, _, down = -of.moved(study.LENGTH) / study.LENGTH
     assert np.hypot(down - study.DOWN, back - study.BACK) < 0.015 and of.iterations < iterations

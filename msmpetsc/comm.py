@@ -114,6 +114,14 @@ def starts(counts: Indices) -> Indices:
     return (np.cumsum(counts) - counts).astype(np.int64)
 
 
+def places_of(keys: Indices, wanted: Indices) -> Indices:
+    """Return the place (...,) of each wanted key in ascending keys, -1 if it is not there."""
+    if len(keys) == 0:
+        return np.full(np.shape(wanted), -1)
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[place] == wanted, place, -1)
+
+
 # keys sampled on each rank to choose the splitters; parts then differ by some percent
 SAMPLES = 128
 
@@ -179,7 +187,5 @@ class SortedKeys:
         return np.concatenate([rows, to_owner.answer(rows[wanted])])
 
     def _index(self, keys: Indices) -> Indices:
-        if len(self.keys) == 0:
-            return np.full(len(keys), -1, np.int64)
-        slot = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
-        return np.where(self.keys[slot] == keys, self.first + slot, -1)
+        place = places_of(self.keys, keys)
+        return np.where(place >= 0, self.first + place, -1)

@@ -27,6 +27,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
+from msmpetsc.comm import places_of
 from msmpetsc.geometry.grid import Grid, packed, unpacked
 from msmpetsc.geometry.lines_in_cells import LINES, split_cell
 from msmpetsc.geometry.morton import COPIES
@@ -75,7 +76,7 @@ class PartsOfPoints:
         """
         import igl
 
-        cell = _find(self.keys, packed(ijk))
+        cell = places_of(self.keys, packed(ijk))
         part = np.zeros(len(points), np.int64)
         for number in np.unique(cell[cell >= 0]):
             own = cell == number
@@ -122,7 +123,7 @@ class CellParts:
 
     def find(self, ijk: Indices) -> Indices:
         """Return the number (...,) of each cut cell (..., 3), -1 for another cell."""
-        return _find(self.keys, packed(ijk))
+        return places_of(self.keys, packed(ijk))
 
 
 def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> CellParts:
@@ -189,17 +190,9 @@ def _rows_in_cells(
     cell, triangle = codes // size, codes % size
     flush = _flush(corners, triangle, keys, cell)
     in_cell, one, other = _edges_in_cells(surface, at, touched)
-    number = np.append(np.argsort(order), -1)[_find(cycled, in_cell)]
+    number = np.append(np.argsort(order), -1)[places_of(cycled, in_cell)]
     ends = _ends_of_edges(codes, size, number, one, other)
     return keys, codes, flush, ends, corners
-
-
-def _find(keys: Indices, wanted: Indices) -> Indices:
-    """Return the place (...,) of each wanted key in ascending keys, -1 if it is not there."""
-    if len(keys) == 0:
-        return np.full(np.shape(wanted), -1)
-    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[place] == wanted, place, -1)
 
 
 def ranges(first: Indices, length: Indices) -> Indices:
@@ -255,7 +248,7 @@ def _ends_of_edges(
     number     : (e,) number of the cell, -1 if there is none
     one, other : (e,) triangles at the edge
     """
-    ends = np.stack([_find(codes, number * size + triangle) for triangle in (one, other)])
+    ends = np.stack([places_of(codes, number * size + triangle) for triangle in (one, other)])
     return ends[:, (number >= 0) & (ends >= 0).all(axis=0)]
 
 
@@ -285,8 +278,8 @@ def _crossing_rows(
     ijk, cell, triangle = unpacked(keys), codes // size, codes % size
     crossing = []
     for axis, step in enumerate(np.eye(3, dtype=np.int64)):
-        beyond = _find(keys, packed(ijk + step))
-        other = np.where(beyond[cell] >= 0, _find(codes, beyond[cell] * size + triangle), -1)
+        beyond = places_of(keys, packed(ijk + step))
+        other = np.where(beyond[cell] >= 0, places_of(codes, beyond[cell] * size + triangle), -1)
         low = np.flatnonzero(other >= 0)
         below = np.full(len(codes), -1)
         below[other[low]] = low
@@ -331,7 +324,7 @@ def _links(
     crossing : for each axis, the rows of ``_crossing_rows``
     """
     ijk, masks, steps = unpacked(keys), sides.masks(), np.eye(3, dtype=np.int64)
-    beyond = np.stack([_find(keys, packed(ijk + step)) for step in steps])
+    beyond = np.stack([places_of(keys, packed(ijk + step)) for step in steps])
     # rows of pieces that bound parts
     bounding = [rows[:, (part[rows] >= 0).all(axis=0)] for rows in crossing]
     # a point of an uncrossed face tells whether two cells of a single part meet

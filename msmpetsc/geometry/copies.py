@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Array, Indices, Mask
-from msmpetsc.comm import SortedKeys
+from msmpetsc.comm import SortedKeys, places_of
 from msmpetsc.geometry.cell_parts import CellParts
 from msmpetsc.geometry.grid import CORNERS, BodyGrids, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
@@ -48,10 +48,7 @@ class Copies:
 
     def place(self, keys: Indices) -> Indices:
         """Return the row (...,) of each cell, -1 for an ordinary cell."""
-        if len(self.keys) == 0:
-            return np.full(np.shape(keys), -1)
-        row = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
-        return np.where(self.keys[row] == keys, row, -1)
+        return places_of(self.keys, keys)
 
     def corner_keys(self, keys: Indices, ijk: Indices) -> Indices:
         """Return the keys (..., 8) of the corner nodes of cells (...,) at ``ijk`` (..., 3)."""

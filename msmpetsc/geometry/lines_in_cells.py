@@ -13,6 +13,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
+from msmpetsc.backend.trees import root
 from msmpetsc.geometry.morton import COPIES
 from msmpetsc.geometry.valid_cells import clip_between
 
@@ -29,16 +30,8 @@ START, LEAVES, POINT, ENTERS, STOP = range(5)
 
 
 @njit()
-def _root(parent: Indices, a: int) -> int:
-    while parent[a] != a:
-        parent[a] = parent[parent[a]]
-        a = parent[a]
-    return a
-
-
-@njit()
 def _join(parent: Indices, a: int, b: int) -> None:
-    a, b = _root(parent, a), _root(parent, b)
+    a, b = root(parent, a), root(parent, b)
     parent[max(a, b)] = min(a, b)
 
 
@@ -153,12 +146,12 @@ def split_cell(
     number = np.full(len(parent), -1)
     count = 0
     for t in range(len(triangles)):
-        root = _root(parent, piece[t])
-        if number[root] < 0 and (flush[t] == 0 or met[piece[t]].sum() > 0):
-            number[root] = min(count, COPIES - 1)
+        tree = root(parent, piece[t])
+        if number[tree] < 0 and (flush[t] == 0 or met[piece[t]].sum() > 0):
+            number[tree] = min(count, COPIES - 1)
             count = min(count + 1, COPIES)
     for k in range(pieces):
-        part[k] = number[_root(parent, k)]
+        part[k] = number[root(parent, k)]
     if count < 2:
         return 1
     crossed = np.zeros((count, 3), np.int64)
@@ -172,7 +165,7 @@ def split_cell(
             if kind[n] == START or not _is_inside(kind, n):
                 continue
             # a line without any crossing has points
-            p = number[_root(parent, max(node[n - 1], node[n]))]
+            p = number[root(parent, max(node[n - 1], node[n]))]
             if p < 0:
                 continue
             if kind[n - 1] == START:
@@ -196,10 +189,10 @@ def _join_unseen(
     pieces = len(met)
     size = np.zeros(len(parent), np.int64)
     for n in range(len(parent)):
-        size[_root(parent, n)] += 1
+        size[root(parent, n)] += 1
     bulk = -1
     for k in range(pieces):
-        if met[k].sum() > 0 and (bulk < 0 or size[_root(parent, k)] > size[_root(parent, bulk)]):
+        if met[k].sum() > 0 and (bulk < 0 or size[root(parent, k)] > size[root(parent, bulk)]):
             bulk = k
     for t in range(len(triangles)):
         k = piece[t]

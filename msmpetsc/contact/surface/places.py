@@ -28,6 +28,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions
 from msmpetsc.backend.kernel import njit
+from msmpetsc.backend.trees import root
 from msmpetsc.contact.surface.near_parts import (
     CROSSING,
     EDGE_VERTEX,
@@ -161,17 +162,8 @@ def _keep_forest(order: Indices, pair: Indices, shared: Indices, weight: Floats)
     parent, last = np.arange(len(pair)), np.full(len(pair), -1)
     for part in order:
         linked = last[shared[part]]
-        first = second = _root(parent, pair[part])
+        first = second = root(parent, pair[part])
         if linked >= 0:
-            second = _root(parent, linked)
+            second = root(parent, linked)
         weight[part] *= 0.0 if first == second else -1.0
         parent[first], last[shared[part]] = second, pair[part]
-
-
-@njit()
-def _root(parent: Indices, pair: int) -> int:
-    """Return the root of a pair's tree, and halve the path to the root."""
-    while parent[pair] != pair:
-        parent[pair] = parent[parent[pair]]
-        pair = parent[pair]
-    return pair

@@ -12,16 +12,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Indices, Mask
-from msmpetsc.comm import SortedKeys
+from msmpetsc.comm import SortedKeys, places_of
 from msmpetsc.geometry.copies import Copies
+from msmpetsc.geometry.embedding import CELLS_AROUND
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 
 # place of a parent in a row of parents, from its index minus half the node's index
 PLACE = np.argsort(CORNERS @ [4, 2, 1])
 ON_AXES = np.array([4, 2, 1])
-# offsets of the cells around a cell
-RING = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1
 
 
 class ParentCopies(NamedTuple):
@@ -70,11 +69,9 @@ class CoarseCopies:
     def of(self, level: int, keys: Indices) -> Indices:
         """Return the numbers (n, 8) of the copies of the parents of nodes (n,) of a level."""
         numbers = np.zeros((len(keys), 8), np.int64)
-        if level < len(self.levels) and len(self.levels[level].keys):
-            parents = self.levels[level]
-            row = np.minimum(np.searchsorted(parents.keys, keys), len(parents.keys) - 1)
-            own = parents.keys[row] == keys
-            numbers[own] = parents.copies[row[own]]
+        if level < len(self.levels):
+            row = places_of(self.levels[level].keys, keys)
+            numbers[row >= 0] = self.levels[level].copies[row[row >= 0]]
         return numbers
 
 
@@ -84,7 +81,7 @@ def _with_ring(corners: Indices, table: SortedKeys) -> Indices:
     A cell counts as one of the lattice if the lattice has all its corners.
     """
     low = np.unique(encode_morton(decode_morton(corners[:, 0])))
-    around = np.unique(encode_morton(decode_morton(low)[:, None] + RING))
+    around = np.unique(encode_morton(decode_morton(low)[:, None] + CELLS_AROUND))
     around = np.setdiff1d(around[around >= 0], low)
     of_around = encode_morton(decode_morton(around)[:, None] + CORNERS)
     exists = (table.find(of_around) >= 0).all(axis=1)

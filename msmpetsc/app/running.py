@@ -105,7 +105,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
     failure, request = None, plan.request
     systems = None
     if request.export:
-        systems = ExportedSystems(comm, plan.scene, Path(request.export), request.exported)
+        systems = ExportedSystems(comm, Path(request.export), request.exported)
     if kernel_cache.is_empty():
         once = "once" if kernel_cache.writable() else "as no folder can keep them (NUMBA_CACHE_DIR)"
         log.info("compiling kernels, %s, about a minute", once)

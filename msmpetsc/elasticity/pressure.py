@@ -6,12 +6,12 @@ the volume to which the normals point away. So the resultant is zero, and the He
 is symmetric. V is cubic along a straight way, so that Simpson's rule gives its change exactly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Positions, Rows
-from msmpetsc.elasticity.springs import Product
 from msmpetsc.lattice.embedded_surface import SurfacePart, doubled_areas
 
 
@@ -40,19 +40,12 @@ class Pressures:
         for part, pressure in self._acting():
             _add(part, pressure / 6 * doubled_areas(part(q)), gradient)
 
-    def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
-        """Return the product with p grad grad V at q; zero if ``projected``: it is indefinite."""
-        if projected:
-            return lambda v, product: None
-        corners = [(part, pressure, part(q)) for part, pressure in self._acting()]
-
-        def add_product(v: Array, product: Array) -> None:
-            for part, pressure, (a, b, c) in corners:
-                u, w, x = part(v)
-                turned = np.cross(w - u, c - a) + np.cross(b - a, x - u)
-                _add(part, pressure / 6 * turned, product)
-
-        return add_product
+    def hessian_at(
+        self, q: Positions, projected: bool, dtype: type = np.float64
+    ) -> "PressureHessian":
+        """Return p grad grad V at q; zero if ``projected``: it is indefinite."""
+        acting = [] if projected else self._acting()
+        return PressureHessian([(part, pressure, part(q)) for part, pressure in acting])
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add a bound of the Hessian's negative part to the owned rows (l,) [N/m].
@@ -77,6 +70,40 @@ class Pressures:
 
     def _acting(self) -> list[tuple[SurfacePart, float]]:
         return [pair for pair in zip(self.parts, self.values, strict=True) if pair[1]]
+
+
+@dataclass(frozen=True)
+class PressureHessian:
+    """The Hessian p grad grad V of surfaces under pressure (collective).
+
+    A call adds the product with v (l, 3) [N] to the owned rows of ``product`` (l, 3).
+
+    acting : each surface, its pressure [Pa] and the corners (3, f, 3) [m] of its triangles
+    """
+
+    acting: list[tuple[SurfacePart, float, Rows]]
+
+    def __call__(self, v: Array, product: Array) -> None:
+        for part, pressure, corners in self.acting:
+            _add(part, _turned(corners, part(v), pressure), product)
+
+    def triangles(self) -> Iterator[tuple[SurfacePart, Rows]]:
+        """Yield each surface with the symmetric part (f, 9, 9) [N/m] of each triangle's matrix.
+
+        Rows go by corner, then x, y and z. The other parts cancel over the triangles.
+        """
+        unit = np.eye(9).reshape(9, 3, 1, 3).swapaxes(0, 1)
+        for part, pressure, corners in self.acting:
+            columns = _turned(corners, unit, pressure)
+            matrices = np.tile(columns.transpose(1, 2, 0), (1, 3, 1))
+            yield part, 0.5 * (matrices + matrices.transpose(0, 2, 1))
+
+
+def _turned(corners: Rows, moves: Rows, pressure: float) -> Rows:
+    """Return the change of p / 6 (b - a) x (c - a) as corners (a, b, c) move."""
+    (a, b, c), (u, w, x) = corners, moves
+    change: Rows = pressure / 6 * (np.cross(w - u, c - a) + np.cross(b - a, x - u))
+    return change
 
 
 def _add(part: SurfacePart, forces: Rows, rows: Rows) -> None:

@@ -85,6 +85,25 @@ def test_a_system_solves_to_the_steps_own_correction(tmp_path: Path, law: str):
 VISCOUS = {"material": SOLID | {"retardation_time": 0.01}}
 PRESSED = {"gravity": {"acceleration": [1.0, 0, -20.0]}, "obstacle": [ROUGH_GROUND]}
 TOUCHES = {"self_contact": {"friction": 0.3}}
+STATIC = {"time": {"step": 1.0, "duration": 1.0, "integrator": "static"}}
+
+
+def roller(axis: int, sign: int, at: float) -> dict:
+    """A roller that holds one component of the nodes on a face of a block."""
+    normal, point = [0, 0, 0], [0, 0, 0]
+    normal[axis], point[axis] = sign, at - sign * 0.01
+    return {"region": {"half_space": {"point": point, "normal": normal}}, "fix": ["xyz"[axis]]}
+
+
+CLAMP = {"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}
+LOW = {"region": {"box": [[0, 0, 0], [1, 1, 0.15]], "relative": True}}
+ARMS = {"region": {"box": [[0, 0, 0.3], [1, 1, 1]], "relative": True}, "fix": ["y"]}
+# The sides of a block on rollers: its top is open, and its edge keeps to the sides
+ROLLERS = {"pin": [roller(0, -1, 0), roller(1, -1, 0), roller(2, -1, 0), roller(0, 1, 0.5),
+                   roller(1, 1, 0.5)]}  # fmt: skip
+TOP = {"half_space": {"point": [0, 0, 0.24], "normal": [0, 0, 1]}}
+SQUEEZED = {"material": SOLID, "pressure": [{"region": TOP, "value": 3e4}]}
+BLOWN = {"material": SOLID, "pressure": [{"region": {"box": [[-1] * 3, [1] * 3]}, "value": 1e4}]}
 
 
 @pytest.mark.parametrize(
@@ -93,12 +112,15 @@ TOUCHES = {"self_contact": {"friction": 0.3}}
         (VISCOUS | {"time": SWING | {"integrator": "bdf2"}}, clamped_beam),
         (LINEAR | PRESSED | {"time": {"step": 0.01, "duration": 0.05}}, block_scene),
         (TOUCHES | {"time": {"step": 0.02, "duration": 0.3}}, pinch_scene),
-        ({"time": {"step": 1.0, "duration": 1.0, "integrator": "static"}}, clamped_beam),
+        (TOUCHES | {"time": {"step": 0.02, "duration": 0.3}, "pin": [LOW, ARMS]}, pinch_scene),
+        (STATIC, clamped_beam),
+        (STATIC | ROLLERS | SQUEEZED, block_scene),
+        (BLOWN | {"time": {"step": 0.01, "duration": 0.03}}, clamped_beam),
     ],
-    ids=["viscous", "friction", "self-contact", "static"],
+    ids=["viscous", "friction", "self-contact", "held-self-contact", "static", "rollers", "blown"],
 )
 def test_the_matrix_multiplies_as_the_products_do(tmp_path: Path, tables: dict, bodies):
-    """Viscosity, friction, self-contact and a lack of inertia are in the matrix."""
+    """Viscosity, friction, self-contact, rollers, pressure, a lack of inertia are in the matrix."""
     checked = []
 
     def check(step, now, jacobian):
@@ -106,6 +128,7 @@ def test_the_matrix_multiplies_as_the_products_do(tmp_path: Path, tables: dict, 
         whole = assembled(jacobian.unknowns, blocks_of(hessian))
         x, y = now.x.duplicate(), now.x.duplicate()
         x.array[:] = np.random.default_rng(step).normal(size=x.size)
+        jacobian.unknowns.project(x)
         jacobian.operator.mult(x, y)
         by_node, product = whole.createVecs()
         by_node.array[:] = jacobian.unknowns.columns(x).T.ravel()
@@ -142,10 +165,12 @@ def test_rigid_modes_are_those_of_the_free_body(tmp_path: Path):
     np.testing.assert_allclose(hessian @ modes.T, (mass * modes).T, rtol=0, atol=1e-10 * stiff)
 
 
-def test_ranks_write_the_same_system(tmp_path: Path):
-    """Two ranks, and the sum of their subdomains."""
+@pytest.mark.parametrize("loads", [{}, BLOWN], ids=["weight", "pressure"])
+def test_ranks_write_the_same_system(tmp_path: Path, loads: dict):
+    """Two ranks, and the sum of their subdomains, with an end on rollers."""
     # Steps so short that the first guess is free fall on any number of ranks
-    path = clamped_beam(tmp_path, material=SOLID, time={"step": 0.01, "duration": 0.01})
+    short = {"material": SOLID, "time": {"step": 0.01, "duration": 0.01}} | loads
+    path = clamped_beam(tmp_path, pin=[CLAMP, roller(0, 1, 1.0)], **short)
     for ranks in (1, 2):
         words = ["--export", tmp_path / str(ranks), "--frames", 1, "--quiet"]
         run(ranks, "-m", "msmpetsc.cli.main", "run", path, "-o", tmp_path / f"{ranks}.h5", *words,
@@ -176,14 +201,26 @@ def test_ranks_write_the_same_system(tmp_path: Path):
     assert float(gamg.split()[4]) < 1e-6
 
 
-def test_rollers_have_no_place_in_an_exported_system(tmp_path: Path):
-    """The matrix has whole nodes; without a word it would leave single components free."""
-    end = {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}
-    roller = [{"region": end, "fix": ["x"]}]
-    path = clamped_beam(tmp_path, material=SOLID, time=SWING, pin=roller)
-    words = ["--export", tmp_path / "systems", "-o", tmp_path / "o.h5"]
-    done = run(1, "-m", "msmpetsc.cli.main", "run", path, *words, status=2)
-    assert "--export: pin.0 has no place" in done.stderr
+def test_a_held_component_has_its_diagonal_alone(tmp_path: Path):
+    """So that the system of a body on rollers, under pressure, has a single solution."""
+    path = block_scene(tmp_path, **STATIC, **ROLLERS, **SQUEEZED)
+    result = msmpetsc.run(path, tmp_path / "x.h5", export=tmp_path, quiet=True)
+    folder = tmp_path / "step_1"
+    hessian, right = matrix(folder / "hessian.bin"), vector(folder, "residual")
+    with h5py.File(result) as file:
+        lattice = build_model(MPI.COMM_SELF, load_scene(path)).lattice
+        begun = file["frames/position"][0]
+    free = ~lattice.pinned
+    held = lattice.held[free].ravel()
+    assert held.any() and not held.all()
+    np.testing.assert_allclose(vector(folder, "coordinates"), begun[free].ravel(), atol=1e-12)
+    rows, diagonal = hessian.toarray(), hessian.diagonal()
+    assert np.all(diagonal[held] > 0) and np.all(right[held] == 0)
+    rest = rows - np.diag(diagonal)
+    assert not rest[held].any() and not rest[:, held].any()
+    y = spsolve(hessian.tocsc(), right)
+    atol = EXACT * np.abs(y).max()
+    np.testing.assert_allclose(vector(folder, "correction"), y, rtol=0, atol=atol)
 
 
 def test_a_study_exports_each_problem_once(tmp_path: Path):

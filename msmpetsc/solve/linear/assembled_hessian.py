@@ -1,7 +1,8 @@
 """The Hessian of a step as a PETSc matrix, for solvers that need one.
 
-A row of the matrix belongs to a coordinate of a free node: x, y and z of a node in sequence.
-Products with all other operators need no matrix (solve.linear.operators).
+A row of the matrix belongs to a coordinate of a free node: x, y and z of a node in sequence. Rows
+and columns of held components are zero, but for their own diagonals. Products with all other
+operators need no matrix (solve.linear.operators).
 """
 
 from collections.abc import Iterator
@@ -11,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import csr_array, eye_array, kron
+from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-from msmpetsc.backend.arrays import Indices, Rows, to_host
+from msmpetsc.backend.arrays import Indices, Mask, Rows, to_host
 from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.elasticity.pressure import PressureHessian
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import Springs, elastic_hessian
 from msmpetsc.solve.linear.operators import TrueHessian
@@ -38,7 +40,16 @@ def blocks_of(hessian: TrueHessian) -> Blocks:
     """Return the blocks of the Hessian of the last ``linearise`` at free nodes (collective)."""
     whole = [np.concatenate(part) for part in zip(*_parts(hessian), strict=True)]
     is_free = (whole[0] >= 0) & (whole[1] >= 0)
-    return Blocks(*(part[is_free] for part in whole))
+    blocks = Blocks(*(part[is_free] for part in whole))
+    unknowns = hessian.unknowns
+    node, component = map(to_host, unknowns.held)
+    held = 3 * unknowns.numbers[node] + component
+    rows, columns = (
+        np.isin(3 * ends[:, None] + np.arange(3), held) for ends in (blocks.first, blocks.second)
+    )
+    is_diagonal = (blocks.first == blocks.second)[:, None, None] & np.eye(3, dtype=bool)
+    blocks.values[(rows[:, :, None] | columns[:, None, :]) & ~is_diagonal] = 0
+    return blocks
 
 
 def assembled(unknowns: Unknowns, blocks: Blocks) -> PETSc.Mat:
@@ -80,7 +91,11 @@ def _summed(comm: MPI.Comm, size: tuple[int, int], blocks: Blocks) -> PETSc.Mat:
 
 
 def _parts(hessian: TrueHessian) -> Iterator[Blocks]:
-    """Yield the blocks of inertia, springs, cells and contact."""
+    """Yield the blocks of inertia, springs, cells, pressure and contact.
+
+    Blocks of pressure and of the surface's contact, whose nodes may be another rank's, lack held
+    components.
+    """
     unknowns, t2, numbers = hessian.unknowns, hessian.t2, hessian.unknowns.numbers
     own = numbers[to_host(unknowns.free)]
     inertia = to_host(unknowns.inertia)[to_host(unknowns.free)]
@@ -90,6 +105,8 @@ def _parts(hessian: TrueHessian) -> Iterator[Blocks]:
     for part in hessian.elastic.parts if hessian.elastic else ():
         if isinstance(part, CellHessians):
             yield _of_cells(part, numbers, t2)
+        if isinstance(part, PressureHessian):
+            yield from _of_pressure(part, unknowns, t2)
     for rows, blocks in hessian.contact.parts if hessian.contact else ():
         at = own[to_host(rows)]
         yield Blocks(at, at, to_host(blocks))
@@ -147,18 +164,43 @@ def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> Blocks:
 
 def _of_surface(surface: SurfaceHessian, unknowns: Unknowns, t2: float) -> Blocks:
     """Return the blocks t^2 W^T H_c W in this rank's rows (collective)."""
-    weights = csr_array(surface.weights[:, unknowns.free])
     own = unknowns.numbers[unknowns.free]
+    weights = _by_component(surface.weights[:, unknowns.free], unknowns.lattice.held[unknowns.free])
+    rows = (3 * own[:, None] + np.arange(3)).ravel()
     placed = csr_array(
-        (weights.data, own[weights.indices], weights.indptr),
-        shape=(weights.shape[0], unknowns.total),
+        (weights.data, rows[weights.indices], weights.indptr),
+        shape=(weights.shape[0], 3 * unknowns.total),
     )
     # The order of the ranks makes the sum reproducible
     whole = sum(unknowns.comm.allgather(placed))
-    coordinates = eye_array(3)
-    joined = kron(weights, coordinates, "csr").T @ (
-        surface.points @ kron(whole, coordinates, "csr")
-    )
-    blocks = joined.tobsr((3, 3))
-    first = np.repeat(own, np.diff(blocks.indptr))
-    return Blocks(first, blocks.indices.astype(np.int64), t2 * blocks.data)
+    first, second, values = _joined(weights, csr_array(surface.points @ whole))
+    return Blocks(own[first], second, t2 * values)
+
+
+def _of_pressure(part: PressureHessian, unknowns: Unknowns, t2: float) -> Iterator[Blocks]:
+    """Yield the blocks t^2 W^T H_p W of this rank's triangles under pressure (collective)."""
+    for surface, triangles in part.triangles():
+        points = surface.points
+        numbers, held = (
+            points.to_owner.answer(rows[points.asked])
+            for rows in (unknowns.numbers, unknowns.lattice.held)
+        )
+        # Points go by corner, then by triangle
+        ends = np.arange(9 * len(triangles)).reshape(3, -1, 3).swapaxes(0, 1).reshape(-1, 9)
+        places = np.broadcast_arrays(ends[:, :, None], ends[:, None, :])
+        matrix = csr_array((triangles.ravel(), [of.ravel() for of in places]), (ends.size,) * 2)
+        weights = _by_component(points.weights, held)
+        first, second, values = _joined(weights, csr_array(matrix @ weights))
+        yield Blocks(numbers[first], numbers[second], t2 * values)
+
+
+def _by_component(weights: csr_array, held: Mask) -> csr_array:
+    """Return weights (v, n) of nodes as (3v, 3n) of their components; held components weigh 0."""
+    return csr_array(kron(weights, eye_array(3)) @ diags_array(np.where(held, 0.0, 1.0).ravel()))
+
+
+def _joined(left: csr_array, right: csr_array) -> Blocks:
+    """Return the blocks of left^T right by places of nodes in the columns of both."""
+    blocks = csr_array(left.T @ right).tobsr((3, 3))
+    first = np.repeat(np.arange(left.shape[1] // 3), np.diff(blocks.indptr))
+    return Blocks(first, blocks.indices.astype(np.int64), blocks.data)

@@ -5,6 +5,7 @@ step's preconditioner. A block is needed since a single direction may settle on 
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +29,9 @@ TINY = np.finfo(float).tiny
 # Relative eigenvalue of a Gram matrix below which directions are linearly dependent
 DEPENDENT = 1e-10
 
-# Directions (k, n), their products with H, and their products with M or the projected
-# Hessian
-Block = tuple[Rows, ...]
+# Unknowns that a combination of directions takes at a time; bounds its copies
+CHUNK = 1 << 16
+
 Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
 
 
@@ -51,6 +52,52 @@ EFFORT = SearchEffort(4, 12, 2)
 # With multigrid smooth modes converge at once. After an alarm EFFORT is taken all the
 # same: a folded body may hide its lowest mode.
 UNIFORM_EFFORT = SearchEffort(2, 3, 1)
+
+
+@dataclass
+class SearchSpace:
+    """Directions of a search and their products, which iterations change in place.
+
+    directions : (room, n), of which the first ``used`` count
+    products   : (room, n) with H
+    weighed    : (room, n) with W; None for M
+    """
+
+    directions: Rows
+    products: Rows
+    weighed: Rows | None
+    used: int
+
+    def _chunks(self) -> Iterator[slice]:
+        """Yield the unknowns in chunks."""
+        count = self.directions.shape[1]
+        return (slice(at, at + CHUNK) for at in range(0, count, CHUNK))
+
+    def rows_weighed(self, mass: Floats, rows: slice, columns: slice) -> Rows:
+        """Return products of W with some directions, at some unknowns."""
+        if self.weighed is not None:
+            return self.weighed[rows, columns]
+        return self.directions[rows, columns] * mass[columns]
+
+    def grams(self, mass: Floats) -> Rows:
+        """Return the Gram matrices (2, used, used) of the directions in H and W, of this rank."""
+        sums = np.zeros((2, self.used, self.used))
+        rows = slice(self.used)
+        for chunk in self._chunks():
+            span = self.directions[rows, chunk]
+            sums[0] += to_host(span @ self.products[rows, chunk].T)
+            sums[1] += to_host(span @ self.rows_weighed(mass, rows, chunk).T)
+        return sums
+
+    def combine(self, parts: Rows) -> None:
+        """Replace the directions by combinations ``parts`` (k, used) of them."""
+        count, on_device = len(parts), like(self.directions, parts)
+        for rows in (self.directions, self.products, self.weighed):
+            if rows is None:
+                continue
+            for chunk in self._chunks():
+                rows[:count, chunk] = on_device @ rows[: self.used, chunk]
+        self.used = count
 
 
 class Lobpcg:
@@ -97,7 +144,7 @@ class Lobpcg:
                     break
             elif its >= max(least, 1) and lowest[-1] > SETTLED * lowest[its // 2]:
                 break
-        return found[0], found[1]
+        return found[0], found[1].copy()
 
     def iterates(
         self, start: Rows, block: int, weigh: Act | None = None, left_out: Rows | None = None
@@ -105,45 +152,63 @@ class Lobpcg:
         """Yield the lowest eigenvalues (k,), their modes (k, n) and errors (k,), without end.
 
         The errors r^T P^-1 r of the eigenvalues are those before the last iteration, with the
-        residuals r and the preconditioner P. Arguments are those of ``lowest``.
+        residuals r and the preconditioner P. The next iteration overwrites the modes. Arguments
+        are those of ``lowest``.
         """
-        size = min(block, len(start))
-        values, (x, last) = self._ritz(self._block(start, weigh), size)
+        space = self._space(start, block, weigh)
+        values = self._ritz(space, min(block, len(start)))
         # A small body has fewer modes than the block
         size = len(values)
         errors = np.full(size, np.inf)
         while True:
-            yield values, x[0], errors
-            residuals = x[1] - like(start, values)[:, None] * x[2]
-            sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
-            self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
-            # Multigrid works in single precision
-            residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])
-            w = self._of_each(self.preconditioner.apply, residuals)
-            errors = self.comm.allreduce(to_host((residuals * w).sum(axis=1))) * sizes**2
-            w = self.unit(self.without(left_out, w))
-            blocks = [x, self._block(w, weigh), *([] if last is None else [last])]
-            values, (x, last) = self._ritz(
-                tuple(np.concatenate(parts) for parts in zip(*blocks, strict=True)), size
-            )
-            self.its += len(w)
+            yield values, space.directions[:size], errors
+            errors = np.array([self._add_residual(space, i, values[i]) for i in range(size)])
+            added = space.directions[space.used - size : space.used]
+            added[:] = self.unit(self.without(left_out, added))
+            self._multiply(space, space.used - size, weigh)
+            values = self._ritz(space, size)
+            self.its += size
 
-    def _block(self, directions: Rows, weigh: Act | None) -> Block:
-        weighed = (
-            directions * self.functional.mass if weigh is None else self._of_each(weigh, directions)
+    def _space(self, start: Rows, block: int, weigh: Act | None) -> "SearchSpace":
+        """Return the space of directions (l, n), with room for those of an iteration."""
+        room = max(len(start), 3 * block), start.shape[1]
+        space = SearchSpace(
+            np.empty(room, like=start),
+            np.empty(room, like=start),
+            None if weigh is None else np.empty(room, like=start),
+            len(start),
         )
-        return directions, self._of_each(self.hessian.mult, directions), weighed
+        space.directions[: len(start)] = start
+        self._multiply(space, 0, weigh)
+        return space
 
-    def _ritz(self, block: Block, size: int) -> tuple[Floats, tuple[Block, Block | None]]:
-        """Return the lowest Ritz values (size,) in the span of a block, ascending, and two blocks.
+    def _multiply(self, space: "SearchSpace", first: int, weigh: Act | None) -> None:
+        """Compute the products with the directions from the ``first`` on."""
+        new = slice(first, space.used)
+        space.products[new] = self._of_each(self.hessian.mult, space.directions[new])
+        if weigh is not None and space.weighed is not None:
+            space.weighed[new] = self._of_each(weigh, space.directions[new])
 
-        The first block has the Ritz vectors, of unit length. The second block has the parts of
-        the Ritz vectors outside the first ``size`` directions, the conjugate directions.
+    def _add_residual(self, space: "SearchSpace", i: int, value: float) -> float:
+        """Add the preconditioned residual of the i-th Ritz vector; return its error r^T P^-1 r."""
+        weighed = space.rows_weighed(self.functional.mass, slice(i, i + 1), slice(None))[0]
+        residual = space.products[i] - value * weighed
+        scale = max(self.comm.allreduce(float(greatest(np.abs(residual))), MPI.MAX), TINY)
+        # Multigrid works in single precision
+        residual /= scale
+        w = self._of_each(self.preconditioner.apply, residual[None])[0]
+        space.directions[space.used] = w
+        space.used += 1
+        error: float = self.comm.allreduce(float(residual @ w)) * scale**2
+        return error
+
+    def _ritz(self, space: "SearchSpace", size: int) -> Floats:
+        """Return the lowest Ritz values (size,) in a space, ascending, and reduce the space.
+
+        It keeps the Ritz vectors, of unit length. Their parts outside the first ``size``
+        directions, the conjugate directions, follow.
         """
-        span, products, weighed = block
-        grams = self.comm.allreduce(
-            np.stack([to_host(span @ products.T), to_host(span @ weighed.T)])
-        )
+        grams = self.comm.allreduce(space.grams(self.functional.mass))
         lengths = np.sqrt(np.maximum(grams[1].diagonal(), TINY))
         grams = grams / lengths / lengths[:, None]
         sizes, parts = np.linalg.eigh(0.5 * (grams[1] + grams[1].T))
@@ -151,12 +216,10 @@ class Lobpcg:
         parts = parts[:, kept] / np.sqrt(sizes[kept])
         values, turns = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
         parts = (parts @ turns)[:, :size].T / lengths
-        on_device = like(span, parts)
-        best = tuple(on_device @ rows for rows in block)
-        if len(span) <= size:
-            return values[:size], (best, None)
-        rest = like(span, parts[:, size:])
-        return values[:size], (best, tuple(rest @ rows[size:] for rows in block))
+        rest = parts.copy() if space.used > size else parts[:0]
+        rest[:, :size] = 0.0
+        space.combine(np.concatenate([parts, rest]))
+        return values[:size]
 
     def without(self, left_out: Rows | None, directions: Rows) -> Rows:
         """Return directions (k, n) without their parts in directions ``left_out`` (r, n)."""

@@ -39,12 +39,10 @@ class Copies:
 
     keys    : (e,) keys of the cells, ascending
     corners : (e, 8) keys of their corner nodes
-    around  : (m, 8) keys of the corner nodes of all cells near nodes with copies
     """
 
     keys: Indices
     corners: Indices
-    around: Indices
 
     def place(self, keys: Indices) -> Indices:
         """Return the row (...,) of each cell, -1 for an ordinary cell."""
@@ -59,7 +57,7 @@ class Copies:
         return corners
 
 
-NO_COPIES = Copies(np.empty(0, np.int64), *[np.empty((0, 8), np.int64)] * 2)
+NO_COPIES = Copies(np.empty(0, np.int64), np.empty((0, 8), np.int64))
 
 
 def find_copies(
@@ -75,7 +73,7 @@ def find_copies(
     ordinary = encode_morton(decode_morton(keys)[:, None] + CORNERS)
     own = np.flatnonzero((corners != ordinary).any(axis=1) | (keys % COPIES > 0))
     own = own[np.argsort(keys[own])]
-    copies = Copies(keys[own], corners[own], corners) if len(own) else None
+    copies = Copies(keys[own], corners[own]) if len(own) else None
     shared: Copies | None = table.comm.bcast(copies)
     return shared
 

@@ -308,7 +308,7 @@ def test_corner_keys_of_ordinary_cells_are_those_of_their_index():
     keys = encode_morton(cells)
     ordinary = encode_morton(cells[:, None] + CORNERS)
     own = ordinary[1] + 1
-    copies = Copies(keys[1:] + 1, own[None], np.empty((0, 8), np.int64))
+    copies = Copies(keys[1:] + 1, own[None])
     asked = np.array([keys[0], keys[1], keys[1] + 1])
     found = copies.corner_keys(asked, cells[[0, 1, 1]])
     np.testing.assert_array_equal(found, [*ordinary, own])

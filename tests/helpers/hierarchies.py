@@ -69,6 +69,12 @@ def figure(fineness: int = 1) -> np.ndarray:
     return np.concatenate([box_of_cells(*ends, fineness) for ends in parts])
 
 
+def comb() -> np.ndarray:
+    """Prongs on a back, with gaps of 1, 2, 3 and 4 cells."""
+    prongs = [at(block(7, 2, 2), 0, y, 1) for y in (1, 4, 8, 13, 19)]
+    return at(np.concatenate([*prongs, at(block(1, 21, 2), -1, 0, 1)]), 1, 0, 0)
+
+
 LATTICES: dict[str, np.ndarray] = {
     "block": block(5, 4, 3),
     "block that begins at odd indices": at(block(4, 3, 3), 1, 3, 5),
@@ -78,6 +84,7 @@ LATTICES: dict[str, np.ndarray] = {
     "two bodies in one coarse cell": np.concatenate([block(3, 3, 1), at(block(3, 3, 1), 0, 0, 2)]),
     "thin sheet": block(9, 9, 1),
     "limbs": limbs(),
+    "comb": comb(),
     "rod": at(block(14, 1, 1), 1, 1, 1),
     "a cell": block(1, 1, 1),
     "a cell at odd indices": block(1, 1, 1) + 1,

@@ -1,94 +1,151 @@
-"""Copies of coarse nodes near a slit, so that coarse grids do not join its sides.
+"""Copies of coarse nodes, so that coarse grids do not join the sides of a gap.
 
-The interpolation function of a coarse node spans the fine nodes around it. If a slit separates
-these fine nodes into several connected parts, the coarse node has a copy for each part. Each fine
-node then has the copies of its part as parents. Fine nodes are connected if they share a cell.
+The interpolation function of a coarse node spans the fine nodes around it. If their cells fall into
+several connected parts, the coarse node has a copy for each part. Each fine node then has the
+copies of its part as parents. Fine nodes are connected if they share a cell.
+
+A part of a coarse node is told from its cells alone. So one rank receives all cells around a coarse
+node, and the result does not depend on the number of ranks.
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.backend.arrays import Indices, Mask
-from msmpetsc.comm import SortedKeys, places_of
-from msmpetsc.geometry.copies import Copies
-from msmpetsc.geometry.embedding import CELLS_AROUND
+from msmpetsc.backend.arrays import Array, Indices, Mask, to_host
+from msmpetsc.backend.kernel import njit
+from msmpetsc.backend.trees import root
+from msmpetsc.comm import Route, SortedKeys, places_of
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.lattice.lattice import Lattice
 
-# place of a parent in a row of parents, from its index minus half the node's index
+# index in CORNERS of an offset, from its digits ON_AXES
 PLACE = np.argsort(CORNERS @ [4, 2, 1])
 ON_AXES = np.array([4, 2, 1])
+# place value of each corner's copy in a number, and their limit [-]
+DIGITS = COPIES ** np.arange(8)
+MOST_COPIES = COPIES**8
+# fine nodes under a coarse node's function, with their copies [-]
+CHILDREN = 27 * COPIES
 
 
-class ParentCopies(NamedTuple):
-    """Numbers of the copies that are parents of the fine nodes of a level.
+def _children() -> Indices:
+    """Return the children (8, 8, 8) of a coarse cell's corners among the corners of fine cells.
 
-    keys   : (n,) keys of the nodes with a parent that is not copy 0, ascending
-    copies : (n, 8) numbers, of the parents at half the node's index plus CORNERS
+    The axes are the fine cell's place in the coarse cell, the coarse corner and the fine corner.
+    A child is numbered 0 to 26 by its offset from the coarse corner; -1 is none.
     """
+    offset = CORNERS[:, None, None] + CORNERS - 2 * CORNERS[:, None]
+    return np.where((np.abs(offset) <= 1).all(axis=3), (offset + 1) @ [9, 3, 1], -1)
 
-    keys: Indices
-    copies: Indices
+
+CHILD = _children()
 
 
 class CoarseCopies:
-    """Copies of the parents of all nodes, level by level, the finest first. Known on all ranks.
+    """Copies of the parents of this rank's nodes, level by level. All methods are collective.
 
-    levels  : parents of the nodes of each level
-    corners : (m, 8) keys of the corners of the cells near copies, on the last level
+    cells    : (m, 8) keys of the corners of this rank's cells on the last level
+    of_nodes : (l, 8) copies of the parents of the lattice's local nodes, ghosts included; the
+               parents are at half the node's index plus CORNERS
     """
 
-    def __init__(self, copies: Copies | None, table: SortedKeys, offsets: Indices):
-        """Start with the nodes of a lattice (collective).
+    def __init__(self, lattice: Lattice, keys: Indices, offsets: Indices):
+        """Start with a lattice.
 
-        table   : keys of its nodes
-        offsets : (owned,) keys added to those of this rank's nodes, to separate bodies
+        keys    : (l,) keys of its local nodes
+        offsets : (l,) added to them, to separate bodies; 0 for a pinned node, which follows its
+                  cell
         """
-        self.levels: list[ParentCopies] = []
-        self.corners = copies.around if copies else np.empty((0, 8), np.int64)
-        if copies:
-            self.corners = _with_ring(self.corners, table)
-            of_nodes = table.rows_of(self.corners.ravel(), offsets).reshape(-1, 8)
-            # pinned nodes have no offset: they follow their cell
-            self.corners = self.corners + of_nodes.max(axis=1, keepdims=True)
-            self._coarsen()
+        corners = to_host(lattice.local_cells)[: lattice.cells_owned]
+        self.cells = keys[corners] + offsets[corners].max(axis=1, keepdims=True)
+        own = self._coarsen(lattice.table, lattice.global_numbers[corners])
+        self.of_nodes = lattice.table.with_ghosts(lattice.ghosts, own)
 
-    def add(self, table: SortedKeys) -> None:
-        """Add the next level, whose nodes have the keys of ``table`` (collective)."""
-        if len(self.corners):
-            self.corners = _with_ring(self.corners, table)
-            self._coarsen()
+    def of(self, table: SortedKeys) -> Array:
+        """Return the copies (n, 8) of the parents of this rank's nodes of the next level."""
+        return self._coarsen(table, table.find(self.cells))
 
-    def _coarsen(self) -> None:
-        parents, self.corners = _coarser(self.corners)
-        self.levels.append(parents)
+    def _coarsen(self, table: SortedKeys, index: Indices) -> Array:
+        """Replace the cells by coarse cells; return the copies (n, 8) of their nodes' parents.
 
-    def of(self, level: int, keys: Indices) -> Indices:
-        """Return the numbers (n, 8) of the copies of the parents of nodes (n,) of a level."""
-        numbers = np.zeros((len(keys), 8), np.int64)
-        if level < len(self.levels):
-            row = places_of(self.levels[level].keys, keys)
-            numbers[row >= 0] = self.levels[level].copies[row[row >= 0]]
+        table : this level's nodes
+        index : (m, 8) their indices at the cells' corners, -1 for a node without unknowns
+        """
+        ijk = decode_morton(self.cells)
+        low = ijk[:, 0] // 2
+        parents = encode_morton(low[:, None] + CORNERS)
+        owners = SortedKeys(table.comm, parents.ravel())
+        numbers = self._numbers(owners, parents, PLACE[(ijk[:, 0] - 2 * low) @ ON_AXES])
+        self.cells = _distinct_cells(owners, parents[:, 0], numbers @ DIGITS)
+        copied = np.flatnonzero(numbers.any(axis=1))
+        is_parent, place = _places(low[copied], ijk[copied])
+        cell, corner, parent = np.nonzero(is_parent)
+        of_corners = np.zeros((*is_parent.shape[:2], 8), np.uint8)
+        of_corners[cell, corner, place[is_parent]] = numbers[copied[cell], parent]
+        nodes = index[copied]
+        sent = (nodes >= 0) & of_corners.any(axis=2)
+        route = Route(table.comm, table.owner_of_index(nodes[sent]))
+        copies = np.zeros((len(table.keys), 8), np.uint8)
+        np.maximum.at(copies, route.send(nodes[sent]) - table.first, route.send(of_corners[sent]))
+        return copies
+
+    def _numbers(self, owners: SortedKeys, parents: Indices, place: Indices) -> Indices:
+        """Return the number (m, 8) of the copy of each parent that each cell belongs to.
+
+        Parts are numbered by their first nodes. The last number is shared by all further parts.
+
+        place : (m,) place of each cell in its coarse cell
+        """
+        route = Route(owners.comm, owners.owner(parents.ravel()))
+        around = CHILD[place].reshape(-1, 8)
+        own = np.repeat(self.cells % COPIES, 8, axis=0)
+        children = np.where(around >= 0, COPIES * around + own, -1).astype(np.int16)
+        of_parent = places_of(owners.keys, route.send(parents.ravel()))
+        tree = np.arange(CHILDREN * len(owners.keys))
+        part = np.empty(len(of_parent), np.int64)
+        _unite(tree, of_parent, route.send(children), part)
+        distinct, inverse = np.unique(part, return_inverse=True)
+        first = np.searchsorted(distinct // CHILDREN, distinct // CHILDREN)
+        number = np.minimum(np.arange(len(distinct)) - first, COPIES - 1)
+        numbers: Indices = route.answer(number[inverse]).reshape(-1, 8)
         return numbers
 
 
-def _with_ring(corners: Indices, table: SortedKeys) -> Indices:
-    """Return the corners (m, 8) of cells, and those of the ordinary cells around (collective).
+@njit()
+def _unite(tree: Indices, of_parent: Indices, children: Array, part: Indices) -> None:
+    """Unite the children of each row (r, 8), and set the part (r,) of each row.
 
-    A cell counts as one of the lattice if the lattice has all its corners.
+    tree : (CHILDREN times the number of parents,) trees of children; a root is a tree's least child
     """
-    low = np.unique(encode_morton(decode_morton(corners[:, 0])))
-    around = np.unique(encode_morton(decode_morton(low)[:, None] + CELLS_AROUND))
-    around = np.setdiff1d(around[around >= 0], low)
-    of_around = encode_morton(decode_morton(around)[:, None] + CORNERS)
-    exists = (table.find(of_around) >= 0).all(axis=1)
-    return np.concatenate([corners, of_around[exists]])
+    for row in range(len(of_parent)):
+        first = -1
+        for child in children[row]:
+            if child >= 0:
+                item = root(tree, CHILDREN * of_parent[row] + child)
+                if first >= 0:
+                    tree[max(item, first)] = min(item, first)
+                    item = min(item, first)
+                first = item
+        part[row] = first
+    for row in range(len(of_parent)):
+        part[row] = root(tree, part[row])
 
 
-def in_cells(low: Indices, ijk: Indices, parents: Indices) -> Indices:
+def _distinct_cells(owners: SortedKeys, first: Indices, copies: Indices) -> Indices:
+    """Return the keys (k, 8) of the corners of coarse cells, each on one rank (collective).
+
+    first  : (m,) keys of first corners, without copies
+    copies : (m,) copies of the corners as digits of a number
+    """
+    route = Route(owners.comm, owners.owner(first))
+    place = places_of(owners.keys, route.send(first))
+    cells = np.unique(place * MOST_COPIES + route.send(copies))
+    low = decode_morton(owners.keys[cells // MOST_COPIES])
+    numbers: Indices = encode_morton(low[:, None] + CORNERS) + cells[:, None] // DIGITS % COPIES
+    return numbers
+
+
+def in_cells(low: Indices, ijk: Indices, parents: Array) -> Array:
     """Return the copies (n, 8) of the corners of coarse cells, from those of fine nodes in them.
 
     low     : (n, 3) index of the coarse cells
@@ -97,7 +154,7 @@ def in_cells(low: Indices, ijk: Indices, parents: Indices) -> Indices:
     """
     is_parent, place = _places(low, ijk)
     copies = np.where(is_parent, np.take_along_axis(parents, place, axis=2), 0)
-    numbers: Indices = copies.max(axis=1)
+    numbers: Array = copies.max(axis=1)
     return numbers
 
 
@@ -113,56 +170,3 @@ def _places(low: Indices, ijk: Indices) -> tuple[Mask, Indices]:
     offset = low[:, None, None] + CORNERS - nodes // 2
     is_parent: Mask = ((offset >= 0) & (offset <= nodes % 2)).all(axis=3)
     return is_parent, PLACE[(offset * is_parent[..., None]) @ ON_AXES] * is_parent
-
-
-def _coarser(corners: Indices) -> tuple[ParentCopies, Indices]:
-    """Return the parents of the corner nodes of cells, and the corners of the coarse cells.
-
-    corners : (m, 8) keys; the result is empty if no node has a copy
-    """
-    nodes, number = np.unique(corners, return_inverse=True)
-    number = number.reshape(corners.shape)
-    _, at, counts = np.unique(nodes // COPIES, return_inverse=True, return_counts=True)
-    ijk, copied = decode_morton(nodes), counts[at] > 1
-    if not copied.any():
-        return ParentCopies(np.empty(0, np.int64), np.empty((0, 8), np.int64)), corners[:0]
-    low = ijk[number[:, 0]] // 2
-    is_parent, place = _places(low, ijk[number])
-    # an item is a fine node with a parent; a cell connects its items of the same parent
-    cell, corner, parent = np.nonzero(is_parent)
-    item = 8 * number[cell, corner] + place[is_parent]
-    hub = 8 * len(nodes) + 8 * cell + parent
-    size = 8 * (len(nodes) + len(corners))
-    graph = coo_array((np.ones(len(item), np.int8), (item, hub)), shape=(size, size))
-    label = connected_components(graph, directed=False)[1]
-    items = np.unique(item)
-    copies = np.zeros(8 * len(nodes), np.int64)
-    of_parent = encode_morton(ijk[items // 8] // 2 + CORNERS[items % 8])
-    copies[items] = _numbers(of_parent, label[items], copied[items // 8])
-    by_node = copies.reshape(-1, 8)
-    own = by_node.any(axis=1)
-    coarse = encode_morton(low[:, None] + CORNERS)
-    np.maximum.at(coarse, (cell, parent), (coarse[cell, parent] // COPIES * COPIES) + copies[item])
-    return ParentCopies(nodes[own], by_node[own]), np.unique(coarse, axis=0)
-
-
-def _numbers(parent: Indices, part: Indices, copied: Indices) -> Indices:
-    """Return the number (n,) of the copy of a parent for each item, from 0 at each parent.
-
-    Only parts with a copied node have numbers of their own. The last number is shared.
-
-    parent : (n,) parent of each item
-    part   : (n,) connected part
-    copied : (n,) whether the item's node has copies
-    """
-    distinct, place = np.unique(part, return_inverse=True)
-    of_part = np.zeros(len(distinct), np.int64)
-    of_part[place] = parent
-    counts = np.zeros(len(distinct), bool)
-    counts[place[copied]] = True
-    order = np.lexsort([distinct, of_part])
-    counted = np.cumsum(counts[order]) - counts[order]
-    first = np.searchsorted(of_part[order], of_part[order])
-    number = np.empty(len(distinct), np.int64)
-    number[order] = np.minimum(counted - counted[first], COPIES - 1) * counts[order]
-    return number[place]

@@ -99,12 +99,12 @@ class Multigrid:
         unknowns, comm = self.unknowns, self.unknowns.comm
         size, everywhere = unknowns.size, node_keys(unknowns)
         offsets = self.bodies.offsets(comm, everywhere)
-        lattice = unknowns.lattice
-        copies = CoarseCopies(lattice.copies, lattice.table, offsets[: lattice.owned])
-        keys = (everywhere + offsets)[to_host(unknowns.free)]
+        free = to_host(unknowns.free)
+        copies = CoarseCopies(unknowns.lattice, everywhere, offsets)
+        keys = (everywhere + offsets)[free]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         count = max(asked - 1, 1) if asked else None
-        coarse = grids(comm, keys, copies, unknowns.total, COARSEST, count)
+        coarse = grids(comm, keys, copies, free, unknowns.total, COARSEST, count)
         if asked and asked != len(coarse) + 1:
             nearest = len(coarse) + 1
             raise InputError(
@@ -112,14 +112,13 @@ class Multigrid:
             )
         stiff = 1 / self.fine.compliance
         galerkin = GalerkinSum(
-            unknowns, elasticity, t2, coarse[0], everywhere, offsets, copies, stiff
+            unknowns, elasticity, t2, coarse[0], everywhere, offsets, copies.of_nodes, stiff
         )
         rows = np.arange(size)[:, None] + size * np.arange(3)
         sizes = 3 * size, 3 * unknowns.total
         levels: list[Level] = []
-        for number, grid in enumerate(coarse):
-            parents = copies.of(number, keys)
-            p = interpolation(comm, keys, parents, rows, sizes, grid, unknowns.memory.mat_type)
+        for grid in coarse:
+            p = interpolation(comm, keys, rows, sizes, grid, unknowns.memory.mat_type)
             self.owned.callback(p.destroy)
             levels.append(Level(grid, p, PETSc.Mat() if levels else galerkin.matrix))
             self.owned.callback(levels[-1].matrix.destroy)

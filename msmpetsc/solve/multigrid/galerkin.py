@@ -36,7 +36,7 @@ from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
-from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies, in_cells
+from msmpetsc.solve.multigrid.coarse_copies import DIGITS, MOST_COPIES, in_cells
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
@@ -49,9 +49,6 @@ UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
 HELD = 100.0
 # entries of a row of ``_write_coarse`` [-]
 COARSE = 41
-# place value of each corner's copy in a number, and their limit [-]
-DIGITS = COPIES ** np.arange(8)
-MOST_COPIES = COPIES**8
 # pairs (36, 2) of corners: the upper triangle of a cell's matrix
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])
 
@@ -152,7 +149,7 @@ class GalerkinSum:
 
     keys    : (l,) key of each local node
     offsets : (l,) key of the offset of each node's body (free_bodies.Bodies.offsets)
-    copies  : copies of the coarse nodes
+    copies  : (l, 8) copies of each node's parents (multigrid.coarse_copies)
     stiff   : (owned,) stiffness of each node at rest [N/m]
     matrix  : AIJ of block size 3; it has values after the first ``update``
     """
@@ -165,13 +162,13 @@ class GalerkinSum:
         grid: CoarseGrid,
         keys: Indices,
         offsets: Indices,
-        copies: CoarseCopies,
+        copies: Array,
         stiff: Floats,
     ):
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
         corners, self.springs, self.nodes, self.cells = _by_cell(
-            unknowns, elasticity, decode_morton(keys), offsets, copies.of(0, keys + offsets)
+            unknowns, elasticity, decode_morton(keys), offsets, copies
         )
         self.weights, self.full = (like(lattice.nodes, a) for a in (t2**0.5 * WEIGHTS, SYMMETRIC))
         of_springs = OF_SPRINGS._replace(factor=t2 * OF_SPRINGS.factor)
@@ -259,7 +256,7 @@ def set_block_size(matrix: PETSc.Mat) -> None:
 
 
 def _by_cell(
-    unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, offsets: Indices, parents: Indices
+    unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, offsets: Indices, parents: Array
 ) -> tuple[Indices, ByCell, ByCell, ByCell]:
     """Return the corners' keys of this rank's coarse cells, and its springs, nodes and cells.
 
@@ -302,7 +299,7 @@ def _by_cell(
     return cells + of_corners, of_springs, of_nodes, of_cells
 
 
-def _copies_of_corners(low: Indices, ijk: Indices, nodes: Indices, parents: Indices) -> Indices:
+def _copies_of_corners(low: Indices, ijk: Indices, nodes: Indices, parents: Array) -> Indices:
     """Return the copies of the corners of each item's coarse cell as digits of a number (n,).
 
     low     : (n, 3) index of the coarse cells

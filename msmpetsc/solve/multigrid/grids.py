@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Indices, Mask
+from msmpetsc.backend.arrays import Array, Indices, Mask
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import decode_morton, encode_morton
@@ -24,9 +24,14 @@ SHRINK = 0.7
 
 @dataclass(frozen=True)
 class CoarseGrid:
-    """Nodes of a coarse level, numbered over all ranks by their Morton keys ``table``."""
+    """Nodes of a coarse level.
+
+    table  : their Morton keys, which number them over all ranks
+    copies : (n, 8) copies of the parents of this rank's finer nodes (multigrid.coarse_copies)
+    """
 
     table: SortedKeys
+    copies: Array
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -40,7 +45,7 @@ def node_keys(unknowns: Unknowns) -> Indices:
     return table.with_ghosts(unknowns.lattice.ghosts, table.keys)
 
 
-def parents_of(keys: Indices, copies: Indices) -> tuple[Indices, Mask]:
+def parents_of(keys: Indices, copies: Array) -> tuple[Indices, Mask]:
     """Return the keys (n, 8) of the parents of nodes (n,), and a mask (n, 8).
 
     Corners that lie beyond an even index have no weight; the mask leaves them out.
@@ -56,6 +61,7 @@ def grids(
     comm: MPI.Comm,
     keys: Indices,
     copies: CoarseCopies,
+    free: Indices,
     total: int,
     coarsest: int,
     count: int | None = None,
@@ -65,19 +71,20 @@ def grids(
     Coarsening stops early if the next grid would not be much smaller. Raises InputError if PETSc
     cannot number the nodes.
 
+    free     : (n,) local numbers of the nodes in the lattice
     total    : number of nodes on all ranks
     coarsest : most nodes of the last grid, if ``count`` is None
     count    : number of grids
     """
     levels: list[CoarseGrid] = []
     while not levels or (total > coarsest if count is None else len(levels) < count):
-        parents, needed = parents_of(keys, copies.of(len(levels), keys))
-        grid = CoarseGrid(SortedKeys(comm, parents[needed]))
+        of_parents = copies.of(levels[-1].table) if levels else copies.of_nodes[free]
+        parents, needed = parents_of(keys, of_parents)
+        grid = CoarseGrid(SortedKeys(comm, parents[needed]), of_parents)
         refuse_unknowns(grid.table.total)
         if levels and grid.table.total > SHRINK * total:
             break
         levels.append(grid)
-        copies.add(grid.table)
         total, keys = grid.table.total, grid.table.keys
     return levels
 
@@ -85,7 +92,6 @@ def grids(
 def interpolation(
     comm: MPI.Comm,
     keys: Indices,
-    copies: Indices,
     rows: Indices,
     row_sizes: tuple[int, int],
     grid: CoarseGrid,
@@ -94,11 +100,10 @@ def interpolation(
     """Return the interpolation P (AIJ) from a coarse grid to finer nodes (collective).
 
     keys      : (n,) keys of this rank's finer nodes that are unknowns
-    copies    : (n, 8) copies of their parents
     rows      : (n, 3) local rows of their x, y and z
     row_sizes : numbers of rows of this rank and of all ranks
     """
-    parents, needed = parents_of(keys, copies)
+    parents, needed = parents_of(keys, grid.copies)
     number = np.full(parents.shape, -1)
     number[needed] = grid.table.find(parents[needed])
     count = needed.sum(axis=1)

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from conftest import WORKERS, run
-from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
+from hierarchies import CELL, COMM, LATTICES, ORIGIN, at, build, hierarchy
+from lattices import block
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.morton import decode_morton, encode_morton
 from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 from msmpetsc.solve.multigrid.grids import grids
@@ -55,12 +57,42 @@ def test_grids_have_the_neighbours_of_half_an_index_until_one_is_small(
 
 
 def test_a_grid_that_is_not_much_smaller_is_none():
-    """Bodies far from each other: each keeps a node, however coarse the grid."""
-    ijk = 64 * np.argwhere(np.ones((3, 3, 3)))
-    keys = encode_morton(ijk)
-    far = keys, CoarseCopies(None, SortedKeys(COMM, keys), np.zeros(27, int)), 27
-    assert [grid.table.total for grid in grids(COMM, *far, coarsest=1)] == [27]
+    """Bodies far from each other: each keeps its corners, however coarse the grid."""
+    lattice = build(COMM, 64 * np.argwhere(np.ones((3, 3, 3))))
+    keys = lattice.table.keys
+    copies = CoarseCopies(lattice, keys, np.zeros_like(keys))
+    far = keys, copies, np.arange(216), 216
+    assert [grid.table.total for grid in grids(COMM, *far, coarsest=1)] == [216]
     assert len(grids(COMM, *far, coarsest=800)) == 1  # a coarse level there always is
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_no_coarse_node_spans_a_gap(name: str):
+    """The fine nodes of each coarse node hang together by cells."""
+    with hierarchy(COMM, build(COMM, LATTICES[name])) as case:
+        p = case.interpolation(0)[::3, ::3] > 0
+        cells = csr_array(
+            (
+                np.ones(case.lattice.cells.size),
+                case.lattice.cells.ravel(),
+                np.arange(0, case.lattice.cells.size + 1, 8),
+            ),
+        )
+        shares = (cells.T @ cells).toarray() > 0
+        for nodes in p.T:
+            assert connected_components(shares[np.ix_(nodes, nodes)])[0] == 1
+
+
+@pytest.mark.parametrize("gap", [1, 2, 3, 4, 6])
+def test_gaps_cost_no_iterations(gap: int):
+    """Two prongs clamped at their root; joined by coarse grids they took four times as many."""
+    prong = block(40, 5, 5)
+    fork = np.concatenate([prong, at(prong, 0, 5 + gap, 0), block(1, 10 + gap, 5)])
+    with hierarchy(COMM, build(COMM, np.unique(fork, axis=0), pins=True), time_step=1e3) as case:
+        several = case.iterations(1e-6, rough=False)
+    with hierarchy(COMM, build(COMM, prong, pins=True), time_step=1e3) as case:
+        single = case.iterations(1e-6, rough=False)
+    assert several <= single + 2
 
 
 def test_hierarchies_of_several_ranks_are_those_of_one():

@@ -37,7 +37,7 @@ from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 # most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
-COARSEST = 800
+COARSEST = 1000
 # most surface points that the finest smoother couples; its matrix is dense
 POINTS = 200
 # lower end of a smoother's range, over its upper end; coarse grids damp the rest

@@ -183,35 +183,45 @@ def _join_unseen(
 ) -> None:
     """Join the pieces between the lines with the parts that they bound.
 
-    A ray inwards from the piece meets another piece of the part. If it meets none, the part is a
-    tip that the ray leaves at once, or the ray crosses the bulk of the cell.
+    A ray inwards from the piece meets another piece of the part. If it meets none, the middle of
+    the ray may see a point of the grid: no surface lies between them. Else the piece is a tip.
     """
     pieces = len(met)
-    size = np.zeros(len(parent), np.int64)
-    for n in range(len(parent)):
-        size[root(parent, n)] += 1
-    bulk = -1
-    for k in range(pieces):
-        if met[k].sum() > 0 and (bulk < 0 or size[root(parent, k)] > size[root(parent, bulk)]):
-            bulk = k
     for t in range(len(triangles)):
         k = piece[t]
         if flush[t] > 0 or met[k].sum() > 0:
             continue
-        other, length = _ray_inwards(triangles, t)
+        start, inwards, length = _ray_inwards(triangles, t)
+        other, length = _first_met(triangles, start, inwards, length, t)
         if other >= 0:
             _join(parent, k, piece[other])
-        elif length > 1.0 / LINES:
-            bulk = k if bulk < 0 else bulk
-            _join(parent, k, bulk)
+        elif length > ROUNDING:
+            seen = _seen_point(triangles, start + 0.5 * length * inwards)
+            if seen >= 0:
+                _join(parent, k, pieces + seen)
 
 
 @njit()
-def _ray_inwards(triangles: Rows, t: int) -> tuple[int, float]:
-    """Return the triangle that a ray inwards from triangle t meets in the cell, and its length.
+def _seen_point(triangles: Rows, start: Floats) -> int:
+    """Return a point of the grid, of the 8 around ``start`` (3,), that no triangle hides, or -1."""
+    for v in range(8):
+        number, way = 0, np.empty(3)
+        for axis in range(3):
+            k = int(np.floor(start[axis] * LINES - PLACE[axis])) + (v >> axis & 1)
+            k = min(max(k, 0), LINES - 1)
+            number = LINES * number + k
+            way[axis] = (k + PLACE[axis]) / LINES - start[axis]
+        if _first_met(triangles, start, way, 1.0, -1)[0] < 0:
+            return number
+    return -1
 
-    The ray begins at the middle of the triangle's part in the cell. If it meets no triangle, the
-    result is -1 and its length in the cell.
+
+@njit()
+def _ray_inwards(triangles: Rows, t: int) -> tuple[Floats, Floats, float]:
+    """Return start (3,), direction (3,) and length in the cell of a ray inwards from triangle t.
+
+    The ray begins at the middle of the triangle's part in the cell. Its length is 0 if the triangle
+    has no area in the cell.
     """
     work, part, other = np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3))
     part[:3] = triangles[t]
@@ -219,33 +229,45 @@ def _ray_inwards(triangles: Rows, t: int) -> tuple[int, float]:
     for axis in range(3):
         size = clip_between(part, size, axis, (0.0, 1.0), work, other)
         part[:size] = other[:size]
-    if size == 0:
-        return -1, 0.0
     start = np.zeros(3)
     for n in range(size):
         start += part[n] / size
     inwards = -np.cross(triangles[t, 1] - triangles[t, 0], triangles[t, 2] - triangles[t, 0])
     area = np.sqrt((inwards * inwards).sum())
-    if area == 0.0:
-        return -1, 0.0
+    if size == 0 or area == 0.0:
+        return start, inwards, 0.0
     inwards /= area
     length = np.inf
     for axis in range(3):
         if inwards[axis] != 0.0:
             wall = 1.0 if inwards[axis] > 0 else 0.0
             length = min(length, (wall - start[axis]) / inwards[axis])
+    return start, inwards, length
+
+
+@njit()
+def _first_met(
+    triangles: Rows, start: Floats, way: Floats, length: float, left_out: int
+) -> tuple[int, float]:
+    """Return the first triangle through which a ray leaves the body, and its height on the ray.
+
+    If there is none, the result is -1 and the length. Moeller and Trumbore 1997.
+
+    start, way : (3,) start of the ray inside the body, and its direction
+    length     : the greatest height, in units of the direction's length
+    left_out   : triangle that does not count
+    """
     met = -1
     for n in range(len(triangles)):
         e, f = triangles[n, 1] - triangles[n, 0], triangles[n, 2] - triangles[n, 0]
-        # Moeller and Trumbore 1997
-        across = np.cross(inwards, f)
+        across = np.cross(way, f)
         volume = (e * across).sum()
         # the ray may only leave the body
-        if n == t or volume >= 0.0:
+        if n == left_out or volume >= 0.0:
             continue
         offset = start - triangles[n, 0]
         u, turned = (offset * across).sum() / volume, np.cross(offset, e)
-        v, height = (inwards * turned).sum() / volume, (f * turned).sum() / volume
+        v, height = (way * turned).sum() / volume, (f * turned).sum() / volume
         if 0.0 < height < length and u >= 0.0 and v >= 0.0 and u + v <= 1.0:
             met, length = n, height
     return met, length

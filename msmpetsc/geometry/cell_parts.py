@@ -8,8 +8,8 @@ A slit narrower than a cell leaves several parts of the body in a cell. They are
 2. In a cell of several pieces, LINES x LINES lines run along each axis, and their crossings form a
    grid of points. Neighbouring points, and points and pieces, are joined if the line between them
    is inside the body. Pieces that are joined bound the same part.
-   A piece between the lines is joined with the piece that a ray inwards from it meets, or with a
-   point that the middle of the ray sees.
+   A piece between the lines is joined with the piece that a ray inwards from it meets. If it meets
+   none, the piece is joined with a point that the middle of the ray sees.
 3. Parts of two cells meet in a common face if a piece crosses it. They also meet if a line of
    step 2 crosses it inside both parts. For two cells of a single part, a point of it decides.
 

@@ -14,8 +14,8 @@ import trimesh
 from block_scene import play
 from conftest import result_on
 from mpi4py import MPI
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, shortest_path
 from surfaces import body_of
 
 from msmpetsc import open as open_result
@@ -318,6 +318,38 @@ def test_the_layers_of_a_folded_sheet_move_apart(tmp_path: Path):
     """Through a gap of a quarter of a cell as through a gap of 1.2 cells, which needs no copies."""
     narrow, wide = (sheet_opening(tmp_path / str(gap), gap) for gap in (0.25, 1.2))
     assert narrow == pytest.approx(wide, rel=0.05)
+
+
+def spiral(thickness: float, gap: float) -> tuple[trimesh.Trimesh, np.ndarray, float]:
+    """A sheet rolled up in 2.5 turns [cells], tilted; the middles of its ends, and its length."""
+    angle = np.linspace(0, 5 * np.pi, 161)
+    along = np.stack([np.cos(angle), np.sin(angle)], 1)
+    radius = 1.5 + (thickness + gap) * angle / (2 * np.pi)
+    inner, outer = radius[:, None] * along, (radius + thickness)[:, None] * along
+    middle = (inner + outer) / 2
+    outline = np.concatenate([inner, outer[::-1]])
+    rolled = manifold3d.CrossSection([outline], manifold3d.FillRule.NonZero).extrude(3).to_mesh()
+    body = trimesh.Trimesh(rolled.vert_properties[:, :3], rolled.tri_verts)
+    turned = trimesh.transformations.euler_matrix(0.4, 0.3, 0.2)
+    ends = np.append(middle[[0, -1]], np.full((2, 1), 1.5), axis=1) @ turned[:3, :3].T
+    body.apply_transform(turned)
+    body.apply_scale(H)
+    return body, ends * H, float(np.linalg.norm(np.diff(middle, axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize(("thickness", "gap"), [(0.8, 0.1), (1.2, 0.2), (0.6, 0.4)])
+def test_a_rolled_sheet_is_as_long_in_the_lattice(thickness: float, gap: float):
+    """From cell to cell by common nodes, a diagonal a step; joined layers would be a short cut."""
+    body, ends, length = spiral(thickness, gap)
+    cages, net = cages_of(body)
+    corners = csr_array(
+        (np.ones(net.cells.size), net.cells.ravel(), np.arange(0, net.cells.size + 1, 8))
+    )
+    middles = cages.grids.node_positions(net.ijk)[net.cells[:, 0]] + H / 2
+    near = [np.flatnonzero(np.linalg.norm(middles - end, axis=1) < 0.9 * H) for end in ends]
+    steps = shortest_path(corners @ corners.T, unweighted=True, indices=near[0])[:, near[1]]
+    # cells near an end may be of the next layer, so the longest way counts
+    assert np.isfinite(steps).all() and steps.max() > 0.85 * length / np.sqrt(3)
 
 
 @pytest.mark.parametrize("gap", [0.1, 0.3])

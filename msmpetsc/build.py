@@ -44,6 +44,7 @@ from msmpetsc.geometry.surface import (
     examine,
     joined,
 )
+from msmpetsc.geometry.thickness import Thickness, thickness_of
 from msmpetsc.lattice.embedded_surface import surface_part
 from msmpetsc.lattice.initial_state import InitialState, ReadState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice
@@ -230,7 +231,7 @@ def build_model(
     loads += areas
     lattice = replace(lattice, pressed=tuple(pressure.part for pressure in pressures))
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
-    return Model(
+    model = Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
         lattice=clamped(scene, lattice, masks, finder, points),
         embedding=geometry.embedding if scene.output.surface else None,
@@ -250,6 +251,9 @@ def build_model(
         obstacles=tuple(obstacles),
         holders=holders,
     )
+    # at the end, because a refused scene needs no advice
+    warn_of_thin_bodies(bodies, lattice.cell_size, scene.material.law)
+    return model
 
 
 def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
@@ -287,16 +291,15 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
     """Return the prepared bodies, with their surfaces on rank 0 only (collective)."""
     prepared = on_root(comm, lambda: [*_prepared(scene)]) or []
-    facts = comm.bcast([(report, bounds_of(surface)) for surface, report in prepared])
-    surfaces: list[Surface | None] = [surface for surface, _ in prepared] or [None] * len(facts)
+    facts = comm.bcast([(each[1], bounds_of(each[0]), each[2]) for each in prepared])
+    surfaces: list[Surface | None] = [each[0] for each in prepared] or [None] * len(facts)
     return tuple(
-        BodySurface(comm, surface, report, bounds)
-        for surface, (report, bounds) in zip(surfaces, facts, strict=True)
+        BodySurface(comm, surface, *fact) for surface, fact in zip(surfaces, facts, strict=True)
     )
 
 
-def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
-    """Yield each body's checked surface and its report; prepare each distinct mesh once."""
+def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport, Thickness | None]]:
+    """Yield each body's checked surface, report and thickness; prepare each distinct mesh once."""
     shapes: dict[str, Surface] = {}
     for path, mesh in scene.meshes.items():
         prefix = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
@@ -313,7 +316,8 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
         for warning in warnings:
             log.warning("%s%s: %s", prefix, mesh.source, warning)
         # a point of no triangle may lie in no cell: compact() drops it
-        yield replace(compact(surface.points, surface.triangles), groups=surface.groups), report
+        whole = compact(surface.points, surface.triangles)
+        yield replace(whole, groups=surface.groups), report, thickness_of(whole, report)
 
 
 def _check_size(surface: Surface, size: float | None) -> list[str]:
@@ -345,7 +349,6 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     cell_size = cages.cell_size or choose_cell_size(
         bodies, cages.count or 0, cages.max_cells, cages.boundary
     )
-    warn_of_thin_bodies(bodies, cell_size)
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 

@@ -22,6 +22,7 @@ from msmpetsc.build import Model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
+from msmpetsc.geometry.thickness import thickness_words
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.results.disk import plain_errors, refuse_no_file, write_whole
 from msmpetsc.results.progress_bar import duration
@@ -44,6 +45,8 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
             mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
         name = f"body.{number}" if len(model.bodies) > 1 else "body"
         size = " x ".join(f"{length:.4g}" for length in body.bounds[1] - body.bounds[0])
+        if body.thickness:
+            mesh = f"{thickness_words(body.thickness.cells(lattice.cell_size))}; {mesh}"
         log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
     own_pinned = int(lattice.pinned[: lattice.owned].sum())
     cells, springs, pinned = (

@@ -21,6 +21,7 @@ from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_ins
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
+from msmpetsc.geometry.thickness import Thickness
 from msmpetsc.geometry.valid_cells import (
     Slab,
     cells_of_gaps,
@@ -44,13 +45,15 @@ TOLERANCE = 0.01
 class BodySurface:
     """A surface on rank 0, with its measures on all ranks.
 
-    bounds : (2, 3) bounding box [m]
+    bounds    : (2, 3) bounding box [m]
+    thickness : of a closed body; None if it was not measured
     """
 
     comm: MPI.Comm
     surface: Surface | None
     report: SurfaceReport
     bounds: Rows
+    thickness: Thickness | None = None
 
 
 @dataclass(frozen=True)

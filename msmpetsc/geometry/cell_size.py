@@ -8,10 +8,9 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import TOLERANCE, BodySurface, refuse_beyond_memory, slabs_of_all
 from msmpetsc.geometry.grid import BodyGrids
+from msmpetsc.geometry.thickness import ADVISED, ENOUGH
+from msmpetsc.scene.body import SOLID
 
-# cells across the mean thickness of a body [-]; a strip of 2 cells bends 3% too little,
-# a strip of 1 cell 16% too little
-ACROSS = 2
 # cell sizes tried [-]; real models need 3 to 6
 SEARCH_LIMIT = 30
 
@@ -70,22 +69,36 @@ def estimated_size(bodies: Sequence[BodySurface], count: float) -> float:
     return float(roots.real.max())
 
 
-def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float) -> None:
-    """Warn of bodies with a mean thickness 2 V / A of less than a cell [m].
+def advised_size(bodies: Sequence[BodySurface], law: str) -> float:
+    """Return the cell size [m] on which the thin tenth of each body bends enough.
 
-    They may be too stiff in bending.
+    It is infinity if all bodies are open.
     """
-    for number, body in enumerate(bodies):
-        thickness = 2 * abs(body.report.volume) / body.report.area
-        if body.report.closed and thickness < cell_size:
-            advised = thickness / ACROSS
-            log.warning(
-                "%s is %.3g m thick on average (2 V / A), %.2g of a cell, and may be too stiff in "
-                "bending: cages.count = %d or cages.cell_size = %.2g puts %d cells there",
-                f"body.{number}" if len(bodies) > 1 else "the body",
-                thickness, thickness / cell_size,
-                float(f"{estimated_cells(bodies, advised):.2g}"), advised, ACROSS,
-            )  # fmt: skip
+    sizes = [body.thickness.advised_size(law) for body in bodies if body.thickness]
+    return min(sizes, default=np.inf)
+
+
+def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float, law: str) -> None:
+    """Warn if a tenth of a body is so thin that it bends too little on cells of side h [m].
+
+    law : law of the material, which decides whether walls along the grid count
+    """
+    bending = {
+        number: body.thickness.bending(cell_size, law)
+        for number, body in enumerate(bodies)
+        if body.thickness
+    }
+    thinnest = min(bending, key=lambda number: bending[number], default=None)
+    if thinnest is None or bending[thinnest] >= ENOUGH:
+        return
+    advised = advised_size(bodies, law)
+    log.warning(
+        "a tenth of %s is so thin%s that it bends by about %.2g of theory: cages.count = %d or "
+        "cages.cell_size = %.2g makes that %.2g",
+        f"body.{thinnest}" if len(bodies) > 1 else "the body",
+        ", and askew to the grid," if law == SOLID else "",
+        bending[thinnest], float(f"{estimated_cells(bodies, advised):.2g}"), advised, ADVISED,
+    )  # fmt: skip
 
 
 def _next_guess(excess: dict[float, float], nearest: float) -> float:

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from block_scene import CELL, block_scene
+from block_scene import CELL, DENSITY, YOUNG, block_scene
 from conftest import run
 from mpi4py import MPI
 from one_process import answers_on
@@ -29,7 +29,9 @@ UP, ASIDE = [{"time": 0.05, "by": [0, 0, 0.02]}], [{"time": 0.05, "by": [0.01, 0
 
 
 def build(folder: Path, **tables) -> Model:
-    scene = load_scene(block_scene(folder, **{"time": TIME} | tables))
+    # two cells of springs are too stiff, and told
+    material = {"young_modulus": YOUNG, "density": DENSITY, "law": "neo-hookean"}
+    scene = load_scene(block_scene(folder, **{"time": TIME, "material": material} | tables))
     return build_model(MPI.COMM_SELF, scene)
 
 
@@ -191,7 +193,8 @@ def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
     }.items():
         scene = load_scene(path, [f'cages.boundary="{boundary}"'])
         log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))
-        assert ("INFO", f"body of 0.45 x 0.45 x 0.2 m; {told}") in heard()
+        thick = "1.6 cells thick, 1.6 at its thin tenth"
+        assert ("INFO", f"body of 0.45 x 0.45 x 0.2 m; {thick}; {told}") in heard()
 
 
 def test_ranks_refuse_and_warn_as_one(tmp_path):
@@ -216,3 +219,20 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
     for words, status, answers in zip(tables, (2, 2, 0), answers_on(2, commands), strict=True):
         assert [given for given, _ in answers] == [status] * 2 and answers[1][1] == "", answers
         assert answers[0][1].count(words) == 1
+
+
+def test_any_number_of_ranks_tells_the_same_thickness(tmp_path):
+    """A strip of half a cell, turned by 30 degrees."""
+    turned = {"rotate": {"axis": [0, 1, 0], "degrees": 30}}
+    solid = {"young_modulus": YOUNG, "density": DENSITY, "law": "neo-hookean"}
+    path = block_scene(tmp_path, [1, 0.25, CELL / 2], time=TIME, material=solid)
+    mesh = {"source": "scene.ply", "prepare": [turned]}
+    told = []
+    for ranks in (1, 2):
+        words = "run", path, "-o", tmp_path / "x.h5", "--overwrite", "--frames", "1"
+        ((_, text), *others) = answers_on(ranks, [[*words, "--set", f"mesh={toml_value(mesh)}"]])[0]
+        assert all(text == "" for _, text in others)
+        told.append([line for line in text.splitlines() if "thick" in line or "theory" in line])
+    assert told[0] == told[1] and len(told[0]) == 2, told
+    assert "so thin, and askew to the grid, that it bends by about 0.21 of theory" in told[0][0]
+    assert "0.5 cells thick, 0.5 at its thin tenth" in told[0][1]

@@ -7,7 +7,6 @@ marked or not: so all cells of the half-open test must be there, and none beyond
 Enclosed cells: scipy.ndimage.label on the dense grid."""
 
 import os
-import re
 import tracemalloc
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from surfaces import body_of, surface_of
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, fill
-from msmpetsc.geometry.cell_size import choose_cell_size, estimated_cells, warn_of_thin_bodies
+from msmpetsc.geometry.cell_size import choose_cell_size
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import unpacked
 from msmpetsc.geometry.morton import COPIES
@@ -317,20 +316,3 @@ def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
 def test_more_cells_than_allowed_are_not_sought():
     with pytest.raises(InputError, match=r"cages.count: 151 is more than cages.max_cells = 150"):
         choose_cell_size([aligned_box()], 151, max_cells=150)
-
-
-def test_bodies_thinner_than_a_cell_are_told_by_their_numbers(caplog):
-    plate, cube = (body_of(trimesh.creation.box(sides)) for sides in ((1, 1, 0.02), (1, 1, 1)))
-    warn_of_thin_bodies([cube, plate], 0.1)
-    (line,) = caplog.messages
-    assert line.startswith("body.1 is 0.0192 m thick on average (2 V / A), 0.19 of a cell")
-    cells, size = (
-        float(re.search(f"{name} = ([^ ]*)", line)[1]) for name in ("count", "cell_size")
-    )
-    warn_of_thin_bodies([cube, plate], size)
-    assert len(caplog.messages) == 1 and estimated_cells([cube, plate], size) == pytest.approx(
-        cells, rel=0.05
-    )
-    warn_of_thin_bodies([cube], 0.3)
-    warn_of_thin_bodies([aligned_box(lid=False)], 0.5)
-    assert len(caplog.messages) == 1

@@ -7,6 +7,7 @@ of a deflection elsewhere.
 import numpy as np
 import skfem
 import trimesh
+from scipy.sparse import eye_array
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 from small_strain import E, box, factorise, hessian, lattice_of
 
@@ -126,6 +127,45 @@ def strip_error(thickness: float, poisson: float, length: int = 20, width: int =
     lattice = lattice_of(mesh, 1.0, poisson=poisson, offset=(0, 0, (1 - thickness) / 2))
     tip = clamped(lattice, np.array([0.0, 0.0, 1.0]))
     return tip / beam(poisson, length, width, thickness) - 1
+
+
+def bent_strip(
+    thickness: float, degrees: float, poisson: float | None, length: int = 20, width: int = 3
+) -> float:
+    """Return how far a strip's ends turn under moments, over the exact solution.
+
+    Cells have sides of 1 m. The strip is turned about its width, so its wall lies across the grid.
+    """
+    turn = trimesh.transformations.rotation_matrix(np.radians(degrees), (0, 1, 0))
+    mesh = trimesh.creation.box((length, width, thickness)).apply_transform(turn)
+    lattice = lattice_of(mesh, 1.0, poisson=poisson, offset=(0.3, 0.5, 0.7))
+    middles = (np.arange(16) + 0.5) / 16 - 0.5
+    y, z = (each.ravel() for each in np.meshgrid(width * middles, thickness * middles))
+    f = np.zeros_like(lattice.nodes)
+    for end in (-0.5, 0.5):
+        # inside by rounding
+        face = np.column_stack([np.full(y.size, (1 - 1e-9) * end * length), y, z])
+        pull = np.sign(end) * z[:, None] / (z**2).sum() * turn[:3, 0]
+        f += spread(lattice, face @ turn[:3, :3].T, pull)
+    K = hessian(lattice)
+    # makes the singular K definite; f is in balance
+    K = K + 1e-10 * K.diagonal().max() * eye_array(f.size)
+    turned = f.ravel() @ factorise(K)(f.ravel())
+    return float(turned / (12 * length / (E * width * thickness**3)))
+
+
+def spread(lattice: Lattice, points: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    """Return the forces (n, 3) [N] on nodes that forces at points (p, 3) [m] cause."""
+    origin, f = lattice.nodes.min(axis=0), np.zeros_like(lattice.nodes)
+    grid = np.rint((lattice.nodes - origin) / lattice.cell_size).astype(int)
+    number = {tuple(place): node for node, place in enumerate(grid)}
+    x = (points - origin) / lattice.cell_size
+    first = np.floor(x).astype(int)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, x - first, 1 - x + first).prod(axis=1)
+        nodes = [number[tuple(place)] for place in first + corner]
+        np.add.at(f, nodes, weight[:, None] * forces)
+    return f
 
 
 def fem_tip(poisson: float) -> float:

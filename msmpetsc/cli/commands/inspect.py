@@ -27,6 +27,7 @@ from msmpetsc.geometry.cell_size import (
     warn_of_thin_bodies,
 )
 from msmpetsc.geometry.surface import Surface
+from msmpetsc.geometry.thickness import thickness_words
 from msmpetsc.lattice.partition_counts import Partition, count_partition
 from msmpetsc.lattice.region import listed
 from msmpetsc.lattice.topology import topology_of
@@ -57,8 +58,8 @@ NO_LIMIT = 1 << 40
 
 def partition_of(
     bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int
-) -> tuple[Partition, int]:
-    """Return the partition among ``ranks`` ranks, and the number of cells of the counted lattice.
+) -> tuple[Partition, int, float]:
+    """Return the partition among ``ranks`` ranks, the counted cells, and the scene's cell size [m].
 
     If the scene has more than MOST_BUILT cells, a lattice of about MOST_BUILT cells is counted,
     and its counts are scaled.
@@ -68,11 +69,12 @@ def partition_of(
     built = h
     if wanted.count or cells > MOST_BUILT:
         built = choose_cell_size(bodies, int(min(cells, MOST_BUILT)), NO_LIMIT, wanted.boundary)
-    warn_of_thin_bodies(bodies, h if cells > MOST_BUILT else built)
     cages = fill(bodies, built, NO_LIMIT, wanted.boundary)
     partition = count_partition(topology_of(cages), ranks)
     counted = int(partition.cells.sum())
-    return partition.scaled(round(cells)) if cells > MOST_BUILT else partition, counted
+    if cells > MOST_BUILT:
+        return partition.scaled(round(cells)), counted, h
+    return partition, counted, built
 
 
 def run(args: argparse.Namespace) -> int:
@@ -85,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
     before = peak_memory()
     bodies = read_bodies(MPI.COMM_WORLD, scene)
     mesh_bytes = peak_memory() - before
-    partition, counted = partition_of(bodies, scene.cages, args.ranks)
+    partition, counted, cell_size = partition_of(bodies, scene.cages, args.ranks)
+    warn_of_thin_bodies(bodies, cell_size, scene.material.law)
     cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning(
@@ -103,6 +106,7 @@ def run(args: argparse.Namespace) -> int:
         "scene": str(args.scene), "ranks": args.ranks, "counted": counted,
         "counts": counts_of(scene, partition),
         "memory": over_ranks(memory_of(partition, stored, mesh_bytes)), "groups": groups,
+        "thickness": [body.thickness and body.thickness.cells(cell_size) for body in bodies],
     }  # fmt: skip
     if args.json:
         print(json.dumps(report, indent=1))
@@ -133,7 +137,7 @@ def over_ranks(values: Floats) -> dict[str, float]:
 
 
 def print_counts(report: dict[str, Any]) -> None:
-    """Print the counts as a table, then the groups of each mesh."""
+    """Print the counts as a table, the thickness of each body and the groups of each mesh."""
     counts = report["counts"]
     how = "counted"
     if report["counted"] != counts["cells"]["all"]:
@@ -146,6 +150,14 @@ def print_counts(report: dict[str, Any]) -> None:
         else:
             columns = f"{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}"
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
+    several = len(report["thickness"]) > 1
+    thick = [
+        f"{f'body.{number}' if several else 'the body'} is {thickness_words(cells)}"
+        for number, cells in enumerate(report["thickness"])
+        if cells
+    ]
+    if thick:
+        print("\n".join(["", *thick]))
     for source, groups in report["groups"].items():
         if groups:
             names = [f"{name} ({count} triangles)" for name, count in groups.items()]

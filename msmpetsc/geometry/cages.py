@@ -37,8 +37,10 @@ LEAST_FILL = 1e-3
 FULL = 1 - 1e-9
 # lattice memory a cell [byte]; a lower bound, as a whole run takes four times as much
 CELL_BYTES = 1000
-# relative error of a cell count or a volume [-]; far below the lattice's own error
+# relative error of a cell count [-]; far below the lattice's own error
 TOLERANCE = 0.01
+# relative error of a body's mass that is told [-]; far above rounding
+MASS_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,7 @@ def fill(
     refuse_beyond_memory(comm, sum(cells.count(comm) for cells in slabs))
     of_parts = _parts_of_all(bodies, grids, slabs)
     cells = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, slabs, strict=True)]
+    _warn_of_masses(bodies, cells, cell_size, boundary)
     keys = encode_morton(
         np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(cells)])
     )
@@ -266,8 +269,6 @@ def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | No
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
         fills, moments = cells.columns.inside(cells.boundary)
-        filled = np.clip(fills, 0, 1).mean(axis=(1, 2, 3)).sum() + cells.interior
-        _warn_of_parts(abs(body.report.volume), body.comm.allreduce(filled) * grid.cell_size**3)
         fills, moments = fills.transpose(0, *(1 + axes)), moments[:, axes]
     elif body.report.closed:
         log.warning(
@@ -288,18 +289,41 @@ def _clipped(fills: Rows, moments: Rows) -> Fill:
     return clipped, moments + (clipped - fills).mean(axis=(1, 2, 3))[:, None] / 4
 
 
-def _warn_of_parts(enclosed: float, filled: float) -> None:
-    """Warn if the volume [m^3] of the cells differs from the mesh, a sum of signed parts."""
-    if abs(filled - enclosed) > TOLERANCE * enclosed:
+def _warn_of_masses(
+    bodies: Sequence[BodySurface],
+    cells: Sequence[tuple[Indices, Array, Fill | None]],
+    cell_size: float,
+    boundary: str,
+) -> None:
+    """Warn of the body whose mass differs most from its mesh, a sum of signed parts (collective).
+
+    cells : grid index, kind and fill of this rank's cells of each body
+    """
+    own = [len(ijk) if cut is None else cut[0].mean(axis=(1, 2, 3)).sum() for ijk, _, cut in cells]
+    filled = bodies[0].comm.allreduce(np.array(own, float)) * cell_size**3
+    enclosed = np.array([abs(body.report.volume) for body in bodies])
+    # the volume of an open mesh has no meaning
+    closed = np.array([body.report.closed for body in bodies])
+    excess = np.divide(filled, enclosed, out=np.ones(len(bodies)), where=closed) - 1
+    worst = int(np.argmax(abs(excess)))
+    if abs(excess[worst]) <= MASS_TOLERANCE:
+        return
+    if boundary != "fill":
+        remedy = f'cages.boundary = "{boundary}" counts cut cells whole'
+    elif cells[worst][2] is None:
+        remedy = "cut cells count whole"
+    elif excess[worst] > 0:
+        remedy = 'some parts are wound inwards, which prepare = ["orient"] mends'
+    else:
         remedy = (
-            'some parts are wound inwards, which prepare = ["orient"] mends'
-            if filled > enclosed
-            else 'parts overlap or lie in each other; prepare = ["union"] joins them, '
+            'parts overlap or lie in each other; prepare = ["union"] joins them, '
             '["orient"] makes cavities of inner parts'
         )
-        log.warning(
-            "the mesh encloses %.4g m^3, its cells hold %.4g m^3: %s", enclosed, filled, remedy
-        )
+    log.warning(
+        "the mesh%s encloses %.4g m^3, its cells hold %.4g m^3 and weigh %.3g times as much: %s",
+        f" of body.{worst}" if len(bodies) > 1 else "",
+        enclosed[worst], filled[worst], 1 + excess[worst], remedy,
+    )  # fmt: skip
 
 
 def slabs_of_all(

@@ -177,3 +177,28 @@ def test_parts_that_weigh_otherwise_than_the_mesh_are_told(
     with caplog.at_level(logging.WARNING, "msmpetsc"):
         fill([body_of(trimesh.util.concatenate(parts))], 0.1)
     assert words in caplog.text and bool(words) == bool(caplog.text)
+
+
+def test_the_body_whose_mass_is_most_off_is_told_once(caplog: pytest.LogCaptureFixture):
+    """Whole cells of 0.2 m: 6^3 around a cube of 1.1 m, 5^3 around a cube of 1 m."""
+    cubes = [body_of(trimesh.creation.box((side,) * 3)) for side in (1.0, 1.1)]
+    box = trimesh.creation.box((1, 1, 1))
+    box.update_faces(np.arange(12) > 0)
+    holed = body_of(box)
+    fill(cubes, 0.2)
+    fill([holed, cubes[0]], 0.2, boundary="whole")
+    assert "weigh" not in caplog.text
+    fill([holed, *cubes], 0.2, boundary="whole")
+    (line,) = [line for line in caplog.messages if "weigh" in line]
+    assert line == (
+        "the mesh of body.2 encloses 1.331 m^3, its cells hold 1.728 m^3 and weigh 1.3 times as "
+        'much: cages.boundary = "whole" counts cut cells whole'
+    )
+
+
+@pytest.mark.parametrize("excess", [0.015, 0.025])
+def test_a_fiftieth_of_the_mass_is_the_limit(excess: float, caplog: pytest.LogCaptureFixture):
+    """A cube a little shorter than ten whole cells."""
+    short = trimesh.creation.box((1, 1, 1 / (1 + excess)))
+    fill([body_of(short)], 0.1, boundary="whole")
+    assert ("weigh" in caplog.text) == (excess > 0.02)

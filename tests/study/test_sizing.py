@@ -323,6 +323,26 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
         assert bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.7 * target
 
 
+@pytest.mark.parametrize(("advised", "finest"), [(900, 1000), (3000, 8000), (1e6, 64_000)])
+def test_thin_walls_are_tried_on_enough_cells(
+    tmp_path: Path, monkeypatch, advised: float, finest: int
+):
+    """And the plan says so if it chooses fewer: 0.1 takes a hundred."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    bench = Bodies(cell_error=1.0)
+    monkeypatch.setattr(
+        trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b])
+    )
+    asked = Asked(0.1, 10, 64_000, advised=advised)
+    sizer = Sizer(tmp_path / "scene.toml", bench, asked, print)
+    plan = sizer.plan()
+    assert max(each.cells for each in sizer.trials) == finest
+    told = (
+        f"on {plan.choice.cells} cells a tenth of a body bends too little; {advised:.2g} would do"
+    )
+    assert plan.met and plan.bounds == [f"the cells: {told}"]
+
+
 def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path, monkeypatch):
     """At 300 cells, as where a foot folds one way or another: no lattice has the error asked for,
     or little less."""

@@ -9,7 +9,12 @@ from contextlib import closing, nullcontext, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 
+from mpi4py import MPI
+
+from msmpetsc.build import read_bodies
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.cell_size import advised_size, estimated_cells
+from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.time import STATIC
 from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Processes
@@ -64,7 +69,10 @@ def print_command(args: argparse.Namespace, choice: Choice) -> str:
 
 def size_all(args: argparse.Namespace, target: float) -> SizePlan:
     """Run the trials in a temporary folder, print each trial, and return the plan."""
-    asked = Asked(target, args.frames, args.cells, args.ranks)
+    scene = load_scene(args.scene)
+    bodies = read_bodies(MPI.COMM_SELF, scene)
+    advised = estimated_cells(bodies, advised_size(bodies, scene.material.law))
+    asked = Asked(target, args.frames, args.cells, args.ranks, advised)
     with (
         tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder,
         closing(Processes()) as processes,

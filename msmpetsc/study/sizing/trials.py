@@ -40,7 +40,7 @@ IMPLICIT: tuple[IntegratorName, ...] = ("bdf2", "implicit-euler")
 HALVINGS, SUBSTEP_HALVINGS = 6, 3
 # ratio of cells below which the distance of a finer to a coarser lattice is random
 DISTINCT_CELLS = 4
-# cells of the finest lattice in the first round
+# least cells of the finest lattice in the first round
 START_CELLS = 1000
 # target / error of the finest step; so that this step stands for the true motion
 STEP_MARGIN = 8
@@ -66,15 +66,17 @@ AIM, ACCEPTED = 0.9, 0.75
 class Asked(NamedTuple):
     """The request of a plan.
 
-    target : largest surface error [-]
-    frames : number of frames, from the scene's first, that the trials run
-    cells  : cells of the finest trial lattice; the scene's number if None
+    target  : largest surface error [-]
+    frames  : number of frames, from the scene's first, that the trials run
+    cells   : cells of the finest trial lattice; the scene's number if None
+    advised : cells on which the thin tenth of each body bends enough
     """
 
     target: float
     frames: int
     cells: int | None = None
     ranks: int = 1
+    advised: float = 0.0
 
 
 class Sizer:
@@ -95,6 +97,7 @@ class Sizer:
             )
         self.cells = count
         self.report = report
+        self.advised = asked.advised
         self.step = self.as_given.time.step
         steps = min(asked.frames, self.as_given.time.steps)
         self.is_static = self.as_given.time.integrator == STATIC
@@ -111,7 +114,8 @@ class Sizer:
         """Return the plan from trials, first on few cells. Raises InputError if too few succeed."""
         most = self.cells
         ratio = REFINEMENT**3
-        while self.cells >= ratio * START_CELLS:
+        # coarse cells lock thin walls, which hides the order of their error
+        while self.cells >= ratio * max(START_CELLS, self.advised):
             self.cells //= ratio
         while True:
             self.bounds.clear()
@@ -416,7 +420,13 @@ class Sizer:
     def _bounds(self, plan: SizePlan, model: CostModel) -> list[str]:
         """Return the reasons why the error of a plan is not smaller, or not certain."""
         inverted = inverted_bound(self.trials, self.as_given.material.law)
-        bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted]
+        thin = []
+        if plan.choice.cells < self.advised:
+            thin = [
+                f"the cells: on {plan.choice.cells} cells a tenth of a body bends too little; "
+                f"{self.advised:.2g} would do"
+            ]
+        bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted, *thin]
         if not plan.met:
             bounds += size_bounds(model, self.target, bool(self.bounds))
         return bounds

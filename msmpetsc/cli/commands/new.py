@@ -9,7 +9,7 @@ fraction of the period of its slowest motion.
 import argparse
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
 
@@ -26,8 +26,10 @@ from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.prepare import part_labels
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import Surface, SurfaceReport, check_encloses, examine
+from msmpetsc.geometry.thickness import Thickness, thickness_of, thickness_words
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.results.disk import write_whole
+from msmpetsc.scene.body import SOLID
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
@@ -53,8 +55,6 @@ DEFAULT_SIZE = 0.3
 SLENDER = 2.5
 # height above the ground of a falling body [its height]
 DROP = 0.2
-# cells across the mean thickness [-]; so that thin parts bend
-ACROSS = 3
 # least and largest number of cells [-]; so that a run takes a minute or so
 CELLS = (1000, 8000)
 # Young's modulus of a falling body [rho g H]; its own weight compresses it by 1%
@@ -174,7 +174,7 @@ class MeshMeasures:
     up        : upward axis of the file
     unit      : unit of the file [m]; None if neither metres nor millimetres give a usual size
     sides     : of the bounding box (3,) [m]
-    thickness : mean thickness, twice the volume over the area [m]
+    thickness : [m]; None if the mesh is open
     volume    : enclosed volume [m^3]
     report    : in the unit of the file
     parts     : fraction of the area (p,) of each connected part, the largest first
@@ -183,7 +183,7 @@ class MeshMeasures:
     up: str
     unit: float | None
     sides: Floats
-    thickness: float
+    thickness: Thickness | None
     volume: float
     triangles: int
     report: SurfaceReport
@@ -226,7 +226,7 @@ def measured(surface: Surface, report: SurfaceReport, up: str) -> MeshMeasures:
         up=up,
         unit=unit,
         sides=metres * (sides[[0, 2, 1]] if up == "y" else sides),
-        thickness=metres * (2 * abs(report.volume) / report.area),
+        thickness=thickness_of(replace(surface, points=metres * surface.points), report),
         volume=metres**3 * abs(report.volume),
         triangles=len(surface.triangles),
         report=report,
@@ -336,15 +336,18 @@ def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
 
 def _cages(body: MeshMeasures) -> list[str]:
     """Return the lines of the table of cages."""
-    target = body.volume * (ACROSS / body.thickness) ** 3
-    count = int(float(plain(min(max(target, CELLS[0]), CELLS[1]), 1)))
-    across = body.thickness * (count / body.volume) ** (1 / 3)
+    # by volume alone, as for a body of many cells
+    size = body.thickness.advised_size(SOLID) if body.thickness else np.inf
+    count = int(float(plain(min(max(body.volume / size**3, CELLS[0]), CELLS[1]), 1)))
+    cell_size = (body.volume / count) ** (1 / 3)
+    words = (
+        f"; the body is {thickness_words(body.thickness.cells(cell_size))}"
+        if body.thickness
+        else ""
+    )
     return [
         "[cages]",
-        line(
-            f"count = {count}",
-            f"cells; {across:.1f} across the mean thickness of {body.thickness:.2g} m",
-        ),
+        line(f"count = {count}", f"cells{words}"),
     ]
 
 

@@ -64,9 +64,10 @@ def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
     touching = surface.points[surface.points[:, 2] <= 1e-6]
     far = np.linalg.norm(pinned(model)[:, None] - touching, axis=2).min(axis=1)
     assert len(far) > 0 and far.max() <= np.sqrt(3) * model.lattice.cell_size
-    (told,) = (
+    told, thin = (
         record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
     )
+    assert "is so thin" in thin
     assert (
         told.startswith("pin.0.region only grazes the body")
         and "the region beyond (0, 0, 1e-06) m" in told

@@ -338,7 +338,7 @@ def test_thin_walls_are_tried_on_enough_cells(
     plan = sizer.plan()
     assert max(each.cells for each in sizer.trials) == finest
     told = (
-        f"on {plan.choice.cells} cells a tenth of a body bends too little; {advised:.2g} would do"
+        f"on {plan.choice.cells} cells a tenth of a body bends too little; {advised:.0f} would do"
     )
     assert plan.met and plan.bounds == [f"the cells: {told}"]
 

@@ -424,7 +424,7 @@ class Sizer:
         if plan.choice.cells < self.advised:
             thin = [
                 f"the cells: on {plan.choice.cells} cells a tenth of a body bends too little; "
-                f"{self.advised:.2g} would do"
+                f"{float(f'{self.advised:.2g}'):.0f} would do"
             ]
         bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted, *thin]
         if not plan.met:

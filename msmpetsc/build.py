@@ -45,10 +45,11 @@ from msmpetsc.geometry.surface import (
     joined,
 )
 from msmpetsc.geometry.thickness import Thickness, thickness_of
+from msmpetsc.lattice.cell_materials import cell_materials
 from msmpetsc.lattice.embedded_surface import surface_part
 from msmpetsc.lattice.initial_state import InitialState, ReadState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice
-from msmpetsc.lattice.region import Finder, cell_materials, nearest_in_bodies
+from msmpetsc.lattice.region import Finder, nearest_in_bodies
 from msmpetsc.lattice.topology import Topology, topology_of
 from msmpetsc.scene.motion import Gravity, Traction
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable

@@ -64,7 +64,9 @@ def pressed(law: str) -> Case:
 
 CASES = {
     "parts": Case({
+        "cages": {"cell_size": 0.11},
         "part": [{"region": FAR, "density": 777.7, "young_modulus": 3e4},
+                 {"region": TILTED, "young_modulus": 2e5},
                  {"region": {"painted": [3]}, "density": 9e3}],
         "pin": [{"region": LEFT}], "gravity": GRAVITY, "time": steps(3, 1 / 64),
     }),

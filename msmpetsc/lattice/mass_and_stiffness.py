@@ -60,7 +60,7 @@ def law_of_springs(
         law = LawConstants(mass, material.spring, material.spring)
     else:
         owned = len(net.octants)
-        made_of = _made_of(net, material, of_cells)
+        made_of, net = _made_of(net, material, of_cells)
         fills = np.ones((len(net.cells), 8)) if net.fills is None else net.fills
         of_pairs = spring_fractions(fills)
         of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
@@ -73,12 +73,26 @@ def law_of_springs(
     return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
 
 
-def _made_of(net: Topology, material: Material, of_cells: MaterialOfCells | None) -> CellMaterial:
-    """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given."""
-    if of_cells:
-        return of_cells(net.keys)
-    of_all = material.density, material.spring, material.poisson_ratio
-    return CellMaterial(*(np.full(len(net.cells), value) for value in of_all))
+def _made_of(
+    net: Topology, material: Material, of_cells: MaterialOfCells | None
+) -> tuple[CellMaterial, Topology]:
+    """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given.
+
+    The fills and moments of the topology returned are those of the cells' stiffness.
+    """
+    count = len(net.cells)
+    if not of_cells:
+        of_all = material.density, material.spring, material.poisson_ratio
+        density, spring, poisson = (np.full(count, value) for value in of_all)
+        return CellMaterial(density, spring, poisson), net
+    made_of = of_cells(net.keys)
+    if made_of.mixed is None or len(made_of.mixed.rows) == 0:
+        return made_of, net
+    rows, of_stiffness, moments_of_stiffness = made_of.mixed
+    fills = np.ones((count, 8)) if net.fills is None else net.fills.copy()
+    moments = np.full((count, 3), 1 / 12) if net.moments is None else net.moments.copy()
+    fills[rows], moments[rows] = of_stiffness, moments_of_stiffness
+    return made_of, net._replace(fills=fills, moments=moments)
 
 
 def law_of_solid(
@@ -89,7 +103,7 @@ def law_of_solid(
     A corner's lumped mass is proportional to the diagonal of L, as with springs.
     """
     owned, count = len(net.octants), len(net.cells)
-    made_of = _made_of(net, material, of_cells)
+    made_of, net = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
     forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
     volume = np.ones(count)

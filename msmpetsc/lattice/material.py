@@ -6,10 +6,11 @@ Central forces between the corners of cubes give Poisson's ratio 1/4 for any sti
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices
+from msmpetsc.backend.arrays import Floats, Indices, Rows
 
 # A spring's kind is its squared length in cells: 1 for an edge, 2 for a face diagonal,
 # 3 for a space diagonal.
@@ -23,6 +24,19 @@ ISOTROPIC = np.array([0, 40, 16, 9]) / 40
 STEPS_A_PERIOD = 40
 
 
+class MixedCells(NamedTuple):
+    """Cells of several materials (lattice.cell_materials).
+
+    rows    : (k,) numbers of the cells
+    fills   : (k, 8) fills of their corners (geometry.fill_fractions), weighted by stiffness
+    moments : (k, 3) second moments of their stiffness
+    """
+
+    rows: Indices
+    fills: Rows
+    moments: Rows
+
+
 @dataclass(frozen=True)
 class CellMaterial:
     """Material constants of cells.
@@ -30,11 +44,13 @@ class CellMaterial:
     density : (c,) [kg/m^3]
     spring  : (c,) Young's modulus [Pa], or spring stiffness [N/m] if the material gives it
     poisson : (c,) Poisson's ratio [-], unused by springs
+    mixed   : cells of several stiffnesses; None if there are none
     """
 
     density: Floats
     spring: Floats
     poisson: Floats
+    mixed: MixedCells | None = None
 
 
 # material of the cells with these keys (c,)

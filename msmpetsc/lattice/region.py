@@ -1,13 +1,13 @@
-"""Nodes and cells in the regions of a scene, the materials of its parts, and its probes.
+"""Nodes and samples of cells in the regions of a scene, and its probes.
 
 A region selects material (README: regions and clamps):
 
 - a node, if the region contains the body's point nearest to the node;
 - also a node in the region, if the body is in the region half a cell away;
-- a cell, if the region contains the centroid of its part inside the surface.
+- a share of a cell, by samples of the cell (lattice.cell_materials).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -22,13 +22,12 @@ from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.inside import frame_of, inside_bodies
-from msmpetsc.geometry.morton import decode_morton, encode_morton
+from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.geometry.surface import Surface, examine, is_inside
 from msmpetsc.geometry.valid_cells import Slab
+from msmpetsc.lattice.cell_samples import COUNT, CellSamples
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.lattice.material import CellMaterial, MaterialOfCells
-from msmpetsc.scene.body import Material, OwnMaterial, Region
-from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.body import Region
 from msmpetsc.scene.schema import OfBody, Probe
 
 # tolerance of a point's place in a cell [cell]; a point of a face lies in both cells
@@ -90,9 +89,7 @@ class Finder:
         region = table.table.region
         if region.is_of_mesh:
             nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
-            where = around = self._of_mesh(
-                table, nodes, lattice.nodes, lattice.body, are_nodes=True
-            )
+            where = around = self._nodes_of_mesh(table, nodes, lattice.nodes, lattice.body)
         else:
             where = self.inside(table, points, lattice.body)
             around = self.inside(table, lattice.nodes, lattice.body)
@@ -131,26 +128,60 @@ class Finder:
         """Return the mask (n,) of points (n, 3) [m] of bodies (n,) in a table's region of space."""
         return inside_bodies(table.table.region, points, self.bounds, body, table.body)
 
-    def find_cells(self, table: OfBody, keys: Indices) -> Mask:
-        """Return the mask (c,) of cells in a region (collective).
+    def find_samples(self, table: OfBody, cells: CellSamples) -> Mask:
+        """Return the mask (c, s) of the samples of cells in a region (collective).
 
-        A cell is in a region of space if the centroid of its part inside the surface is. A region
-        of painted points or of a group has the cells of ``_of_mesh``.
-
-        keys : (c,) keys of the cells
-
-        Raises InputError on all ranks if the region has no cell.
+        A region of painted points has all samples of the cells that contain these points. An open
+        group has all samples of the cells that its triangles cut.
         """
-        grids, ijk = self.cages.grids, decode_morton(keys)
-        fills = self.cages.of_cells(keys, self.cages.fills)
-        middles = grids.node_positions(ijk + (0.5 if fills is None else _middles(fills)))
-        if table.table.region.is_of_mesh:
-            where = self._of_mesh(table, ijk, middles, grids.body_of(ijk), are_nodes=False)
+        where = np.zeros((len(cells.ijk), COUNT), bool)
+        if table.table.region.painted is not None:
+            keys = encode_morton(self._painted_cells(table))
+            where[np.isin(encode_morton(cells.ijk), keys)] = True
+        elif table.table.region.group is not None:
+            for number, group, marked in self._groups(table, are_nodes=False):
+                is_marked = np.isin(encode_morton(cells.ijk), marked)
+                if not examine(group).closed:
+                    where[is_marked] = True
+                    continue
+                # a cell that no triangle cuts is inside or outside as a whole
+                whole = np.flatnonzero((cells.body == number) & ~is_marked)
+                middles = self.cages.grids.node_positions(cells.ijk[whole] + 0.5)
+                where[whole] |= is_inside(group, middles)[:, None]
+                for rows, points in cells.points(np.flatnonzero(is_marked)):
+                    where[rows] |= is_inside(group, points).reshape(-1, COUNT)
         else:
-            where = self.inside(table, middles, grids.body_of(ijk))
-        if not self.comm.allreduce(bool(where.any()), MPI.LOR):
-            raise InputError(f"{table.key}.region holds the centre of no cell{self.extents(table)}")
+            for rows, points in cells.points(np.arange(len(where))):
+                body = np.repeat(cells.body[rows], COUNT)
+                where[rows] = self.inside(table, points, body).reshape(-1, COUNT)
         return where
+
+    def check_holds(self, table: OfBody, where: Mask) -> None:
+        """Raise InputError on all ranks if no sample (c, s) is in a table's region (collective)."""
+        if not self.comm.allreduce(bool(where.any()), MPI.LOR):
+            raise InputError(f"{table.key}.region holds no part of a cell{self.extents(table)}")
+
+    def shares_inside(self, cells: CellSamples, rows: Indices) -> Rows:
+        """Return the share (k, s) of each sample of cells (k,) in the part inside (collective).
+
+        Samples outside the surface have no share; if all are outside, all have the same.
+        """
+        is_within = np.ones((len(rows), COUNT), bool)
+        cut = cells.cut(rows)
+        points = [np.zeros((0, 3)), *(points for _, points in cells.points(cut))]
+        to_root = Route(self.comm, np.zeros(COUNT * len(cut), np.int64))
+        given = to_root.send(np.concatenate(points))
+        body = to_root.send(np.repeat(cells.body[cut], COUNT))
+        where = np.zeros(len(given), bool)
+        for number in np.unique(body):
+            surface = self.bodies[number].surface
+            # Rank 0 alone receives points, and it has the surfaces.
+            assert surface is not None
+            where[body == number] = is_inside(surface, given[body == number])
+        is_within[np.isin(rows, cut)] = to_root.answer(where).reshape(-1, COUNT)
+        is_within[~is_within.any(axis=1)] = True
+        shares: Rows = is_within / is_within.sum(axis=1, keepdims=True)
+        return shares
 
     def extents(self, table: OfBody) -> str:
         """Return the extents of a table's bodies and of its region, for a message."""
@@ -161,36 +192,42 @@ class Finder:
             "" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}"
         )
 
-    def _of_mesh(
-        self, table: OfBody, ijk: Indices, points: Positions, body: Indices, are_nodes: bool
-    ) -> Mask:
-        """Return the mask (n,) of nodes or cells in a region of painted points or a group.
+    def _nodes_of_mesh(self, table: OfBody, ijk: Indices, points: Positions, body: Indices) -> Mask:
+        """Return the mask (n,) of nodes in a region of painted points or a group (collective).
 
-        A group has the nodes that are nearest to a point of its triangles, or the cells that its
-        triangles cut. A closed group has the nodes and cells that it encloses, too (collective).
+        A group has the nodes that are nearest to a point of its triangles. A closed group has the
+        nodes that it encloses, too.
 
-        ijk    : (n, 3) grid index of the nodes or cells
-        points : (n, 3) positions of the nodes, or centroids of the cells [m]
+        ijk    : (n, 3) grid index of the nodes
+        points : (n, 3) positions of the nodes [m]
         body   : (n,) number of the body of each
         """
-        grids, region = self.cages.grids, table.table.region
-        if region.group is None:
-            cells = self._painted_cells(table)
-            keys = encode_morton((cells[:, None] + CORNERS).reshape(-1, 3) if are_nodes else cells)
+        if table.table.region.group is None:
+            keys = encode_morton((self._painted_cells(table)[:, None] + CORNERS).reshape(-1, 3))
             return np.isin(encode_morton(ijk), keys)
         where = np.zeros(len(ijk), bool)
-        for number, group in groups_named(
-            self.bodies, table.key + ".region", region.group, table.body
-        ).items():
-            grid = grids.grids[number]
-            # A node is nearest to the points of the cell centred at the node.
-            corners = grid.to_cells(group.points)[group.triangles] + are_nodes / 2
-            marked = marked_cells(corners, grid.shape + 1, Slab(0, grid.shape[0] + 1))
-            where |= np.isin(encode_morton(ijk), encode_morton(marked + grids.first(number)))
+        for number, group, marked in self._groups(table, are_nodes=True):
+            where |= np.isin(encode_morton(ijk), marked)
             if examine(group).closed:
                 own = np.flatnonzero(body == number)
                 where[own] |= is_inside(group, points[own])
         return where
+
+    def _groups(self, table: OfBody, are_nodes: bool) -> Iterator[tuple[int, Surface, Indices]]:
+        """Yield body number, triangles and keys (k,) of a region's groups (collective).
+
+        The keys are of the cells that the triangles cut, or of the nodes nearest to them.
+        """
+        group = table.table.region.group
+        assert group is not None
+        for number, surface in groups_named(
+            self.bodies, table.key + ".region", group, table.body
+        ).items():
+            grid = self.cages.grids.grids[number]
+            # A node is nearest to the points of the cell centred at the node.
+            corners = grid.to_cells(surface.points)[surface.triangles] + are_nodes / 2
+            marked = marked_cells(corners, grid.shape + 1, Slab(0, grid.shape[0] + 1))
+            yield number, surface, encode_morton(marked + self.cages.grids.first(number))
 
     def _painted_cells(self, table: OfBody) -> Indices:
         """Return the cells (k, 3) that contain painted points of a body's surface (collective)."""
@@ -295,15 +332,6 @@ def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list
     return points
 
 
-def _middles(fills: Rows) -> Rows:
-    """Return the centroid (c, 3) of the part of cells inside the surface, from corner fills.
-
-    It is in cells from the low corner. ``fills`` are (c, 2, 2, 2).
-    """
-    whole = fills.sum(axis=(1, 2, 3))
-    return np.stack([fills.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
-
-
 def _box_text(low: Floats, high: Floats) -> str:
     ends = (", ".join(f"{x:.4g}" for x in end) for end in (low, high))
     return "from ({}) to ({}) m".format(*ends)
@@ -323,45 +351,6 @@ def _extent(region: Region, bounds: Rows) -> str:
     normal = region.half_space.normal
     at, along = (", ".join(f"{x:.4g}" for x in vector) for vector in (point, normal))
     return f"beyond ({at}) m towards ({along})"
-
-
-def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
-    """Return the function from keys (c,) of cells to their materials (collective).
-
-    It is None if all cells have the scene's material.
-    """
-    material = scene.material
-    parts = list(scene.tables("part"))
-    bodies = [body.material for body in scene.body]
-    if not parts and not any(bodies):
-        return None
-    (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)
-    density, stiffness, poisson = (
-        np.array([_own(own, material, name) for own in bodies or [None]])
-        for name in ("density", spring, "poisson_ratio")
-    )
-
-    def of_cells(keys: Indices) -> CellMaterial:
-        body = finder.cages.grids.body_of(decode_morton(keys))
-        cells = CellMaterial(density[body], stiffness[body], poisson[body])
-        for part in parts:
-            where, own = finder.find_cells(part, keys), part.table
-            for values, name in (
-                (cells.density, "density"),
-                (cells.spring, spring),
-                (cells.poisson, "poisson_ratio"),
-            ):
-                if getattr(own, name) is not None:
-                    values[where] = getattr(own, name)
-        return cells
-
-    return of_cells
-
-
-def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
-    """Return a constant of a body's own material, or the scene's if the body gives none."""
-    value: float | None = getattr(own, name, None)
-    return float(getattr(material, name)) if value is None else value
 
 
 class ProbePoints:

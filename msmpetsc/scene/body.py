@@ -189,10 +189,7 @@ class HalfSpace(Table):
 
 
 class Region(Table):
-    """A part of space or of a mesh that selects nodes at rest.
-
-    A region of a part selects cells, by their centres.
-    """
+    """A part of space or of a mesh that selects nodes at rest; for a part, shares of cells."""
 
     one_of = ("box", "sphere", "half_space", "painted", "group")
     box: Box | None = Field(
@@ -210,8 +207,8 @@ class Region(Table):
     group: GroupName | None = Field(
         None,
         description="name or number of a group in the mesh file (msmpetsc inspect lists groups); "
-        "selects the nodes nearest to its triangles, or for a part the cells that these cut, and "
-        "everything inside a closed group [-]",
+        "selects the nodes nearest to its triangles, or for a part of an open group the cells that "
+        "these cut, and everything inside a closed group [-]",
     )
     relative: bool = Field(
         False,
@@ -261,6 +258,8 @@ class OwnMaterial(Table):
 
 
 class PartTable(OwnMaterial):
-    """Cells of another material. A cell in several parts takes each key from the last of them."""
+    """A region of another material. A place in several parts takes each key from the last."""
 
-    region: Region = Field(description="cells of the part, selected by their centres")
+    region: Region = Field(
+        description="place of the part; a cell that its edge cuts has the mean by volume"
+    )

@@ -178,18 +178,15 @@ def _stress(subject: Drawable) -> Colouring:
 
 
 def _part(subject: Drawable) -> Colouring:
-    """Return the field of part numbers; a cell belongs to the last part that contains it."""
+    """Return the field of part numbers; a point belongs to the last part that contains it."""
     rest = subject.rest
     parts = list(subject.scene.tables("part"))
     if not parts:
         raise InputError(f"--colour part: the scene of {subject.name} has no part")
-    number = np.zeros(len(rest.cells))
+    number = np.zeros(len(rest.points))
     for index, part in enumerate(parts):
-        number[rest.find_cells(part)] = index + 1
-    of_points = number[rest.cells_around(rest.points, rest.body_of_point)]
-    return Colouring(
-        "part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts))
-    )
+        number[rest.points_in(part)] = index + 1
+    return Colouring("part", "", lambda _: number, 1.0, ("material", *(part.key for part in parts)))
 
 
 COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {

@@ -72,14 +72,13 @@ class BodiesAtRest:
         """Centres (c, 3) of the cells [m]."""
         return np.asarray(self.nodes[self.cells].mean(axis=1))
 
-    def find_cells(self, table: OfBody) -> Mask:
-        """Return which cells (c,) lie in a table's region; none if the result lacks the region."""
+    def points_in(self, table: OfBody) -> Mask:
+        """Return which points (v,) lie in a table's region; none if the result lacks the region."""
         region = table.table.region
         if region.is_of_mesh:
-            return np.isin(np.arange(len(self.cells)), self._painted_cells(table))
-        return inside_bodies(
-            region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body
-        )
+            around = self.cells_around(self.points, self.body_of_point)
+            return np.isin(around, self._painted_cells(table))
+        return inside_bodies(region, self.points, self.bounds, self.body_of_point, table.body)
 
     def _painted_cells(self, table: OfBody) -> Indices:
         """Return the numbers of the cells that contain the painted points of a table's region."""

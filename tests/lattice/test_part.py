@@ -162,8 +162,8 @@ def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp
 
 
 def test_a_part_of_no_cell_is_refused(tmp_path: Path):
-    corner = {"box": [[0, 0, 0], [0.05, 0.05, 0.05]]}  # holds a node, but the middle of no cell
+    corner = {"box": [[0, 0, 0], [5e-4, 5e-4, 5e-4]]}  # holds a node, but no sample of a cell
     with pytest.raises(
-        InputError, match=r"^part\.0\.region holds the centre of no cell: the body is from .* m$"
+        InputError, match=r"^part\.0\.region holds no part of a cell: the body is from .* m$"
     ):
         of_parts(tmp_path, {"region": corner, "density": 1.0})

@@ -1,0 +1,108 @@
+"""Materials of cells that lie in parts of a scene; means in cells that an interface cuts.
+
+Samples stand for the part of a cell inside the surface. A cell that an interface cuts has the
+means of E, nu and rho over its samples. So uniform strain costs the energy of the materials.
+Bending also depends on where in the cell the stiff material is. So the fills and second moments of
+the cell are those of its stiffness, with w = E / mean E at the samples:
+
+    s_v = 8 int w N_v,      int w x^2,      N_v the trilinear function of a corner.
+
+With a single material w is 1. If a material is empty, these are the numbers of a cell that the
+surface cuts (lattice.cut_cells, lattice.cell_moments).
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows
+from msmpetsc.lattice.cell_samples import COUNT, CellSamples
+from msmpetsc.lattice.material import CellMaterial, MaterialOfCells, MixedCells
+from msmpetsc.lattice.region import Finder
+from msmpetsc.scene.body import Material, OwnMaterial
+from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import OfBody
+
+
+class Constant(NamedTuple):
+    """A material constant of cells (c,), and of the samples (k, s) of cells that are cut."""
+
+    of_cells: Floats
+    of_samples: Rows
+
+
+def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
+    """Return the function from keys (c,) of cells to their materials (collective).
+
+    It is None if all cells have the scene's material.
+    """
+    material = scene.material
+    parts = list(scene.tables("part"))
+    bodies = [body.material for body in scene.body]
+    if not parts and not any(bodies):
+        return None
+    (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)
+    names = "density", spring, "poisson_ratio"
+    of_bodies = [
+        np.array([_own(own, material, name) for own in bodies or [None]]) for name in names
+    ]
+
+    def of_cells(keys: Indices) -> CellMaterial:
+        cells = CellSamples(finder.cages, keys)
+        masks = [finder.find_samples(part, cells) for part in parts]
+        is_cut = np.zeros(len(keys), bool)
+        for mask in masks:
+            is_cut |= mask.any(axis=1) & ~mask.all(axis=1)
+        cut = np.flatnonzero(is_cut)
+        shares = finder.shares_inside(cells, cut)
+        for part, mask in zip(parts, masks, strict=True):
+            mask[cut] &= shares > 0
+            finder.check_holds(part, mask)
+        density, spring, poisson = (
+            _means([*_own_values(parts, masks, name)], of_body[cells.body], cut, shares)
+            for name, of_body in zip(names, of_bodies, strict=True)
+        )
+        weights = shares * (spring.of_samples / spring.of_cells[cut, None] - 1)
+        rows = np.flatnonzero(weights.any(axis=1))
+        weighted = cells.weighted(cut[rows], weights[rows])
+        return CellMaterial(
+            density.of_cells, spring.of_cells, poisson.of_cells, MixedCells(cut[rows], *weighted)
+        )
+
+    return of_cells
+
+
+def _means(
+    own_values: Sequence[tuple[float, Mask]], of_cells: Floats, cut: Indices, shares: Rows
+) -> Constant:
+    """Return a constant of cells; a cell among ``cut`` (k,) has the mean over its samples.
+
+    own_values : values of parts and the masks (c, s) of their samples; the last one counts
+    of_cells   : (c,) value outside the parts; it is changed
+    shares     : (k, s) share of each sample of the cells ``cut``
+    """
+    of_samples = np.repeat(of_cells[cut, None], COUNT, axis=1)
+    for value, mask in own_values:
+        of_cells[mask.all(axis=1)] = value
+        of_samples[mask[cut]] = value
+    # relative to a sample inside: equal samples have exactly their value as mean
+    first = np.take_along_axis(of_samples, shares.argmax(axis=1)[:, None], axis=1)
+    of_cells[cut] = first[:, 0] + (shares * (of_samples - first)).sum(axis=1)
+    return Constant(of_cells, of_samples)
+
+
+def _own_values(
+    parts: Sequence[OfBody], masks: Sequence[Mask], name: str
+) -> Iterator[tuple[float, Mask]]:
+    """Yield the value and the mask (c, s) of each part that gives a constant."""
+    for part, mask in zip(parts, masks, strict=True):
+        value = getattr(part.table, name)
+        if value is not None:
+            yield value, mask
+
+
+def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
+    """Return a constant of a body's own material, or the scene's if the body gives none."""
+    value: float | None = getattr(own, name, None)
+    return float(getattr(material, name)) if value is None else value

@@ -13,8 +13,8 @@ from msmpetsc.lattice.cell_moments import forms_of
 # samples of a cell [-]
 COUNT = 64
 # samples (s, 3) of a whole cell from its middle [cells]: a lattice rule, which has 64
-# values along each axis. The share beyond a plane errs by 1.5% rms. It errs by 0.8% at most for
-# a plane along the grid, where a grid of 4^3 samples errs by 12%.
+# values along each axis. The share beyond a plane errs by 1.5% rms. For a plane along
+# the grid it errs by 0.8% at most, where a grid of 4^3 samples errs by 12%.
 OF_WHOLE = (np.arange(COUNT)[:, None] * [1, 7, 23] % COUNT + 0.5) / COUNT - 0.5
 
 

@@ -217,9 +217,6 @@ CHECKPOINT = {
     "history_q": Field("f8", (2, "n", 3), "m", "node positions in the history of BDF2"),
     "history_v": Field("f8", (2, "n", 3), "m/s", "node velocities in the history of BDF2"),
     "lowest_mode": Field("f8", (2, "n", 3), "kg^-1/2", "mode of least curvature"),
-    "loads": Field(
-        "f8", (2, "n"), "-", "compression of nodes at which the load factor was computed"
-    ),
     "sides": Field("f8", (2, "n", "o"), "1", "side of a thin obstacle on which a node is"),
 }
 GROUPS = {

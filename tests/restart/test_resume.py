@@ -143,10 +143,7 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
         with TimeLoop(COMM, read, build_model(COMM, read)) as simulation:
             return simulation.saved.rows.keys() - {"q", "q_previous"}
 
-    followed = {
-        "lowest_mode",
-        "loads",
-    }  # whether a step is at a minimum is asked of every implicit one
+    followed = {"lowest_mode"}  # whether a step is at a minimum is asked of every implicit one
     assert rows(swing(solver=LOOSE)) == followed
     assert rows(by("verlet", swing())) == set()
     assert rows(by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))) == followed | {

@@ -1,17 +1,13 @@
 """Lowest curvature of a step's true Hessian H = M + t^2 (Hessian of E).
 
-F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. Three tests follow
-each other until H is known to be positive definite or a direction of negative curvature is found:
-
-1. H is positive definite if no spring or cell is compressed enough. One pass over them tells.
-2. The load factor nu (nonlinear.load_factor): no eigenvalue of M^(-1) H is below 1 - nu.
-3. The lowest eigenvalue of M^(-1) H is computed if nu is not small (nonlinear.lobpcg). A long
-   search is made if the compression has grown or if a solve has met a negative curvature. At all
-   other steps a few iterations follow the last mode, with multigrid only if its curvature has
-   changed.
+F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. H is positive
+definite if no spring or cell is compressed enough: one pass over them tells. Otherwise the lowest
+eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the compression has
+grown or if a solve has met a negative curvature. At all other steps a few iterations follow the
+last mode, with multigrid only if its curvature has changed.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import ClassVar
 
@@ -22,7 +18,6 @@ from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
-from msmpetsc.solve.nonlinear.load_factor import LIGHT, MORE, LoadFactor
 from msmpetsc.solve.nonlinear.lobpcg import (
     DEPENDENT,
     EFFORT,
@@ -36,6 +31,9 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Modes of at least this share of the lowest negative curvature count as equally steep
 ALIKE = 0.9
+# Growth of the compression, or of the mode's curvature, beyond which another mode may
+# be the lowest
+MORE = 1.25
 # Relative change of the mode's curvature below which the mode is taken as it is
 UNCHANGED = 0.1
 
@@ -49,23 +47,17 @@ class Alarm(IntEnum):
 
 
 @dataclass(frozen=True)
-class Compressed:
-    """Greatest value and sum of t^2 concavity / m over the free nodes of all ranks."""
+class Compression:
+    """Compression of a body: t^2 concavity / m of the free nodes of all ranks.
+
+    greatest : greatest value
+    total    : sum
+    inertia  : whether M is part of H and outweighs negative parts of the elastic Hessian
+    """
 
     greatest: float = 0.0
     total: float = 0.0
-
-
-@dataclass(frozen=True)
-class Compression(Compressed):
-    """Compression of a body at given positions.
-
-    inertia : whether M is part of H and outweighs negative parts of the elastic Hessian
-    ratios  : t^2 concavity / m (m,) of this rank's free nodes
-    """
-
     inertia: bool = True
-    ratios: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def least_curvature(self) -> float:
@@ -99,11 +91,10 @@ class LowestCurvature:
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.unknowns = functional.comm, functional.unknowns
         self.search = Lobpcg(functional, hessian, preconditioner)
-        self.load_factor = LoadFactor(self.search)
         # Products with H (multigrid's finest level included) of all searches so far
         self.products = 0
         # Compression at which the last long search was made
-        self.searched = Compressed()
+        self.searched = NONE
         # Lowest known mode (n,), of unit length in the norm of M, and its curvature
         # when it was found
         self.mode: Floats | None = None
@@ -125,28 +116,19 @@ class LowestCurvature:
             concavity = concavity + functional.surface.concavity(q)[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
         most, sums = zip(*self.comm.allgather((greatest(ratios), float(ratios.sum()))), strict=True)
-        return Compression(max(most), sum(sums), not self.unknowns.static, ratios)
+        return Compression(max(most), sum(sums), not self.unknowns.static)
 
     def lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
     ) -> tuple[float, Floats | None]:
         """Return the lowest eigenvalue of M^(-1) H that a search finds, and its direction (n,).
 
-        If the load factor is small, return a positive lower bound of the eigenvalue, and None.
-
         q    : positions (l, 3) [m] at which H was linearised last
         hint : a direction that may contain the mode
         """
         products = self.hessian.products + self.preconditioner.products
-        is_known = not (alarm or self.unknowns.static)
-        least = 1 - self.load_factor.bound(q, compression.ratios) if is_known else 0.0
-        found = None if least >= 1 - LIGHT else self._lowest(q, compression, alarm, hint)
+        values, modes = self._lowest(q, compression, alarm, hint)
         self.products += self.hessian.products + self.preconditioner.products - products
-        if found is None:
-            # A body that is loaded more then has a long search
-            self.searched = Compressed()
-            return least, None
-        values, modes = found
         # Springs of zero length have a cusp: g falls along any direction
         if not np.isfinite(values[0]):
             self.mode = None
@@ -175,9 +157,7 @@ class LowestCurvature:
             found = self._followed()
         if found is None:
             # After an alarm the next step makes a long search, too
-            self.searched = (
-                Compressed() if alarm else Compressed(compression.greatest, compression.total)
-            )
+            self.searched = NONE if alarm else compression
             with self.preconditioner.searching(q, self.functional.contact_at(q)):
                 found = self._search_at_length(
                     q, hint, EFFORT if alarm is Alarm.HERE else self.effort
@@ -258,21 +238,17 @@ class LowestCurvature:
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
         checkpoint.keep({"lowest_mode": rows})
         checkpoint.keep_counts(self)
-        self.load_factor.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Restore the mode, the searched compression and the load factor."""
+        """Restore the mode and the searched compression."""
         checkpoint.restore_counts(self)
         if self.knows_mode:
             rows = like(self.functional.mass, checkpoint.row("lowest_mode"))
             self.mode = rows[self.unknowns.free].T.ravel()
-        self.load_factor.restore(checkpoint)
 
-    def forget(self, modes: bool = True) -> None:
-        """Forget all that a checkpoint does not hold; ``modes``: the mode and the load, too."""
-        self.load_factor.forget(modes)
-        if modes:
-            self.searched, self.mode = Compressed(), None
+    def forget(self) -> None:
+        """Forget the mode and its search."""
+        self.searched, self.mode = NONE, None
 
     def destroy(self) -> None:
         self.search.destroy()

@@ -1,4 +1,4 @@
-"""Lowest eigenvalues by locally optimal conjugate gradients on a block of directions (LOBPCG).
+"""Lowest eigenvalues of M^(-1) H by locally optimal conjugate gradients (LOBPCG).
 
 The method is Algorithm 5.1 of Knyazev 2001, Toward the optimal preconditioned eigensolver, with the
 step's preconditioner. A block is needed since a single direction may settle on a higher mode.
@@ -60,12 +60,10 @@ class SearchSpace:
 
     directions : (room, n), of which the first ``used`` count
     products   : (room, n) with H
-    weighed    : (room, n) with W; None for M
     """
 
     directions: Rows
     products: Rows
-    weighed: Rows | None
     used: int
 
     def _chunks(self) -> Iterator[slice]:
@@ -73,35 +71,27 @@ class SearchSpace:
         count = self.directions.shape[1]
         return (slice(at, at + CHUNK) for at in range(0, count, CHUNK))
 
-    def rows_weighed(self, mass: Floats, rows: slice, columns: slice) -> Rows:
-        """Return products of W with some directions, at some unknowns."""
-        if self.weighed is not None:
-            return self.weighed[rows, columns]
-        return self.directions[rows, columns] * mass[columns]
-
     def grams(self, mass: Floats) -> Rows:
-        """Return the Gram matrices (2, used, used) of the directions in H and W, of this rank."""
+        """Return the Gram matrices (2, used, used) of the directions in H and M, of this rank."""
         sums = np.zeros((2, self.used, self.used))
         rows = slice(self.used)
         for chunk in self._chunks():
             span = self.directions[rows, chunk]
             sums[0] += to_host(span @ self.products[rows, chunk].T)
-            sums[1] += to_host(span @ self.rows_weighed(mass, rows, chunk).T)
+            sums[1] += to_host((span * mass[chunk]) @ span.T)
         return sums
 
     def combine(self, parts: Rows) -> None:
         """Replace the directions by combinations ``parts`` (k, used) of them."""
         count, on_device = len(parts), like(self.directions, parts)
-        for rows in (self.directions, self.products, self.weighed):
-            if rows is None:
-                continue
+        for rows in (self.directions, self.products):
             for chunk in self._chunks():
                 rows[:count, chunk] = on_device @ rows[: self.used, chunk]
         self.used = count
 
 
 class Lobpcg:
-    """Search for the lowest eigenvalues of W^(-1) H. All methods are collective.
+    """Search for the lowest eigenvalues of M^(-1) H. All methods are collective.
 
     its : iterations, a direction each, of all searches so far
     """
@@ -123,19 +113,17 @@ class Lobpcg:
         block: int,
         most: int,
         least: int,
-        weigh: Act | None = None,
         left_out: Rows | None = None,
     ) -> tuple[Floats, Rows]:
-        """Return the lowest eigenvalues (k,), k <= block, of W^(-1) H and their modes (k, n).
+        """Return the lowest eigenvalues (k,), k <= block, of M^(-1) H and their modes (k, n).
 
         start    : directions (l, n)
         most     : most iterations
         least    : fewest iterations
-        weigh    : applies W; M if None
         left_out : directions (r, n), orthonormal in M, that the search leaves out
         """
         lowest = []
-        for its, found in enumerate(self.iterates(start, block, weigh, left_out)):
+        for its, found in enumerate(self.iterates(start, block, left_out)):
             lowest.append(found[0][0])
             if its == most:
                 break
@@ -147,7 +135,7 @@ class Lobpcg:
         return found[0], found[1].copy()
 
     def iterates(
-        self, start: Rows, block: int, weigh: Act | None = None, left_out: Rows | None = None
+        self, start: Rows, block: int, left_out: Rows | None = None
     ) -> Iterator[tuple[Floats, Rows, Floats]]:
         """Yield the lowest eigenvalues (k,), their modes (k, n) and errors (k,), without end.
 
@@ -155,7 +143,7 @@ class Lobpcg:
         residuals r and the preconditioner P. The next iteration overwrites the modes. Arguments
         are those of ``lowest``.
         """
-        space = self._space(start, block, weigh)
+        space = self._space(start, block)
         values = self._ritz(space, min(block, len(start)))
         # A small body has fewer modes than the block
         size = len(values)
@@ -165,34 +153,26 @@ class Lobpcg:
             errors = np.array([self._add_residual(space, i, values[i]) for i in range(size)])
             added = space.directions[space.used - size : space.used]
             added[:] = self.unit(self.without(left_out, added))
-            self._multiply(space, space.used - size, weigh)
+            self._multiply(space, space.used - size)
             values = self._ritz(space, size)
             self.its += size
 
-    def _space(self, start: Rows, block: int, weigh: Act | None) -> "SearchSpace":
+    def _space(self, start: Rows, block: int) -> "SearchSpace":
         """Return the space of directions (l, n), with room for those of an iteration."""
         room = max(len(start), 3 * block), start.shape[1]
-        space = SearchSpace(
-            np.empty(room, like=start),
-            np.empty(room, like=start),
-            None if weigh is None else np.empty(room, like=start),
-            len(start),
-        )
+        space = SearchSpace(np.empty(room, like=start), np.empty(room, like=start), len(start))
         space.directions[: len(start)] = start
-        self._multiply(space, 0, weigh)
+        self._multiply(space, 0)
         return space
 
-    def _multiply(self, space: "SearchSpace", first: int, weigh: Act | None) -> None:
+    def _multiply(self, space: "SearchSpace", first: int) -> None:
         """Compute the products with the directions from the ``first`` on."""
         new = slice(first, space.used)
         space.products[new] = self._of_each(self.hessian.mult, space.directions[new])
-        if weigh is not None and space.weighed is not None:
-            space.weighed[new] = self._of_each(weigh, space.directions[new])
 
     def _add_residual(self, space: "SearchSpace", i: int, value: float) -> float:
         """Add the preconditioned residual of the i-th Ritz vector; return its error r^T P^-1 r."""
-        weighed = space.rows_weighed(self.functional.mass, slice(i, i + 1), slice(None))[0]
-        residual = space.products[i] - value * weighed
+        residual = space.products[i] - value * self.functional.mass * space.directions[i]
         scale = max(self.comm.allreduce(float(greatest(np.abs(residual))), MPI.MAX), TINY)
         # Multigrid works in single precision
         residual /= scale

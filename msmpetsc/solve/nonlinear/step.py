@@ -321,7 +321,8 @@ class Stepper:
         self.first_guess.forget()
         self.jacobian.preconditioner.forget()
         self.control.forget(modes)
-        self.minimum.curvature.forget(modes)
+        if modes:
+            self.minimum.curvature.forget()
 
     def work_so_far(self) -> Work:
         """Return the work of all steps so far, with estimates and searches for modes."""

@@ -39,8 +39,6 @@ class LocalGlobal(StepMethod):
         self.snes.setFunction(self._residual, self.f)
         self.snes.setJacobian(self._linearise, self.jacobian.operator)
         self.snes.setObjective(self._objective)
-        if self.jacobian.touches:
-            self.snes.setLineSearchPreCheck(self._shorten)
         self.snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
             self.ksp.setInitialGuessNonzero(True)
@@ -86,24 +84,6 @@ class LocalGlobal(StepMethod):
         with LOCAL:
             change, distance = self.functional.change(self.functional.positions(x), self.base)
         return -1.0 if self.outcome.is_flat and distance > 0 else change
-
-    def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Shorten y so that the surface crosses nothing on the way from x to x - y.
-
-        Return whether y changed (SNESLineSearchPreCheck).
-        """
-        if self.functional.surface is None:
-            return False
-        end = self.functional.vectors.take()
-        end.waxpy(-1.0, y, x)
-        with LOCAL:
-            share = self.functional.free_share(
-                self.functional.positions(x), self.functional.positions(end)
-            )
-        self.functional.vectors.give_back(end)
-        if share < 1.0:
-            y.scale(share)
-        return share < 1.0
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Linearise contact at x and set the initial guess of the linear solve (SNESJacobian)."""

@@ -13,10 +13,9 @@ over for some iterations.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Positions
+from msmpetsc.backend.arrays import Array
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
@@ -36,8 +35,6 @@ ALPHA = 1e-4
 LEAST, MOST = 0.1, 0.5
 # Least step length; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
-# Share of its slope that a direction must keep when it is bent at obstacles
-DOWNHILL = 0.1
 # Growth of |F| after an unchecked full step beyond which g is checked again: friction
 # and contact have kinks
 RAISED = 2.0
@@ -95,7 +92,7 @@ class Newton(StepMethod):
             if not self._solve(now, outcome, its):
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break
-            outcome = self._after_solve(outcome, self._limit(now) or projected > 0)
+            outcome = self._after_solve(outcome, self._shorten(now) or projected > 0)
             flat = outcome.is_flat and not asks
             found = self._search(now, flat)
             if found is None and projected:
@@ -193,48 +190,16 @@ class Newton(StepMethod):
         self.functional.vectors.give_back(x)
         return None
 
-    def _limit(self, now: Iterate) -> bool:
-        """Shorten or bend y if the way to x - y enters obstacles or causes a crossing.
-
-        Return whether y changed.
-        """
-        if self.functional.problem.contact is None:
+    def _shorten(self, now: Iterate) -> bool:
+        """Shorten y so that the surface crosses nothing from x to x - y; return whether y changed."""
+        if self.functional.surface is None:
             return False
         self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
-            after = self.functional.positions(self.end)
-            stopped = self._stop_at_obstacles(now, after)
-            share = self.functional.free_share(now.q, after if stopped is None else stopped)
+            share = self.functional.free_share(now.q, self.functional.positions(self.end))
         if share < 1.0:
             self.y.scale(share)
-        return stopped is not None or share < 1.0
-
-    def _stop_at_obstacles(self, now: Iterate, after: Positions) -> Positions | None:
-        """Bend y so that nodes end at the surface of an obstacle that they would enter.
-
-        H at x does not know obstacles that nodes do not touch yet. A line search that shortened the
-        whole step for each of them would let them come in one by one.
-
-        after : positions (l, 3) [m] at x - y
-
-        Return the new end (l, 3) [m]. Return None if y stays, since g is no less at the new end or
-        the bent direction hardly leads downhill.
-        """
-        functional, contact, bent = self.functional, self.functional.problem.contact, self.end
-        stopped = contact.stopped(after, now.q) if contact else None
-        if not functional.comm.allreduce(stopped is not None, MPI.LOR):
-            return None
-        functional.unknowns.from_nodes(after if stopped is None else stopped, bent)
-        # Fixed nodes stay at their places
-        free = functional.positions(bent)
-        # Self-contact is left out, as it costs most
-        if functional.value(free) >= functional.value(after):
-            return None
-        bent.aypx(-1.0, now.x)
-        if not bent.dot(now.f) > DOWNHILL * self.y.dot(now.f):
-            return None
-        bent.copy(self.y)
-        return free
+        return share < 1.0
 
 
 def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:

@@ -25,8 +25,8 @@ class Preset:
     projected    : iterations with the projected Hessian at the start of each minimisation
     start_from_b : whether CG starts from x = b, as in the paper's Algorithm 1
     iterations   : fixed number of iterations from y, as the method was published. None: iterate to
-        the error target from the best of several guesses; the last linear solve of a step then
-        goes beyond ksp_rtol
+        the error target from the best of several guesses; linear solves near the end of a step
+        then go beyond ksp_rtol
     chooses      : whether the solver may replace pc_type by multigrid of the Hessian if that pays
     """
 
@@ -207,7 +207,7 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
         quoted = f'"{value}"' if value and " " in value else value or ""
         line = f"-{name} {quoted}".rstrip()
         if name in adapting:
-            line = f"# {line}    the last solve of a step goes beyond it; fixed if given"
+            line = f"# {line}    solves near the end of a step go beyond it; fixed if given"
         lines.append(line)
     for each in ours:
         each.withdraw()

@@ -323,14 +323,12 @@ class ImplicitEuler(Integrator):
         if checkpoint.step:
             self.stepper.forget(modes=False)
         checkpoint.keep_counts(self)
-        checkpoint.keep_counts(self.stepper.control.estimate)
         self.stepper.minimum.curvature.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         self._let_go(time)
         self.stepper.forget()
         checkpoint.restore_counts(self)
-        checkpoint.restore_counts(self.stepper.control.estimate)
         self.stepper.minimum.curvature.restore(checkpoint)
 
     def forget(self) -> None:

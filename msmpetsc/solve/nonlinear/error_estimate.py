@@ -14,21 +14,16 @@ Then g can be examined at x - e_k (minimum.Minimum). If a step has met an eigenv
 below 1, bounds are divided by it.
 """
 
-from typing import ClassVar
-
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions
-from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 from msmpetsc.solve.petsc.events import ESTIMATE
 
-# Iterations between tests of convergence
-CHECK_EVERY = 4
 # Share of |e_k|_H that may be missing at the end
 CLOSE = 0.1
 # Growth of |e_k|_M since iteration k / 2 up to which soft modes count as found
@@ -38,18 +33,6 @@ GROWTH = 1.2
 LEFT = 2.0
 # Most iterations of an estimate
 MOST = 512
-# Safety factor on the least Ritz value of a few iterations
-LOWER = 0.7
-# Greatest eigenvalue of P^(-1) H; a larger Ritz value shows contact that P lacks
-GREATEST = 1.1
-# Iterations below which no Ritz value is near the least eigenvalue, and above which one
-# may be
-FEW, MANY = 2, 4
-# Iterations on noise, which show an eigenvalue far below the others
-PROBED = 4
-# Greatest growth of the least Ritz value from solve to solve; few iterations
-# overestimate it
-RISE = 2.0
 
 
 class ErrorEstimate:
@@ -58,8 +41,6 @@ class ErrorEstimate:
     correction : e of the last estimate
     residual   : F - H e of the last estimate
     """
-
-    state: ClassVar[dict[str, Range]] = {"floor": ANY}
 
     def __init__(
         self,
@@ -84,12 +65,6 @@ class ErrorEstimate:
         # Bound on the missing part of an acceptable error; None if the estimate ended
         # otherwise
         self.missing: float | None = None
-        # Least Ritz value of P^(-1) H; 0 if unknown
-        self.least = 0.0
-        # Least Ritz value of P^(-1) H on noise; infinite if noise was not tried
-        self.floor = np.inf
-        # Whether the solve in progress is on noise
-        self.is_probe = False
         # |e_k|_M by iteration
         self.lengths: dict[int, float] = {}
         self.ksp = PETSc.KSP().create(functional.comm)
@@ -127,10 +102,7 @@ class ErrorEstimate:
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
             self.linearise(iterate.q, iterate.contact)
-            if self.needs_probe:
-                self._probe()
             self.ksp.solve(iterate.f, self.correction)
-            self.learn(self.ksp)
             self.length = self._length() if self.ksp.reason > 0 else np.inf
         self.products += self.hessian.products + self.preconditioner.products - before
         return self.length
@@ -145,11 +117,6 @@ class ErrorEstimate:
             return length + left
         return length * max(length / half, 1.0) if half > 0 else length
 
-    @property
-    def needs_probe(self) -> bool:
-        """Whether P^(-1) H may have an eigenvalue far below all Ritz values."""
-        return self.preconditioner.is_uniform and np.isinf(self.floor)
-
     def linearise(self, q: Positions, contact: ContactAt | None) -> None:
         """Linearise the Hessian and the preconditioner at positions q (l, 3) [m]."""
         self.preconditioner.prepare(q, contact)
@@ -161,10 +128,7 @@ class ErrorEstimate:
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
-        if self.is_probe:
-            return reasons.ITERATING if its < PROBED else reasons.CONVERGED_ITS
-        every = 1 if self.preconditioner.is_uniform else CHECK_EVERY
-        if residual > 0 and (its == 0 or its % max(every // 2, 1)):
+        if residual > 0 and its == 0:
             return reasons.ITERATING
         length = self.lengths[its] = self.functional.norm(ksp.getSolution())
         if (
@@ -174,7 +138,7 @@ class ErrorEstimate:
             or self._is_acceptable(length, residual)
         ):
             return reasons.CONVERGED_ITS
-        if its % every or length > GROWTH * self.lengths.get(its // 2, 0.0):
+        if length > GROWTH * self.lengths.get(its // 2, 0.0):
             return reasons.ITERATING
         if not self.preconditioner.is_uniform and 4 * its**2 * length < self.bound:
             return reasons.ITERATING
@@ -190,44 +154,6 @@ class ErrorEstimate:
             return False
         self.missing = missing
         return True
-
-    def _least(self, ksp: PETSc.KSP) -> float:
-        """Return the least known eigenvalue of P^(-1) H, by a solve, too; 0 if there is none."""
-        if ksp.its < FEW:
-            return self.least
-        least = float(ksp.computeExtremeSingularValues()[1])
-        if not 0 < least <= GREATEST:
-            return 0.0
-        least = min(least, self.floor)
-        return min(least, (RISE if ksp.its >= MANY else 1.0) * self.least) if self.least else least
-
-    def learn(self, ksp: PETSc.KSP) -> None:
-        """Take the Ritz values of a solve by CG with this Hessian and preconditioner."""
-        self.least = self._least(ksp)
-
-    def _probe(self) -> None:
-        """Look for an eigenvalue of P^(-1) H far below the others by CG on noise.
-
-        Noise has parts of all modes. The few iterations of a step's solve miss a very small
-        eigenvalue, such as a cell's that hangs by an edge.
-        """
-        self.functional.memory.write(self.residual)[:] = (
-            self.functional.mass * self.functional.noise(1)[0]
-        )
-        self.is_probe = True
-        self.ksp.solve(self.residual, self.correction)
-        self.is_probe = False
-        least = float(self.ksp.computeExtremeSingularValues()[1])
-        # At a fold the next estimate tries again
-        if least > 0:
-            self.floor = least
-            self.least = min(self.least, least)
-
-    def forget(self, modes: bool) -> None:
-        """Forget the least Ritz value; ``modes``: that on noise, too."""
-        self.least = 0.0
-        if modes:
-            self.floor = np.inf
 
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Return whether e_k is close to e in the norm of H, as far as CG can show."""

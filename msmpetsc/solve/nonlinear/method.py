@@ -78,12 +78,9 @@ class StepMethod(ABC):
         return int(REASON.ITERATING)
 
     def adapt(self, outcome: Outcome, its: int = 0) -> None:
-        """Set the tolerances of the linear solve after ``its`` iterations, if the user does not."""
+        """Set the tolerance of the linear solve after ``its`` iterations, if the user does not."""
         if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
-            rtol, atol = self.control.tolerances(outcome, its)
-            self.ksp.setTolerances(
-                rtol=rtol, atol=None if self.options.is_given("ksp_atol") else atol
-            )
+            self.ksp.setTolerances(rtol=self.control.tolerance(outcome, its))
 
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
         """Return the final outcome by SNES's reason. Raises StepStopped and StepFailed."""

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import KNOWN, Outcome
+from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
@@ -95,12 +95,9 @@ class Minimum:
             return Verdict(np.inf, examined, direction, value)
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
-        known = outcome.error_of_solve(value)
-        if value > CONVEX and np.isfinite(known) and known * outcome.distance <= enough:
-            return Verdict(known, examined)
         length, rest = functional.norm(first), functional.dual_norm(examined.f) / value
         # An upper bound if g stays as convex
-        if value > CONVEX and length + rest <= KNOWN * enough:
+        if value > CONVEX and length + rest <= enough:
             return Verdict(
                 self.rounding.relative(length + rest, functional.distance(examined.q)), examined
             )
@@ -143,7 +140,7 @@ class Minimum:
         """
         functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
         distance, first = functional.distance(examined.q), functional.norm(correction)
-        acceptable = KNOWN * enough - first if lowest > CONVEX else 0.0
+        acceptable = enough - first if lowest > CONVEX else 0.0
         second = estimate(examined, bound, enough, acceptable, lowest)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf

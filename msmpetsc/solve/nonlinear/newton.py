@@ -92,7 +92,9 @@ class Newton(StepMethod):
             if not self._solve(now, outcome, its):
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break
-            outcome = self._after_solve(outcome, self._shorten(now) or projected > 0)
+            if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
+                outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
+            self._shorten(now)
             flat = outcome.is_flat and not asks
             found = self._search(now, flat)
             if found is None and projected:
@@ -163,14 +165,6 @@ class Newton(StepMethod):
             return 1.0
         return max(float(norms[-1] / norms[0]), float(np.finfo(float).eps))
 
-    def _after_solve(self, outcome: Outcome, changed: bool) -> Outcome:
-        """Return the outcome with the bounds of the linear solve, unless y has changed since."""
-        if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
-            outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
-        if changed:
-            return replace(outcome, solved=np.inf)
-        return self.control.after_linear_solve(self.ksp, outcome)
-
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:
         """Return the first iterate x - s y of sufficient descent; None if g falls for no s.
 
@@ -190,16 +184,15 @@ class Newton(StepMethod):
         self.functional.vectors.give_back(x)
         return None
 
-    def _shorten(self, now: Iterate) -> bool:
-        """Shorten y so that the surface crosses nothing from x to x - y; return whether y changed."""
+    def _shorten(self, now: Iterate) -> None:
+        """Shorten y so that the surface crosses nothing on the way from x to x - y."""
         if self.functional.surface is None:
-            return False
+            return
         self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
             share = self.functional.free_share(now.q, self.functional.positions(self.end))
         if share < 1.0:
             self.y.scale(share)
-        return share < 1.0
 
 
 def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:

@@ -161,7 +161,6 @@ class Stepper:
         snes.setFromOptions()
         if self.preset.true_hessian:
             snes.setType(PETSc.SNES.Type.PYTHON)
-        ksp.setComputeEigenvalues(ksp.getType() == PETSc.KSP.Type.CG)
         return snes, ksp
 
     def _refuse_of_snes(self) -> None:
@@ -320,7 +319,7 @@ class Stepper:
         """
         self.first_guess.forget()
         self.jacobian.preconditioner.forget()
-        self.control.forget(modes)
+        self.control.forget()
         if modes:
             self.minimum.curvature.forget()
 

@@ -158,12 +158,10 @@ class ErrorControl:
         to y.
         """
         distance = now.distance
-        enough = goal * distance if goal else np.inf
-        length = self.estimate(iterate, now.residual, enough, goal * distance)
+        length = self.estimate(iterate, goal * distance)
         if not np.isfinite(length):
             return replace(now, error=now.bound, alarm=Alarm.HERE)
-        if self.estimate.missing is None:
-            self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
+        self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
         error = self.rounding.relative(
             length, self.functional.distance(iterate.q, self.estimate.correction)
         )

@@ -5,7 +5,6 @@ If the body is compressed, g may have a fold or a saddle between x and x - e. It
 change so much that e says little. So Hessian and error are examined once more at x - e.
 """
 
-import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -101,14 +100,16 @@ class Minimum:
             return Verdict(
                 self.rounding.relative(length + rest, functional.distance(examined.q)), examined
             )
-        if corrected and estimate.missing is not None and value <= CONVEX:
-            closely = bool(np.isfinite(estimate(at, functional.dual_norm(at.f), np.inf)))
-            return self.examine(at, replace(outcome, corrected=closely), enough)
-        if corrected and bent <= SMALL * estimate.length and value > CONVEX:
+        if corrected and value <= CONVEX < estimate.lowest:
+            # The estimate has taken the missing part for too small
+            again = bool(np.isfinite(estimate(at)))
+            return self.examine(at, replace(outcome, corrected=again), enough)
+        estimated = estimate.found + estimate.missing
+        if corrected and bent <= SMALL * estimated and value > CONVEX:
             return Verdict(
-                self.rounding.relative(estimate.length, functional.distance(examined.q)), examined
+                self.rounding.relative(estimated, functional.distance(examined.q)), examined
             )
-        return Verdict(self._second_estimate(examined, first, rest, enough, value), examined)
+        return Verdict(self._second_estimate(examined, length, rest, enough, value), examined)
 
     def _corrected_iterate(self, at: Iterate) -> Iterate | None:
         """Return the iterate x - e; None if the surface crosses itself on the way."""
@@ -129,19 +130,17 @@ class Minimum:
         return x, q, functional.free_share(at.q, q) == 1.0
 
     def _second_estimate(
-        self, examined: Iterate, correction: PETSc.Vec, bound: float, enough: float, lowest: float
+        self, examined: Iterate, first: float, bound: float, enough: float, lowest: float
     ) -> float:
-        """Return the relative error of the iterate by two corrections, the first of them
-        ``correction``.
+        """Return the relative error of the iterate by two corrections, the first of norm ``first``.
 
         If the second correction crosses the surface, g is not quadratic along it, and the error
         may be far larger. CG may break down on an F of rounding alone: then the bound stands for
         the second correction if the curvature allows, else the error is infinite.
         """
         functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
-        distance, first = functional.distance(examined.q), functional.norm(correction)
-        acceptable = enough - first if lowest > CONVEX else 0.0
-        second = estimate(examined, bound, enough, acceptable, lowest)
+        distance = functional.distance(examined.q)
+        second = estimate(examined, max(enough - first, 0.0) if lowest > CONVEX else 0.0)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
         if functional.surface is not None:
@@ -149,18 +148,9 @@ class Minimum:
             functional.vectors.give_back(end)
             if not is_free:
                 return relative(first + DOUBTFUL * second, distance)
-        known = second - (estimate.missing or 0.0)
-        if first > 0 and known > SMALL * first:
+        if first > 0 and estimate.found > SMALL * first:
             return DOUBTFUL * relative(max(first, second), distance)
-        if estimate.missing is not None:
-            return relative(first + second, distance)
-        correction.axpy(
-            second / max(functional.norm(estimate.correction), sys.float_info.min),
-            estimate.correction,
-        )
-        return relative(
-            functional.norm(correction), functional.distance(examined.q, estimate.correction)
-        )
+        return relative(first + second, distance)
 
     def lower_iterate(self, at: Iterate, verdict: Verdict) -> Iterate | None:
         """Return an iterate of lower g than one that is no minimum; None if there is none.

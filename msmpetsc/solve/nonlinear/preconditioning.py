@@ -102,10 +102,6 @@ class Preconditioner:
         columns = memory.write(y)
         columns[:] = like(columns, solution.values)
 
-    def by_diagonal(self, r: Rows) -> Rows:
-        """Return D^-1 r (3, m), D the diagonal of A."""
-        return r / (self.own + self.t2 * self.added)
-
     def destroy(self) -> None:
         """Destroy all PETSc objects (collective)."""
         for part in (*self.blocks, self.pc, self.vector):
@@ -223,10 +219,6 @@ class LatticePreconditioner:
                 self.translations.around(self.pc, x, y)
             else:
                 self.pc.apply(x, y)
-
-    def by_diagonal(self, r: Rows) -> Rows:
-        """Return D^-1 r (3, m), D the 3 x 3 blocks of each node."""
-        return self.multigrid.fine.by_blocks(r, np.empty_like(r))
 
     def forget(self) -> None:
         """Forget the hierarchy, so that the next step builds another."""
@@ -391,15 +383,6 @@ class StepPreconditioner:
         """Write P^-1 x to y (PCApply calls it)."""
         self.applied.apply(x, y)
         self.applied.unknowns.project(y)
-
-    def least_norm(self, r: PETSc.Vec) -> float:
-        """Return a lower bound of |r|_(H^-1) that does not depend on P.
-
-        With D the diagonal, H is at most 2 D, or 4 D since D may be of earlier positions.
-        """
-        columns = self.applied.unknowns.columns(r)
-        square = float(np.vdot(columns, self.applied.by_diagonal(columns)))
-        return 0.5 * float(np.sqrt(max(self.applied.unknowns.comm.allreduce(square), 0.0)))
 
     def forget(self) -> None:
         """Forget earlier steps, so that a choice by iterations is made anew."""

@@ -19,7 +19,7 @@ from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs
 from msmpetsc.environment import Environment
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
@@ -27,7 +27,6 @@ from msmpetsc.solve.integrators.implicit import ContactFaces
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.simulate import TimeLoop
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
@@ -281,22 +280,6 @@ def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(
     assert solves[1] == ["nothing", "all"]
 
 
-def test_a_step_that_fails_without_the_surface_is_solved_with_it(folder: Path, solves, monkeypatch):
-    step = Stepper.step
-
-    def failing(self: Stepper, problem: StepProblem, start: np.ndarray | None = None) -> StepResult:
-        if problem.contact is None or problem.contact.surface is None:
-            raise StepFailed("fails", "iterations")
-        return step(self, problem, start)
-
-    monkeypatch.setattr(Stepper, "step", failing)
-    play(fall(folder, "failing", 0.02, time={"step": 0.01, "duration": 0.02}))
-    assert (
-        all(each == ["nothing"] + ["all"] * len(each[1:]) for each in solves.values())
-        and len(solves) == 2
-    )
-
-
 def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path):
     """A ball flies at a block, and its Newton correction through the block, of which the Hessian
     knows nothing."""
@@ -321,7 +304,8 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
         environment.contacts.widen()
         functional.begin(faces.problem())
         now = functional.at(q)
-        correction = stepper.control.estimate(now, np.inf, np.inf)
+        stepper.control.estimate(now)
+        correction = stepper.control.estimate.found
         outcome = Outcome(corrected=True, compression=minimum.curvature.compression(q))
         verdict = minimum.examine(now, outcome, correction)
     assert verdict.error > 10 * correction / functional.distance(q)

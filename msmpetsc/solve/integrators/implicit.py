@@ -42,10 +42,8 @@ from msmpetsc.solve.petsc.events import CONTACT
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
-# most solves of a step for its contact faces; nodes may pass through a thin obstacle
+# most solves of a step for its contacts; nodes may pass through a thin obstacle
 MOST_SOLVES = 10
-# most solves with the pairs around contacts only; later solves search all pairs
-MOST_NARROW = 3
 # energy of surface pairs left out, over that of the error; x moves by 0.01 of the error
 LEFT_OUT = 1e-4
 
@@ -116,16 +114,9 @@ class ContactFaces:
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:
         """Return the result of ``step`` with settled contacts. Raises StepFailed."""
-        contacts = self.environment.contacts
         while not self.is_settled:
-            try:
-                result = step(self.problem())
-            except StepFailed:
-                if not (contacts and contacts.is_narrow):
-                    raise
-                contacts.widen()
-            else:
-                self.compare(result.position, LEFT_OUT * result.energy_tolerance)
+            result = step(self.problem())
+            self.compare(result.position, LEFT_OUT * result.energy_tolerance)
         return result
 
     def compare(self, x: Positions, left_out: float) -> None:
@@ -159,7 +150,7 @@ class ContactFaces:
                 is_free, self.is_settled = narrow.after_way(self.q, x, left_out)
             if not self.is_settled:
                 self.start = x if is_free else None
-                if self.solves >= MOST_NARROW:
+                if self.solves >= MOST_SOLVES:
                     narrow.widen()
                 return
         if self.end is None and environment.friction_lags(x, self.contact):

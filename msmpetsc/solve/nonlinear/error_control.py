@@ -29,9 +29,6 @@ from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctiona
 FULL_STEP_ERROR = 1e-5
 # Ratio of the bound to the error before any estimate was made
 FIRST_RATIO = 5.0
-# Iterations of a step after which its linear solves gain a digit. Loose solves may open
-# and close a stiff gap for ever
-ITS_PER_DIGIT = 50
 # Ratio of |F| to the last |F| above which F may be rounding of stiff contact
 STAYS = 0.5
 # Factor on the goal after a doubt, and its least value
@@ -167,13 +164,12 @@ class ErrorControl:
         )
         return replace(now, error=error, corrected=True)
 
-    def tolerance(self, now: Outcome, its: int) -> float:
-        """Return the tolerance of the linear solve after ``its`` iterations of a step."""
-        loosest = self.rtol * max(0.1 ** (its // ITS_PER_DIGIT), CLOSEST)
+    def tolerance(self, now: Outcome) -> float:
+        """Return the tolerance of the linear solve at an iterate."""
         if not now.goal * now.bound > 0:
-            return loosest
+            return self.rtol
         needed = max(now.reduction**2, 0.5 * now.goal * self.ratio / now.bound)
-        return min(loosest, max(needed, CLOSEST * self.rtol))
+        return min(max(needed, CLOSEST * self.rtol), self.rtol)
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """Return the outcome from which a step goes on after a doubt; None without any gain.

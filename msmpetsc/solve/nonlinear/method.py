@@ -21,8 +21,6 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
-# Cost of an iteration of a method without its linear solve [iterations of CG]
-ITERATION = 10
 REASON = PETSc.SNES.ConvergedReason
 
 
@@ -72,15 +70,14 @@ class StepMethod(ABC):
             return int(REASON.CONVERGED_ITS)
         if Stop.agreed(self.functional.comm):
             return int(REASON.DIVERGED_INNER)
-        spent = self.spent()
-        if spent.ksp_its + ITERATION * (spent.iterations + its) > MOST_ITERATIONS:
+        if self.spent().ksp_its > MOST_ITERATIONS:
             return int(REASON.DIVERGED_MAX_IT)
         return int(REASON.ITERATING)
 
-    def adapt(self, outcome: Outcome, its: int = 0) -> None:
-        """Set the tolerance of the linear solve after ``its`` iterations, if the user does not."""
+    def adapt(self, outcome: Outcome) -> None:
+        """Set the tolerance of the next linear solve, if the user does not."""
         if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
-            self.ksp.setTolerances(rtol=self.control.tolerance(outcome, its))
+            self.ksp.setTolerances(rtol=self.control.tolerance(outcome))
 
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
         """Return the final outcome by SNES's reason. Raises StepStopped and StepFailed."""

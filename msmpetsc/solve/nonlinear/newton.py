@@ -35,9 +35,6 @@ ALPHA = 1e-4
 LEAST, MOST = 0.1, 0.5
 # Least step length; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
-# Growth of |F| after an unchecked full step beyond which g is checked again: friction
-# and contact have kinks
-RAISED = 2.0
 KSP = PETSc.KSP.ConvergedReason
 # Reasons of KSP without a usable direction
 USELESS = (
@@ -82,30 +79,26 @@ class Newton(StepMethod):
         assert self._given is not None
         now, outcome = self._given
         outcome = self.control.judge(now, replace(outcome, residual=np.inf))
-        # Iterations left with the projected Hessian; whether g is checked close to its
-        # minimum, too
-        projected, asks, its = self.preset.projected, False, 0
+        # Iterations left with the projected Hessian
+        projected, its = self.preset.projected, 0
         while not (reason := self._reason(snes, its, now, outcome)):
             self._linearise(now, outcome, projected > 0)
             if its == 0 and (watch := self.functional.problem.watch):
                 watch(now, self.jacobian)
-            if not self._solve(now, outcome, its):
+            if not self._solve(now, outcome):
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break
             if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
                 outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
             self._shorten(now)
-            flat = outcome.is_flat and not asks
-            found = self._search(now, flat)
+            found = self._search(now, outcome.is_flat)
             if found is None and projected:
                 reason = REASON.DIVERGED_LINE_SEARCH
                 break
             if found is None:
                 projected = PROJECTED
                 continue
-            before = outcome.residual
             now, outcome = found, self.control.judge(found, outcome)
-            asks |= flat and outcome.residual > RAISED * before
             projected, its = max(projected - 1, 0), its + 1
         self.iterations += its
         self._given = now, outcome
@@ -146,9 +139,9 @@ class Newton(StepMethod):
                 self.control.estimate.correction.copy(self.y)
             self.ksp.setInitialGuessNonzero(known)
 
-    def _solve(self, now: Iterate, outcome: Outcome, its: int) -> bool:
+    def _solve(self, now: Iterate, outcome: Outcome) -> bool:
         """Solve H y = F; return whether y is usable."""
-        self.adapt(outcome, its)
+        self.adapt(outcome)
         rtol = self.ksp.getTolerances()[0]
         if not self.options.is_given("ksp_max_it"):
             most = self.jacobian.preconditioner.most_iterations(rtol)

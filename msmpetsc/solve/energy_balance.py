@@ -39,7 +39,7 @@ from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.elasticity.springs import crushing_energy
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.solve.integrators.integrator import EnergyBudget, Integrator, State
+from msmpetsc.solve.integrators.integrator import EnergyBudget, State
 from msmpetsc.solve.nonlinear.step import StepResult
 
 # spurious energy that fails a step, over all energy; Verlet may oscillate by nearly 2
@@ -128,22 +128,21 @@ class EnergyBalance:
             touch=environment.touch(q, time),
         )
 
-    def step(self, integrator: Integrator, before: State, time: float) -> tuple[StepResult, State]:
-        """Take the integrator's step that ends at ``time`` and update the budget (collective).
+    def examine(
+        self, before: State, result: StepResult, after: State, time: float, time_step: float
+    ) -> tuple[State, bool]:
+        """Return the state after a step with its energy budget, and whether a history gains energy.
 
-        If the history of BDF2 returns the energy that an impact took, repeat the step without it.
+        The history of BDF2 may return the energy that an impact took (collective).
+
         Raises StepFailed if a number is not finite, or if the spurious energy is above
         FAILING_GAIN times the largest legitimate energy.
         """
-        result, after = integrator.advance(before, time)
-        budget = self._budget_after(before, result, after, time, integrator.time_step)
-        if before.history is not None and self._history_gains(
-            before, result, after, time, integrator.time_step
-        ):
-            again, after = self.step(integrator, replace(before, history=None), time)
-            cost = replace(result.cost + again.cost, steps=1, step_error=again.cost.step_error)
-            return replace(again, cost=cost), after
-        return result, replace(after, budget=budget)
+        budget = self._budget_after(before, result, after, time, time_step)
+        gains = before.history is not None and self._history_gains(
+            before, result, after, time, time_step
+        )
+        return replace(after, budget=budget), gains
 
     def _history_gains(
         self, before: State, result: StepResult, after: State, time: float, time_step: float

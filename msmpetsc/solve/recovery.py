@@ -1,4 +1,17 @@
-"""Recovery from failed steps: repeat the step in shorter pieces or with a robust solver."""
+"""The ladder of a failed step: all that is tried again, in this order.
+
+1. ``take_step``: BDF2 takes the step without its history if this gains energy. After an impact the
+   history holds the energy that the impact took.
+2. ``Halving``: pieces of a load (integrators.static), of a step that ``time.error`` chooses
+   (integrators.adaptive.StepControl) or of a scene's step (``Recovery``). A shorter piece starts
+   nearer to its solution, and inertia holds nodes nearer to their places.
+3. ``Recovery``: a robust preset solves the step, if ``safety.on_failure`` says so.
+
+What a solver does before it fails is no rung: the projected Hessian (nonlinear.newton), the way to
+another point after a saddle (nonlinear.step), a start that crosses nothing
+(nonlinear.carried_start), other contacts (integrators.implicit.ContactFaces), substeps that are
+stable (integrators.verlet). Each needs an iterate or a problem that no caller has.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +28,7 @@ from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
-# most halvings of a step; 1024 pieces bound the cost of a hopeless step
+# most halvings; 1024 pieces bound the cost of a hopeless step or load
 DEEPEST = 10
 # preset of the fallback solver
 ROBUST = "newton-projected"
@@ -30,13 +43,72 @@ MakeIntegrator = Callable[[Time, Solver, str], Integrator]
 TakeStep = Callable[[State, float], tuple[StepResult, State]]
 
 
+def take_step(
+    balance: EnergyBalance, integrator: Integrator, before: State, time: float
+) -> tuple[StepResult, State]:
+    """Take an integrator's step that ends at ``time`` [s] and passes the balance (collective).
+
+    Raises StepFailed.
+    """
+    result, after = integrator.advance(before, time)
+    after, history_gains = balance.examine(before, result, after, time, integrator.time_step)
+    if not history_gains:
+        return result, after
+    again, after = take_step(balance, integrator, replace(before, history=None), time)
+    cost = replace(result.cost + again.cost, steps=1, step_error=again.cost.step_error)
+    return replace(again, cost=cost), after
+
+
+class Halving:
+    """Pieces of a step or of a load: half as long after a failure, twice as long after a success.
+
+    reached : end of the last piece, from 0 to 1
+    level   : halvings of the next piece
+    count   : number of pieces
+    """
+
+    def __init__(self, level: int = 0):
+        self.reached, self.level, self.count = 0.0, level, 0
+
+    @property
+    def end(self) -> float:
+        """Return the end of the next piece."""
+        return self.reached + 2.0**-self.level
+
+    def run(
+        self, take: Callable[[], None], retry: Callable[[StepFailed], bool] = lambda _: False
+    ) -> None:
+        """Take pieces until 1 is reached. Raises StepFailed.
+
+        take  : takes the next piece
+        retry : returns whether the piece may be taken again as it is, after a failure
+        """
+        while self.reached < 1:
+            try:
+                take()
+            except StepFailed as failure:
+                if not retry(failure):
+                    self._halve(failure)
+                continue
+            self.reached, self.count = self.end, self.count + 1
+            self.level = max(self.level - 1, 0)
+            while self.reached < 1 < self.end:
+                self.level += 1
+
+    def _halve(self, failure: StepFailed) -> None:
+        if self.level == DEEPEST:
+            raise StepFailed(
+                f"{failure} (and failed in {2**DEEPEST} pieces)", failure.kind
+            ) from None
+        self.level += 1
+
+
 class Recovery:
     """Take the steps of a run, and repeat failed steps as ``safety.on_failure`` says.
 
     take    : takes a step as the scene defines it
     spare   : number of halvings -> integrator of that step length
     level   : halvings that the next step starts with, because failures persist
-    deepest : most halvings of the step in progress
     """
 
     state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
@@ -46,7 +118,7 @@ class Recovery:
         self.make, self.balance, self.take = make, balance, take
         self.on_failure, self.time_step = scene.safety.on_failure, scene.time.step
         self.spare: dict[int, Integrator] = {}
-        self.recovered = self.level = self.deepest = 0
+        self.recovered = self.level = 0
 
     def step(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take or recover the step that ends at ``time`` [s] (collective). Raises StepFailed."""
@@ -69,7 +141,7 @@ class Recovery:
         if self.on_failure == "fallback":
             result, after = self._take(0, state, time)
             return replace(result, cost=result.cost + Work(fallbacks=1)), after
-        return self._in_pieces(state, time, self.level or 1)
+        return self._in_pieces(state, time)
 
     def sum_up(self) -> None:
         """Log at the end of a run how many steps were recovered."""
@@ -77,38 +149,22 @@ class Recovery:
             were = "s were" if self.recovered > 1 else " was"
             log.warning("%d step%s %s", self.recovered, were, WORDS[self.on_failure])
 
-    def _in_pieces(self, state: State, time: float, level: int) -> tuple[StepResult, State]:
-        """Take a step in 2^level pieces; halve the pieces that fail.
+    def _in_pieces(self, state: State, time: float) -> tuple[StepResult, State]:
+        """Take a step in pieces, the first of them as long as the last piece before allows."""
+        pieces, cost = Halving(self.level or 1), Work()
 
-        The next step starts at the deepest level of this step, or, if no piece failed, a level up.
-        """
-        self.deepest = level
-        pieces = 2**level
-        cost = Work()
-        for piece in range(1, pieces + 1):
-            end = time - self.time_step + piece * self.time_step / pieces
-            result, state = self._piece(state, end, level)
-            cost += result.cost
-        self.level = self.deepest if self.deepest > level else level - 1
+        def take() -> None:
+            nonlocal state, result, cost
+            end = time - (1 - pieces.end) * self.time_step
+            result, state = self._take(pieces.level, state, end)
+            cost += result.cost + Work(substeps=1)
+
+        result = StepResult(state.q, state.q_previous, cost)
+        pieces.run(take)
+        self.level = pieces.level
         # A resumed run starts without spare solvers.
         self.destroy()
         return replace(result, cost=replace(cost, steps=1)), state
-
-    def _piece(self, state: State, time: float, level: int) -> tuple[StepResult, State]:
-        """Take a piece of t / 2^level that ends at ``time`` [s], in halves if it fails."""
-        self.deepest = max(self.deepest, level)
-        try:
-            result, after = self._take(level, state, time)
-            return replace(result, cost=result.cost + Work(substeps=1)), after
-        except StepFailed as failure:
-            if level == DEEPEST:
-                raise StepFailed(
-                    f"{failure} (and failed in {2**level} pieces)", failure.kind
-                ) from None
-        half = self.time_step / 2 ** (level + 1)
-        first, state = self._piece(state, time - half, level + 1)
-        second, state = self._piece(state, time, level + 1)
-        return replace(second, cost=first.cost + second.cost), state
 
     def _take(self, level: int, state: State, time: float) -> tuple[StepResult, State]:
         """Take a step of t / 2^level between states that belong to steps of t."""
@@ -119,7 +175,7 @@ class Recovery:
             # A new integrator must not differ from a kept integrator.
             self.spare[level].forget()
         before = state.over(self.time_step, short)
-        result, after = self.balance.step(self.spare[level], before, time)
+        result, after = take_step(self.balance, self.spare[level], before, time)
         previous = State(result.position, result.previous).over(short, self.time_step).q_previous
         return replace(result, previous=previous), after.over(short, self.time_step)
 

@@ -38,7 +38,7 @@ from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
-from msmpetsc.solve.recovery import ROBUST, Recovery, TakeStep
+from msmpetsc.solve.recovery import ROBUST, Recovery, TakeStep, take_step
 from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
@@ -137,7 +137,7 @@ class TimeLoop:
         if scene.time.error:
             self.adaptive = Adaptive(scene, self._make, self.balance)
         self.integrator = self.adaptive or self._make(scene.time, scene.solver)
-        take: TakeStep = partial(self.balance.step, self.integrator)
+        take: TakeStep = partial(take_step, self.balance, self.integrator)
         # Adaptive passes each of its own steps through the energy balance.
         if self.adaptive:
             take = self.adaptive.advance

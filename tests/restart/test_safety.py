@@ -175,15 +175,15 @@ def test_stop_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_a_failed_step_is_halved_and_whole_steps_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Call 3 is step 3 as a whole, call 4 its first half, call 5 the first quarter: 2 quarters, 1
-    half; then step 4 in quarters, step 5 in halves, and whole steps again."""
+    """Call 3 is step 3 as a whole, call 4 its first half, call 5 the first quarter: then a half and
+    a quarter; step 4 in halves, and whole steps again."""
     failing = Failing(monkeypatch, {3, 4})
     _, frames = play(beam(tmp_path), "safety.on_failure=substep")
     assert (
-        of(frames, "substeps").tolist() == [0, 0, 0, 3, 4, 2, 0]
+        of(frames, "substeps").tolist() == [0, 0, 0, 3, 2, 0, 0]
         and not of(frames, "fallbacks").any()
     )
-    assert failing.count == 2 + 1 + 1 + 3 + 4 + 2 + 1
+    assert failing.count == 2 + 1 + 1 + 3 + 2 + 1 + 1
 
 
 def test_steps_in_halves_are_those_of_half_the_time_step(

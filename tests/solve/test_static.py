@@ -11,10 +11,12 @@ from one_process import input_error
 
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.integrators.static import LoadPath, LoadSteps
+from msmpetsc.solve.integrators import static
+from msmpetsc.solve.integrators.static import LoadPath
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.recovery import Halving
 
 COLUMN = np.array([0.25, 0.25, 2.0])  # [m]: 2 x 2 x 16 cells
 TOP = {"box": [[-9, -9, 1.99], [9, 9, 9]]}
@@ -146,24 +148,22 @@ def test_a_load_comes_on_in_steps_and_ends_the_same(
 ):
     """Brought on at once or in parts: the equilibrium is but one."""
     _, at_once = play(column(tmp_path, **BEAM))
-    monkeypatch.setattr(LoadSteps, "__init__", start_with_an_eighth)
+    monkeypatch.setattr(static, "Halving", lambda: Halving(3))
     _, in_parts = play(column(tmp_path, **BEAM))
     assert np.abs(at_once[-1].position - in_parts[-1].position).max() < 1e-7
     assert in_parts[-1].iterations > at_once[-1].iterations
 
 
-def start_with_an_eighth(steps: LoadSteps) -> None:
-    steps.reached, steps.size, steps.count, steps.failures = 0.0, 1 / 8, 0, 0
-
-
 def test_shares_of_a_load():
-    steps, tried = LoadSteps(), []
-    for succeeds in (False, False, True, True, False, True, True):
-        tried.append(steps.share)
-        if succeeds:
-            steps.take()
-        else:
-            steps.halve(StepFailed("failed"))
+    steps, tried = Halving(), []
+    succeeds = iter((False, False, True, True, False, True, True))
+
+    def take() -> None:
+        tried.append(steps.end)
+        if not next(succeeds):
+            raise StepFailed("failed")
+
+    steps.run(take)
     assert tried == [1.0, 0.5, 0.25, 0.75, 1.0, 0.875, 1.0]
     assert steps.reached == 1.0 and steps.count == 4
 
@@ -179,7 +179,7 @@ def test_a_state_that_fails_is_found_another_way(
     _, usual = play(column(tmp_path, **tables))
     try_share = LoadPath.try_share
 
-    def fails_at_first(path: LoadPath, steps: LoadSteps) -> StepResult:
+    def fails_at_first(path: LoadPath, steps: Halving) -> StepResult:
         if path.time_step == STATE["step"] and path.stepper.preset is find_preset("newton"):
             raise StepFailed("failed")
         return try_share(path, steps)

@@ -34,6 +34,7 @@ from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.recovery import take_step
 from msmpetsc.solve.work import Work
 
 # levels of the shortest and the longest step; 1/1024 and 64 times the scene's step
@@ -308,7 +309,7 @@ class Adaptive(Integrator):
             before = self._start_of(state, level, restarts)
             end = self._end_time(self.tick + self.ticks.length(level))
             try:
-                result, after = self.balance.step(self._integrator(level), before, end)
+                result, after = take_step(self.balance, self._integrator(level), before, end)
                 measure = self._measure(before, result, after, level)
                 is_accepted = self.control.accepts(level, measure)
             except StepFailed:

@@ -33,6 +33,7 @@ from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.recovery import Halving
 from msmpetsc.solve.work import Work
 
 # first tau, over the time of sound along the body; slender bodies are slower
@@ -43,48 +44,8 @@ LOWEST = 10.0
 ACCEPTED_LOWEST = 1.0, 1e3
 # most iterations of a load step that may be halved; a smaller load step is then cheaper
 HALVING_ITERATIONS = 200
-# smallest load step, over the whole load; it bounds the cost of a hopeless load
-SMALLEST = 2.0**-10
-# most failed load steps of a state; they bound the cost of a hopeless load
-MOST_FAILURES = 50
-# largest load step accepted in any case, over the whole load; smaller steps hardly help
-SMALL = 2.0**-4
-
-
-class LoadSteps:
-    """Choose the shares of a load that are tried in turn.
-
-    reached : share of the last equilibrium
-    count   : number of accepted load steps
-    """
-
-    def __init__(self) -> None:
-        self.reached, self.size, self.count, self.failures = 0.0, 1.0, 0, 0
-
-    @property
-    def share(self) -> float:
-        """Return the share to try next."""
-        return min(self.reached + self.size, 1.0)
-
-    @property
-    def may_be_refused(self) -> bool:
-        """Return whether a smaller load step may end better than the next load step."""
-        return self.size > SMALL
-
-    def take(self) -> None:
-        """Accept the share, and double the load step."""
-        self.reached = self.share
-        self.size *= 2
-        self.count += 1
-
-    def halve(self, failure: StepFailed) -> None:
-        """Halve the load step after a failure. Raises StepFailed if that cannot help."""
-        self.size = 0.5 * (self.share - self.reached)
-        self.failures += 1
-        if self.size < SMALLEST or self.failures > MOST_FAILURES:
-            raise StepFailed(
-                f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind
-            ) from None
+# halvings of a load step beyond which smaller steps hardly help
+SMALL = 4
 
 
 @dataclass
@@ -117,12 +78,12 @@ class LoadPath:
         self.holding: Rows | None = None
         self.problem: StepProblem | None = None
 
-    def try_share(self, steps: LoadSteps) -> StepResult:
+    def try_share(self, steps: Halving) -> StepResult:
         """Return the equilibrium of the share to try.
 
         Raises StepFailed if there is none, or if smaller load steps may avoid its inverted cells.
         """
-        share = steps.share
+        share = steps.end
         q = self.known[-1][1]
         # Obstacles move in the first load step only.
         time_step = 0.0 if len(self.known) > 1 else self.time_step
@@ -134,7 +95,7 @@ class LoadPath:
         count, where = worst_inverted(
             self.stepper.comm, lattice, result.position, corners=self.displaced
         )
-        if steps.may_be_refused and count > self.inverted:
+        if steps.level < SMALL and count > self.inverted:
             raise StepFailed(
                 f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted"
             )
@@ -237,25 +198,29 @@ class Static(ImplicitEuler):
         Raises StepFailed.
         """
         snes, rest = self.stepper.snes, self.stepper.lattice.nodes
-        steps = LoadSteps()
+        steps = Halving()
         max_it = snes.getTolerances()[3]
         # The user's own number of iterations holds for all load steps.
         is_limited = not self.stepper.budget and self.stepper.options.is_default("snes_max_it")
+
+        def take() -> None:
+            nonlocal result
+            if is_limited:
+                snes.setTolerances(max_it=HALVING_ITERATIONS if steps.level < SMALL else max_it)
+            result = path.try_share(steps)
+
+        def begin_at_rest(failure: StepFailed) -> bool:
+            nonlocal path
+            if path.displaced:
+                reason = str(failure).split("; try ")[0]
+                log.info("t = %.6g s: begun at the rest shape: it %s", path.time, reason)
+                path = replace(path, state=State(rest, rest))
+                return True
+            return False
+
+        result = StepResult(path.base, path.base, Work())
         try:
-            while steps.reached < 1.0:
-                if is_limited:
-                    limit = HALVING_ITERATIONS if steps.may_be_refused else max_it
-                    snes.setTolerances(max_it=limit)
-                try:
-                    result = path.try_share(steps)
-                    steps.take()
-                except StepFailed as failure:
-                    if not path.displaced:
-                        steps.halve(failure)
-                        continue
-                    reason = str(failure).split("; try ")[0]
-                    log.info("t = %.6g s: begun at the rest shape: it %s", path.time, reason)
-                    path = replace(path, state=State(rest, rest))
+            steps.run(take, begin_at_rest)
         finally:
             snes.setTolerances(max_it=max_it)
         if steps.count > 1:

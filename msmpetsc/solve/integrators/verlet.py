@@ -38,6 +38,7 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
+from msmpetsc.solve.energy_balance import OSCILLATION_CREDIT
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.linear.ghosts import Ghosted
 from msmpetsc.solve.linear.largest_eigenvalue import HighestMode
@@ -50,8 +51,6 @@ SAFETY = 0.8
 RETRIES = 4
 # spurious energy that halves the substeps, over all energy; a fifth of NOTABLE_GAIN
 GAIN = 2e-3
-# energy that springs may regain after a loss, over all energy; as in the energy balance
-SPRINGS_CREDIT = 0.1
 # gain that doubles substeps, over the limit; doubled substeps gain 4 to 16 times more
 EASED = 1 / 32
 # most halvings of the substeps; 32 times the substeps bound the cost
@@ -220,7 +219,7 @@ class Verlet(Integrator):
         )
         total = energy + kinetic
         limit = GAIN * total + ROUNDING * self.unstable_energy
-        gained = max(self.gained + gain, -SPRINGS_CREDIT * total)
+        gained = max(self.gained + gain, -OSCILLATION_CREDIT * total)
         if (
             min(gain, gained) > limit
             and self.halvings < HALVINGS

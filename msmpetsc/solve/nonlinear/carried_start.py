@@ -38,8 +38,6 @@ PROGRESS = 0.1
 # Corrections at fixed s after each share; a correction doubles a gap that the share has
 # closed
 CORRECTIONS = 2
-# ksp_rtol of a direction, which only has to arrive
-RTOL = 1e-2
 
 
 class CarriedStart:
@@ -55,7 +53,8 @@ class CarriedStart:
         self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP, vectors: Vectors
     ):
         self.functional, self.jacobian, self.ksp, self.vectors = functional, jacobian, ksp, vectors
-        self.most_its = ksp.getTolerances()[3]
+        # Those of the options; a direction only has to arrive
+        self.rtol, _, _, self.most_its = ksp.getTolerances()
 
     def find(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:
         """Return the guess (l, 3) [m], or a start that the surface reaches without a crossing.
@@ -163,7 +162,7 @@ class CarriedStart:
         f.axpy(1.0, change)
         tolerances = self.ksp.getTolerances()
         self.ksp.setInitialGuessNonzero(False)
-        self.ksp.setTolerances(rtol=RTOL, max_it=self.most_its)
+        self.ksp.setTolerances(rtol=self.rtol, max_it=self.most_its)
         self.ksp.solve(f, x)
         self.ksp.setTolerances(*tolerances)
         x.scale(-1.0)

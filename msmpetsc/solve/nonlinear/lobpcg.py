@@ -19,12 +19,9 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Most iterations of a long search
 LONGEST_SEARCH = 100
-# A long search ends if the curvature is above this share of its value half as many
-# iterations ago
+# A long search ends if the curvature has fallen by less than to this share of its value
+# half as many iterations ago
 SETTLED = 0.95
-# A search ends if a negative curvature is above this multiple of its value two
-# iterations ago
-SHARPENED = 1.1
 TINY = np.finfo(float).tiny
 # Relative eigenvalue of a Gram matrix below which directions are linearly dependent
 DEPENDENT = 1e-10
@@ -127,10 +124,8 @@ class Lobpcg:
             lowest.append(found[0][0])
             if its == most:
                 break
-            if lowest[-1] < 0:
-                if its >= 2 and lowest[-1] > SHARPENED * lowest[-3]:
-                    break
-            elif its >= max(least, 1) and lowest[-1] > SETTLED * lowest[its // 2]:
+            least_its, settled = (2, 1 / SETTLED) if lowest[-1] < 0 else (max(least, 1), SETTLED)
+            if its >= least_its and lowest[-1] > settled * lowest[its // 2]:
                 break
         return found[0], found[1].copy()
 

@@ -25,7 +25,6 @@ from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.implicit import ContactFaces
 from msmpetsc.solve.nonlinear.error_control import Outcome
-from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -184,23 +183,6 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
     assert (
         height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2
     )  # it stays above, and is hardly dented
-
-
-def test_the_best_guess_is_taken_though_not_all_are_weighed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-):
-    chosen, least = [], FirstGuess._least
-
-    def checked(self: FirstGuess, guesses: list[np.ndarray], without: list[float]) -> int:
-        number = least(self, guesses, without)
-        values = [self.functional.value(self.with_fixed(guess), True) for guess in guesses]
-        chosen.append((number, int(np.argmin(values)), int(np.argmin(without))))
-        return number
-
-    monkeypatch.setattr(FirstGuess, "_least", checked)
-    play(fall(folder, "guesses", 1e-3, time={"step": 0.01, "duration": 0.2}))
-    taken, best, without = np.array(chosen).T
-    assert len(taken) > 10 and np.array_equal(taken, best) and (best != without).any()
 
 
 @pytest.fixture

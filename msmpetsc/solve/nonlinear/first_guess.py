@@ -36,34 +36,11 @@ class FirstGuess:
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
         surface = self.functional.surface
-        presses = surface is not None and surface.presses(q)
         # A free flight would lead into the parts that press each other
-        if not presses:
+        if surface is None or not surface.presses(q):
             guesses.append(flight)
         values = [self.functional.value(self.with_fixed(guess)) for guess in guesses]
-        best = self._least(guesses, values) if surface and presses else int(np.argmin(values))
-        return guesses[best]
-
-    def _least(self, guesses: list[Positions], without: list[float]) -> int:
-        """Return the number of the guess of least g.
-
-        Self-contact costs most. It lowers g by no more than the energy that it, or an elastic slip,
-        stores at the start. So most guesses are ruled out without it.
-
-        without : g of each guess without self-contact
-        """
-        functional = self.functional
-        problem, best, least = functional.problem, 0, np.inf
-        assert functional.surface is not None
-        contacts = functional.surface.contacts
-        stored = functional.t2 * contacts.touch(problem.q, contacts.begin).energy
-        for number in np.argsort(without):
-            if without[number] - stored >= least:
-                break
-            value = functional.value(self.with_fixed(guesses[number]), True)
-            if value < least:
-                best, least = int(number), value
-        return best
+        return guesses[int(np.argmin(values))]
 
     def learn(self, x: Positions) -> None:
         """Take the correction of a step that ended at x (l, 3) [m]."""

@@ -158,12 +158,11 @@ class StepFunctional:
         self.vectors.lend(iterate, iterate.x, iterate.f)
         return iterate
 
-    def value(self, q: Positions, met: bool = False) -> float:
+    def value(self, q: Positions) -> float:
         """Return g [kg m^2] at positions q (l, 3) [m], up to a constant of the step.
 
-        It compares guesses that are far apart.
-
-        met : include self-contact, which costs most and means little if triangles cross
+        It compares guesses that are far apart. Self-contact is left out: it costs most and means
+        little if triangles cross.
         """
         problem, owned = self.problem, slice(self.lattice.owned)
         moved = q[owned] - problem.y[owned]
@@ -171,8 +170,6 @@ class StepFunctional:
         if problem.contact:
             acting += problem.contact.energy(q)
             acting += problem.contact.change_of_friction(q, problem.y)
-            if met and problem.contact.surface:
-                acting += problem.contact.surface.change(q, problem.q)
         inertia = 0.5 * self._inner(moved, moved)
         return float(self.comm.allreduce(inertia + self.t2 * acting))
 

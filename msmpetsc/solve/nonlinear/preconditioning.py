@@ -141,15 +141,6 @@ class LatticePreconditioner:
             self._build(q.copy(), self._blocks(contact), surface)
         return is_due
 
-    def balance(self, q: Positions, contact: ContactAt | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Translate free bodies to the balance of their forces, from positions q with residual f.
-
-        q : positions (l, 3) [m] of the unknowns x, which are changed
-        """
-        if self.translations and self._is_free(q, contact):
-            columns = self.unknowns.columns_to_write(x)
-            columns -= self.translations.of(self.unknowns.columns(f))
-
     def most_iterations(self, rtol: float) -> int | None:
         """Return the most iterations of a solve to a relative tolerance with this hierarchy.
 
@@ -336,12 +327,6 @@ class StepPreconditioner:
                 "preconditioner: multigrid on the lattice (%s; -pc_type jacobi keeps to it)", reason
             )
             self.multigrid = self.make_multigrid()
-
-    @property
-    def to_balance(self) -> LatticePreconditioner | None:
-        """Multigrid that translates free bodies to the balance of forces; None without any."""
-        multigrid = self.multigrid if self.is_chosen else None
-        return multigrid if multigrid and multigrid.translations else None
 
     def most_iterations(self, rtol: float) -> int | None:
         """Return the most iterations of a solve to a tolerance; None for PETSc's option."""

@@ -29,7 +29,6 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.nonlinear.local_global import LocalGlobal
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.newton import SOFTER, Newton
-from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
@@ -252,20 +251,7 @@ class Stepper:
                 self.first_guess.with_fixed(guess), self.first_guess.drift
             )
         with LOCAL:
-            now = self.functional.at(guess)
-        multigrid = self.jacobian.preconditioner.to_balance
-        return self._balanced(now, multigrid) if start is None and multigrid else now
-
-    def _balanced(self, now: Iterate, multigrid: LatticePreconditioner) -> Iterate:
-        """Return an iterate whose free bodies are translated to the balance of forces."""
-        x = self.functional.vectors.take()
-        now.x.copy(x)
-        multigrid.balance(now.q, now.contact, now.f, x)
-        balanced = self.functional.iterate(x)
-        share = self.functional.free_share(now.q, balanced.q)
-        return (
-            balanced if share == 1.0 else self.functional.at(now.q + share * (balanced.q - now.q))
-        )
+            return self.functional.at(guess)
 
     def _first(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
         """Reduce F to the goal from the start of a step (collective).

@@ -7,10 +7,14 @@
    nearer to its solution, and inertia holds nodes nearer to their places.
 3. ``Recovery``: a robust preset solves the step, if ``safety.on_failure`` says so.
 
-What a solver does before it fails is no rung: the projected Hessian (nonlinear.newton), the way to
-another point after a saddle (nonlinear.step), a start that crosses nothing
-(nonlinear.carried_start), other contacts (integrators.implicit.ContactFaces), substeps that are
-stable (integrators.verlet). Each needs an iterate or a problem that no caller has.
+A solver has retries of its own, which are no rungs, since no caller has their iterates or problems:
+
+- the projected Hessian (nonlinear.newton)
+- softer solids, and another point after a saddle (nonlinear.step)
+- a start that crosses nothing (nonlinear.carried_start)
+- other contacts (integrators.implicit.ContactFaces)
+- the rest shape in place of a given start (integrators.static)
+- stable substeps (integrators.verlet)
 """
 
 from collections.abc import Callable
@@ -75,32 +79,22 @@ class Halving:
         """Return the end of the next piece."""
         return self.reached + 2.0**-self.level
 
-    def run(
-        self, take: Callable[[], None], retry: Callable[[StepFailed], bool] = lambda _: False
-    ) -> None:
-        """Take pieces until 1 is reached. Raises StepFailed.
-
-        take  : takes the next piece
-        retry : returns whether the piece may be taken again as it is, after a failure
-        """
+    def run(self, take: Callable[[], None]) -> None:
+        """Take pieces until 1 is reached; ``take`` takes the next piece. Raises StepFailed."""
         while self.reached < 1:
             try:
                 take()
             except StepFailed as failure:
-                if not retry(failure):
-                    self._halve(failure)
-                continue
-            self.reached, self.count = self.end, self.count + 1
-            self.level = max(self.level - 1, 0)
-            while self.reached < 1 < self.end:
+                if self.level == DEEPEST:
+                    raise StepFailed(
+                        f"{failure} (and failed in {2**DEEPEST} pieces)", failure.kind
+                    ) from None
                 self.level += 1
-
-    def _halve(self, failure: StepFailed) -> None:
-        if self.level == DEEPEST:
-            raise StepFailed(
-                f"{failure} (and failed in {2**DEEPEST} pieces)", failure.kind
-            ) from None
-        self.level += 1
+            else:
+                self.reached, self.count = self.end, self.count + 1
+                self.level = max(self.level - 1, 0)
+                while self.reached < 1 < self.end:
+                    self.level += 1
 
 
 class Recovery:
@@ -152,6 +146,7 @@ class Recovery:
     def _in_pieces(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take a step in pieces, the first of them as long as the last piece before allows."""
         pieces, cost = Halving(self.level or 1), Work()
+        result = StepResult(state.q, state.q_previous, cost)
 
         def take() -> None:
             nonlocal state, result, cost
@@ -159,7 +154,6 @@ class Recovery:
             result, state = self._take(pieces.level, state, end)
             cost += result.cost + Work(substeps=1)
 
-        result = StepResult(state.q, state.q_previous, cost)
         pieces.run(take)
         self.level = pieces.level
         # A resumed run starts without spare solvers.

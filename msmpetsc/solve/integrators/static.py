@@ -199,19 +199,18 @@ class Static(ImplicitEuler):
         result = StepResult(path.base, path.base, Work())
 
         def take() -> None:
-            nonlocal result
-            result = path.try_share(steps)
-
-        def begin_at_rest(failure: StepFailed) -> bool:
-            nonlocal path
-            if path.displaced:
+            nonlocal path, result
+            try:
+                result = path.try_share(steps)
+            except StepFailed as failure:
+                if not path.displaced:
+                    raise
                 reason = str(failure).split("; try ")[0]
                 log.info("t = %.6g s: begun at the rest shape: it %s", path.time, reason)
                 path = replace(path, state=State(rest, rest))
-                return True
-            return False
+                result = path.try_share(steps)
 
-        steps.run(take, begin_at_rest)
+        steps.run(take)
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", path.time, steps.count)
         return result, path

@@ -21,6 +21,8 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
+# Cost of an iteration of a method without its linear solve [iterations of CG]
+ITERATION = 10
 REASON = PETSc.SNES.ConvergedReason
 
 
@@ -70,7 +72,8 @@ class StepMethod(ABC):
             return int(REASON.CONVERGED_ITS)
         if Stop.agreed(self.functional.comm):
             return int(REASON.DIVERGED_INNER)
-        if self.spent().ksp_its > MOST_ITERATIONS:
+        spent = self.spent()
+        if spent.ksp_its + ITERATION * (spent.iterations + its) > MOST_ITERATIONS:
             return int(REASON.DIVERGED_MAX_IT)
         return int(REASON.ITERATING)
 

@@ -53,7 +53,7 @@ class CarriedStart:
         self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP, vectors: Vectors
     ):
         self.functional, self.jacobian, self.ksp, self.vectors = functional, jacobian, ksp, vectors
-        # Those of the options; a direction only has to arrive
+        # Tolerances of the options; a direction only has to arrive
         self.rtol, _, _, self.most_its = ksp.getTolerances()
 
     def find(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:

@@ -94,7 +94,7 @@ class Outcome:
 
 @dataclass(eq=False)
 class ErrorControl:
-    """Errors of the iterates of one stepper. All methods that take an iterate are collective.
+    """Errors of the iterates of a stepper. All methods that take an iterate are collective.
 
     target       : relative error at which a step is done; 0 if a budget of iterations ends it
     rtol         : ksp_rtol, the loosest tolerance of a linear solve

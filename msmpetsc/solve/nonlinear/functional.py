@@ -40,7 +40,7 @@ HOPELESS = 0.3
 
 @dataclass(frozen=True)
 class StepProblem:
-    """Data of one implicit step.
+    """Data of an implicit step.
 
     q          : q_n (l, 3) [m], ghosts included
     y          : positions (l, 3) [m] of the nodes after the step without forces

@@ -153,7 +153,7 @@ class Lobpcg:
             self.its += size
 
     def _space(self, start: Rows, block: int) -> "SearchSpace":
-        """Return the space of directions (l, n), with room for those of an iteration."""
+        """Return the space of directions (l, n), with room for the directions of an iteration."""
         room = max(len(start), 3 * block), start.shape[1]
         space = SearchSpace(np.empty(room, like=start), np.empty(room, like=start), len(start))
         space.directions[: len(start)] = start

@@ -124,7 +124,7 @@ class Newton(StepMethod):
 
         If the error estimate there has found a correction, its H and the correction are reused.
 
-        projected : use H without its negative parts, which are not those of the estimate
+        projected : use H without its negative parts; the estimate has a Hessian with them
         """
         known = outcome.corrected and not projected
         with LOCAL:

@@ -44,7 +44,7 @@ LOOP = {"snes_type": "newtonls", "snes_linesearch_type": "bt"}
 
 @dataclass(frozen=True)
 class StepResult:
-    """Result of one step.
+    """Result of a step.
 
     position     : (l, 3) [m], ghosts included
     previous     : (l, 3) [m], such that the velocity is (position - previous) / t
@@ -216,7 +216,7 @@ class Stepper:
             self.ksp.setUp()
 
     def step(self, problem: StepProblem, start: Rows | None = None) -> StepResult:
-        """Return the result of one step.
+        """Return the result of a step.
 
         start : first guess (l, 3) [m]; None for the best of several
 

@@ -1,10 +1,10 @@
 """Lowest curvature of a step's true Hessian H = M + t^2 (Hessian of E).
 
 F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. H is positive
-definite if no spring or cell is compressed enough, which a pass over them tells. Otherwise the lowest
-eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the compression has
-grown or if a solve has met a negative curvature. At all other steps a few iterations follow the
-last mode, with multigrid only if its curvature has changed.
+definite if no spring or cell is compressed enough, which a pass over them tells. Otherwise the
+lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the
+compression has grown or if a solve has met a negative curvature. At all other steps a few
+iterations follow the last mode, with multigrid only if its curvature has changed.
 """
 
 from dataclasses import dataclass

@@ -28,14 +28,15 @@ MOST_COPIES = COPIES**8
 CHILDREN = 27 * COPIES
 
 
-def _children() -> Indices:
+def _children() -> Array:
     """Return the children (8, 8, 8) of a coarse cell's corners among the corners of fine cells.
 
     The axes are the fine cell's place in the coarse cell, the coarse corner and the fine corner.
     A child is numbered 0 to 26 by its offset from the coarse corner; -1 is none.
     """
     offset = CORNERS[:, None, None] + CORNERS - 2 * CORNERS[:, None]
-    return np.where((np.abs(offset) <= 1).all(axis=3), (offset + 1) @ [9, 3, 1], -1)
+    number = np.where((np.abs(offset) <= 1).all(axis=3), (offset + 1) @ [9, 3, 1], -1)
+    return number.astype(np.int16)
 
 
 CHILD = _children()
@@ -98,8 +99,8 @@ class CoarseCopies:
         """
         route = Route(owners.comm, owners.owner(parents.ravel()))
         around = CHILD[place].reshape(-1, 8)
-        own = np.repeat(self.cells % COPIES, 8, axis=0)
-        children = np.where(around >= 0, COPIES * around + own, -1).astype(np.int16)
+        own = np.repeat((self.cells % COPIES).astype(np.int16), 8, axis=0)
+        children = np.where(around >= 0, np.int16(COPIES) * around + own, np.int16(-1))
         of_parent = places_of(owners.keys, route.send(parents.ravel()))
         tree = np.arange(CHILDREN * len(owners.keys))
         part = np.empty(len(of_parent), np.int64)

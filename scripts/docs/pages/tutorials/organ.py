@@ -72,7 +72,7 @@ for displacement, pull in zip(0.015 * time / 3.0, force, strict=True):
 # It prints:
 #
 #     0 mm: 0.0 N
-#     5 mm: -2.0 N
+#     5 mm: -1.9 N
 #     10 mm: -3.8 N
 #     15 mm: -5.6 N
 #

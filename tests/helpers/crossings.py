@@ -12,7 +12,11 @@ def unique_edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def count_crossings(points: np.ndarray, triangles: np.ndarray) -> int:
-    """Return how many pairs of an edge and a triangle that share no corner cross; points (v, 3)."""
+    """Return how many pairs of an edge and a triangle that share no corner cross; points (v, 3).
+
+    An edge with an end in the triangle's plane, up to rounding, does not cross it: a flat face has
+    triangles in one plane.
+    """
     return _count(
         np.ascontiguousarray(points, float),
         unique_edges(triangles),
@@ -38,6 +42,7 @@ def _count(points, edges, triangles):
                 points[triangles[f, 2], c],
             )
             low[f, c], high[f, c] = min(x, y, z), max(x, y, z)
+    rounding = 1e-13 * np.abs(points).max()
     order = np.argsort(low[:, 0])
     begins, widest = low[order, 0], (high[:, 0] - low[:, 0]).max()
     for e in range(len(edges)):
@@ -52,7 +57,10 @@ def _count(points, edges, triangles):
             if apart:
                 continue
             r, s, t = points[i], points[j], points[k]
-            if _volume(r, s, t, p) * _volume(r, s, t, q) >= 0:
+            above, below = _volume(r, s, t, p), _volume(r, s, t, q)
+            if above * below >= 0:
+                continue
+            if min(abs(above), abs(below)) <= rounding * np.linalg.norm(np.cross(s - r, t - r)):
                 continue
             u, v, w = _volume(p, q, r, s), _volume(p, q, s, t), _volume(p, q, t, r)
             count += (u > 0 and v > 0 and w > 0) or (u < 0 and v < 0 and w < 0)

@@ -292,16 +292,23 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
     """Return the prepared bodies, with their surfaces on rank 0 only (collective)."""
     prepared = on_root(comm, lambda: [*_prepared(scene)]) or []
-    facts = comm.bcast([(each[1], bounds_of(each[0]), each[2]) for each in prepared])
-    surfaces: list[Surface | None] = [each[0] for each in prepared] or [None] * len(facts)
+    facts = comm.bcast(
+        [(report, bounds_of(surface), thickness) for surface, report, thickness in prepared]
+    )
+    surfaces: list[Surface | None] = [surface for surface, _, _ in prepared]
     return tuple(
-        BodySurface(comm, surface, *fact) for surface, fact in zip(surfaces, facts, strict=True)
+        BodySurface(comm, surface, *of_body)
+        for surface, of_body in zip(surfaces or [None] * len(facts), facts, strict=True)
     )
 
 
 def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport, Thickness | None]]:
-    """Yield each body's checked surface, report and thickness; prepare each distinct mesh once."""
+    """Yield each body's checked surface, report and thickness.
+
+    Each distinct mesh is prepared and measured once.
+    """
     shapes: dict[str, Surface] = {}
+    measured: dict[str, Thickness | None] = {}
     for path, mesh in scene.meshes.items():
         prefix = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
         shape = repr(mesh.model_copy(update={"base": None}))
@@ -318,7 +325,9 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport, Thickness 
             log.warning("%s%s: %s", prefix, mesh.source, warning)
         # a point of no triangle may lie in no cell: compact() drops it
         whole = compact(surface.points, surface.triangles)
-        yield replace(whole, groups=surface.groups), report, thickness_of(whole, report)
+        if shape not in measured:
+            measured[shape] = thickness_of(whole, report)
+        yield replace(whole, groups=surface.groups), report, measured[shape]
 
 
 def _check_size(surface: Surface, size: float | None) -> list[str]:

@@ -117,6 +117,11 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     return f", did you mean {near!r}?" if near else ""
 
 
+def body_names(count: int) -> list[str]:
+    """Return the names of ``count`` bodies of a scene in messages."""
+    return [f"body.{number}" if count > 1 else "the body" for number in range(count)]
+
+
 def one_line(error: Exception, length: int = 160) -> str:
     """Return the first line of an error's message in printable characters."""
     return printable((str(error).strip().splitlines() or [type(error).__name__])[0], length)

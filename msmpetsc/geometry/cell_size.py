@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, body_names
 from msmpetsc.geometry.cages import TOLERANCE, BodySurface, refuse_beyond_memory, slabs_of_all
 from msmpetsc.geometry.grid import BodyGrids
 from msmpetsc.geometry.thickness import ADVISED, ENOUGH
@@ -95,7 +95,7 @@ def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float, law: st
     log.warning(
         "a tenth of %s is so thin%s that it bends by about %.2g of theory: cages.count = %d or "
         "cages.cell_size = %.2g makes that %.2g",
-        f"body.{thinnest}" if len(bodies) > 1 else "the body",
+        body_names(len(bodies))[thinnest],
         ", and askew to the grid," if law == SOLID else "",
         bending[thinnest], float(f"{estimated_cells(bodies, advised):.2g}"), advised, ADVISED,
     )  # fmt: skip

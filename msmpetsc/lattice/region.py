@@ -134,13 +134,12 @@ class Finder:
         A region of painted points has all samples of the cells that contain these points. An open
         group has all samples of the cells that its triangles cut.
         """
-        where = np.zeros((len(cells.ijk), COUNT), bool)
+        where, keys = np.zeros((len(cells.ijk), COUNT), bool), encode_morton(cells.ijk)
         if table.table.region.painted is not None:
-            keys = encode_morton(self._painted_cells(table))
-            where[np.isin(encode_morton(cells.ijk), keys)] = True
+            where[np.isin(keys, encode_morton(self._painted_cells(table)))] = True
         elif table.table.region.group is not None:
             for number, group, marked in self._groups(table, are_nodes=False):
-                is_marked = np.isin(encode_morton(cells.ijk), marked)
+                is_marked = np.isin(keys, marked)
                 if not examine(group).closed:
                     where[is_marked] = True
                     continue

@@ -18,7 +18,7 @@ from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.machine import peak_memory
 from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, body_names
 from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.cell_size import (
     choose_cell_size,
@@ -150,10 +150,10 @@ def print_counts(report: dict[str, Any]) -> None:
         else:
             columns = f"{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}"
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
-    several = len(report["thickness"]) > 1
+    names = body_names(len(report["thickness"]))
     thick = [
-        f"{f'body.{number}' if several else 'the body'} is {thickness_words(cells)}"
-        for number, cells in enumerate(report["thickness"])
+        f"{name} is {thickness_words(cells)}"
+        for name, cells in zip(names, report["thickness"], strict=True)
         if cells
     ]
     if thick:

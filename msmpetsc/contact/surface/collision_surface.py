@@ -16,7 +16,7 @@ from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.obstacle_surfaces import obstacle_surfaces
 from msmpetsc.contact.surface.pairs import CollisionSurface
 from msmpetsc.contact.surface.points import SurfacePoints
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, body_names
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import ON_PLANE
@@ -79,8 +79,7 @@ def collision_surface(
     side = smallest(np.array([body.bounds for body in bodies]))
     law = BarrierLaw.of_lattice(distance, table, lattice, scene.time.step, side)
     carried = SurfacePoints(comm, lattice, embedding, met)
-    names = [f"body.{number}" if len(bodies) > 1 else "the body" for number in range(len(bodies))]
-    names += [f"obstacle.{number}" for number in met.numbers]
+    names = body_names(len(bodies)) + [f"obstacle.{number}" for number in met.numbers]
     counts = [len(part.points) for part in (*surfaces, *met.solids)]
     parts = list(zip(names, counts, strict=True)) if surfaces else []
     surface = CollisionSurface(joint, carried, law, meets_itself, parts)

@@ -152,7 +152,7 @@ class Lobpcg:
             values = self._ritz(space, size)
             self.its += size
 
-    def _space(self, start: Rows, block: int) -> "SearchSpace":
+    def _space(self, start: Rows, block: int) -> SearchSpace:
         """Return the space of directions (l, n), with room for the directions of an iteration."""
         room = max(len(start), 3 * block), start.shape[1]
         space = SearchSpace(np.empty(room, like=start), np.empty(room, like=start), len(start))
@@ -160,12 +160,12 @@ class Lobpcg:
         self._multiply(space, 0)
         return space
 
-    def _multiply(self, space: "SearchSpace", first: int) -> None:
+    def _multiply(self, space: SearchSpace, first: int) -> None:
         """Compute the products with the directions from the ``first`` on."""
         new = slice(first, space.used)
         space.products[new] = self._of_each(self.hessian.mult, space.directions[new])
 
-    def _add_residual(self, space: "SearchSpace", i: int, value: float) -> float:
+    def _add_residual(self, space: SearchSpace, i: int, value: float) -> float:
         """Add the preconditioned residual of the i-th Ritz vector; return its error r^T P^-1 r."""
         residual = space.products[i] - value * self.functional.mass * space.directions[i]
         scale = max(self.comm.allreduce(float(greatest(np.abs(residual))), MPI.MAX), TINY)
@@ -177,7 +177,7 @@ class Lobpcg:
         error: float = self.comm.allreduce(float(residual @ w)) * scale**2
         return error
 
-    def _ritz(self, space: "SearchSpace", size: int) -> Floats:
+    def _ritz(self, space: SearchSpace, size: int) -> Floats:
         """Return the lowest Ritz values (size,) in a space, ascending, and reduce the space.
 
         It keeps the Ritz vectors, of unit length. Their parts outside the first ``size``

@@ -18,17 +18,21 @@ from forked import run_forked, run_ranks
 from msmpetsc.app.ranks import ALONE
 
 ROOT = Path(__file__).parent.parent
-WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec
+# programs for mpiexec
+WORKERS = ROOT / "tests" / "workers"
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-os.environ.update(AS_ROOT)  # for what the program itself starts by mpiexec, called within a test
-SHARED_CORES = {"OMPI_MCA_mpi_yield_when_idle": "1"}  # more ranks than cores: who waits makes room
+# for runs that a command starts by mpiexec within a test
+os.environ.update(AS_ROOT)
+# waiting ranks yield their core, since ranks outnumber cores
+SHARED_CORES = {"OMPI_MCA_mpi_yield_when_idle": "1"}
 # Open MPI 5 writes a line for each rank about networks that do not pair, IPv4 with
 # IPv6; ranks of one machine need none
 ONE_MACHINE = {"OMPI_MCA_btl_tcp_if_include": "lo"}
-# As this process was started: its own MPI, once awake, leaves marks that would confuse a child's.
+# As this process was started: its own MPI, once awake, leaves marks that would confuse
+# a child's. the path by which petsc4py may be found
 PATHS = os.pathsep.join(
     filter(None, (str(ROOT), str(ROOT / "tests" / "helpers"), os.environ.get("PYTHONPATH")))
-)  # petsc4py may be found by it
+)
 ENVIRONMENT = {
     **os.environ,
     **AS_ROOT,
@@ -38,10 +42,11 @@ ENVIRONMENT = {
     **ONE_MACHINE,
 }
 
-# Seconds that each test file took, all its tests together; scripts/test --record-durations
-# writes them
+# Seconds that each test file took, all its tests together; scripts/test
+# --record-durations writes them
 DURATIONS = Path(__file__).parent / "durations.json"
-# Seconds of a file up to which its tests are in the smoke run, which takes three minutes in all
+# Seconds of a file up to which its tests are in the smoke run, which takes three
+# minutes in all
 SMOKE = 10.0
 
 # [s]: what takes longer will not end; a loaded machine was seen to take ten times as
@@ -152,7 +157,8 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def falling_ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result of a ball that falls and leaps, its surface stored; for reading only."""
-    from ball_result import write_ball  # which wakes MPI
+    # this import starts MPI
+    from ball_result import write_ball
 
     return write_ball(tmp_path_factory.mktemp("falling") / "ball.h5")
 

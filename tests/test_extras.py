@@ -52,9 +52,8 @@ def test_the_table_of_extras_is_that_of_the_project(extra: str):
         )
 
 
-OF_RUNS = tuple(
-    name for name in EXTRAS["run"] if name not in (*EXTRAS["render"], "pooch")
-)  # which pyvista needs
+# packages that pyvista needs
+OF_RUNS = tuple(name for name in EXTRAS["run"] if name not in (*EXTRAS["render"], "pooch"))
 DRAWN = [
     "render {} -o x.png",
     "render {} -o x.gif --frames 0:4:2",
@@ -130,7 +129,8 @@ def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball:
 
 
 BEAM = ROOT / "scenes" / "studies" / "atlas" / "beam.toml"
-NEEDED = {  # a package that is missing -> the extra that brings it, and a command that needs it
+# by missing package: the extra that brings it, and a command that needs it
+NEEDED = {
     **{
         name: ("run", ["run", BEAM, "-o", "y.h5"])
         for name in ("mpi4py", "petsc4py", "numba", "trimesh", "igl")

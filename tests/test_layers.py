@@ -4,7 +4,8 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-LAYERS = (  # each imports from those before it alone
+# each layer imports from earlier layers only
+LAYERS = (
     "errors",
     "scene comm backend extensions fields checkpoint",
     "geometry",
@@ -24,11 +25,12 @@ LAYERS = (  # each imports from those before it alone
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names.split()}
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
 ONLY_IN = {"petsc4py": {"solve", "app", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}
+# results can be read and drawn without PETSc
 NEVER = {
     ("results", "solve"),
     ("view", "solve"),
     ("export", "solve"),
-}  # a result can be read and drawn where there is no PETSc
+}
 
 
 def imported(tree: ast.AST) -> Iterator[str]:

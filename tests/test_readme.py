@@ -49,7 +49,8 @@ ELSEWHERE = {
     "asv", "pip", "python", "module", "export", "./configure", "eval",
     "sbatch", "docker", "apptainer", "conda", "spack",
 }  # fmt: skip
-SMALLER = {  # a command's words -> those of the test
+# words of a command -> words of the test
+SMALLER = {
     "cages.count=3000": "cages.count=400 --frames 4 --overwrite",
     "bunny_fall.toml --overwrite": "bunny_fall.toml --overwrite --set cages.count=400 --frames 2",
     "new my.toml --mesh body.obj": "new my.toml --mesh body.obj --overwrite",
@@ -65,9 +66,11 @@ SMALLER = {  # a command's words -> those of the test
     "--set time.duration=4": "--set time.duration=0.05",
 }
 RUN = (ROOT / "scripts" / "README.md", *sorted((*START.glob("*.md"), *HOW_TO.glob("*.md"))))
-DIFFER = {"compare": (0, 1), "plan": (0, 3)}  # exit statuses of commands that were carried out
+# exit statuses of the commands that were run
+DIFFER = {"compare": (0, 1), "plan": (0, 3)}
 PROGRAM = ("-m", "msmpetsc.cli.main")
-LONG = ("study", "--device cuda")  # of RUN's commands, parsed only
+# commands of RUN that are only parsed
+LONG = ("study", "--device cuda")
 # commands that fork runs or start mpiexec, which no fork of a test's may do
 STARTING = ("plan ", "check ", "doctor")
 
@@ -149,7 +152,8 @@ def test_commands_are_known(command: str):
     if program == "msmpetsc":
         try:
             assert parsed(arguments).command == arguments[0]
-        except SystemExit as done:  # of what prints and ends
+        except SystemExit as done:
+            # the page's code prints and ends
             assert done.code == 0
         return
     script = ROOT / program
@@ -253,8 +257,10 @@ def test_the_scene_with_every_table_is_one(tmp_path: Path):
 
 STUDIES = HOW_TO / "study.md"
 WITH_TABLES = [path for path in PAGES if blocks(path, "toml") and path != STUDIES]
-WITH_TABLES.remove(REFERENCE / "every-table.md")  # which names meshes that are downloaded
-LACKED = {  # tables of the scene that a page's tables change
+# this page names meshes that would be downloaded
+WITH_TABLES.remove(REFERENCE / "every-table.md")
+# tables of the scene that a page's tables change
+LACKED = {
     "mesh": {"source": "body.obj"},
     "cages": {"count": 200},
     "material": {"young_modulus": 1e6, "density": 1000},

@@ -33,12 +33,14 @@ PAPER_CELLS = {
     "bunny": 9946,
     "brain": 13661,
 }
-TISSUE_CELLS = {"heart_tissue": 1500}  # of neo-Hookean scenes, which are not the paper's either
+# neo-Hookean scenes, which are not the paper's either
+TISSUE_CELLS = {"heart_tissue": 1500}
+# scenes that are not the paper's
 TOUCHING_CELLS = {
     "two_bunnies": 1500,
     "pile": 1000,
     "armadillo_fold": 3000,
-}  # of scenes that are not the paper's
+}
 ALL = sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
@@ -143,9 +145,8 @@ def test_every_scene_has_the_papers_cells_or_its_own_and_four_moments():
     for name in ALL:
         scene = SceneFile.model_validate(tomllib.loads((SCENES / f"{name}.toml").read_text()))
         assert scene.cages.count == (own.get(name) or PAPER_CELLS[name.split("_")[0]])
-        assert (
-            scene.self_contact is None or scene.self_contact.surface is None
-        )  # what is drawn is what touches
+        # the drawn surface is the surface in contact
+        assert scene.self_contact is None or scene.self_contact.surface is None
         assert len(scene.picture.times) == 4 and scene.picture.times[-1] <= scene.time.duration
 
 
@@ -188,17 +189,18 @@ def knee_angle(run: Result, q: np.ndarray) -> float:
 
 def test_the_dragon_is_raised_to_rest_and_pushed_to_rest_and_bends_its_knees(result):
     run = result("dragon_raise_push")
-    turn = np.searchsorted(
-        run.time, run.scene.force[1].start - 1e-9
-    )  # the first frame under the force reversed
+    # the first frame under the reversed force
+    turn = np.searchsorted(run.time, run.scene.force[1].start - 1e-9)
     assert run.kinetic[turn - 1] < 1e-6 * run.kinetic[:turn].max()
     assert run.kinetic[-1] < 1e-6 * run.kinetic[turn:].max()
-    for zone in (([0, 0.5, 0.8], [1, 0.9, 1]), ([0, 0.15, 0.8], [1, 0.5, 1])):  # head, wings
+    # the head and the wings
+    for zone in (([0, 0.5, 0.8], [1, 0.9, 1]), ([0, 0.15, 0.8], [1, 0.5, 1])):
         raised, pushed = run.moved(turn - 1, run.zone(*zone))[2], run.moved(-1, run.zone(*zone))[2]
         assert raised > 0.004 and pushed < -0.004
     rest, raised, pushed = (knee_angle(run, q) for q in (run.nodes, run.q[turn - 1], run.q[-1]))
     assert pushed < rest - 0.2 and raised > rest + 0.2
-    assert run.moved(-1, run.zone([0, 0.25, 0.3], [1, 0.5, 0.45]))[2] < -0.002  # hind knees go down
+    # the hind knees go down
+    assert run.moved(-1, run.zone([0, 0.25, 0.3], [1, 0.5, 0.45]))[2] < -0.002
 
 
 # ---- Figure 9
@@ -222,18 +224,19 @@ def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trac
         [Motion.through(plate.path).value_at(time)[2] for time in run.time]
     )
     there = run.time < plate.stop - 1e-9
-    assert low.min() < 0.82 * 0.21  # the lobes are 0.21 m high
-    assert run.surface[:, :, 2].min() > -0.4 * run.h  # the tips it lands on
+    # the lobes are 0.21 m high
+    assert low.min() < 0.82 * 0.21
+    # the tips on which the lung lands
+    assert run.surface[:, :, 2].min() > -0.4 * run.h
     assert (run.surface[there, :, 2].max(axis=1) < low[there] + 0.4 * run.h).all()
     body, tip = run.zone([0, 0, 0], [1, 1, 0.5]), run.zone([0, 0, 0.95], [1, 1, 1])
     assert error_of_lobes(run) < 0.02 * run.height
-    assert run.moved(-1, body)[2] > -0.07  # it leans over and sags under its own weight
-    assert (
-        run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]
-    )  # folded, and up again
-    assert (
-        0 < run.inverted(-1) < 0.06 * len(run.cells)
-    )  # 29 of 999, in the tips of the lobes: springs do not undo a fold
+    # the body leans over and sags under its weight
+    assert run.moved(-1, body)[2] > -0.07
+    # the body folds and comes up again
+    assert run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]
+    # 29 of 999 in the tips of the lobes: springs do not undo a fold
+    assert 0 < run.inverted(-1) < 0.06 * len(run.cells)
 
 
 def press_to(share: float) -> list[str]:
@@ -264,10 +267,11 @@ def test_the_heart_follows_the_pull_and_returns(result):
     pull = np.linalg.norm(anchor.path[-1].by)
     away = run.q[held - 1][prescribed] - run.nodes[prescribed]
     np.testing.assert_allclose(away, np.broadcast_to(anchor.path[-1].by, away.shape), atol=1e-12)
+    # the anchor has released the body
     assert (
         np.linalg.norm(run.q[held][prescribed] - run.q[held - 1][prescribed], axis=1).min()
         > 0.1 * pull
-    )  # let go
+    )
     assert np.linalg.norm(run.q[-1] - run.nodes, axis=1).max() < 0.01 * pull
     assert run.inverted(held - 1) == 0
 
@@ -303,7 +307,8 @@ def test_it_falls_freely_hits_the_ground_and_leaps_and_gains_nothing(result, nam
     )
     v = run.middle_velocity()[:, 2]
     assert v[contact - 2] == pytest.approx(gravity[2] * t * (contact - 1), rel=1e-9)
-    assert v[contact:].max() > -0.5 * v[contact - 2]  # reversed
+    # the speed is reversed
+    assert v[contact:].max() > -0.5 * v[contact - 2]
     # springs do not resist where a copy of a cell has next to nothing inside
     most = 1e-3 * len(run.cells) if name == "brain_fall" else 0
     assert max(run.inverted(frame) for frame in range(contact, len(run.q), 20)) <= most
@@ -326,20 +331,19 @@ def test_a_bunny_that_falls_on_another_comes_to_rest_on_it(result):
     """So do the eight of the pile, which take three minutes."""
     run = result("two_bunnies")
     assert run.contacts[-1] > 0 and run.nearest[-1] > 0
-    assert not any(
-        count_crossings(drawn, run.body[1]) for drawn in run.surface[10::20]
-    )  # what is drawn touches
+    # the drawn surface is in contact
+    assert not any(count_crossings(drawn, run.body[1]) for drawn in run.surface[10::20])
     assert run.kinetic[-1] < 1e-2 * run.kinetic.max()
-    assert (
-        run.surface[-1, :, 2].min() > -0.6 * run.h
-    )  # the nodes of an ear meet the ground, not its surface
+    # the nodes of an ear meet the ground before its surface does
+    assert run.surface[-1, :, 2].min() > -0.6 * run.h
     assert run.inverted(-1) == 0
 
 
 @pytest.mark.slow
 def test_the_armadillos_hands_press_each_other_and_spring_back(result):
     few = ("--set", "cages.count=2000", "--set", "self_contact.surface=4000")
-    run = result("armadillo_fold", *few)  # with 1,000 cells, and its own 3,009, steps take a minute
+    # with 1,000 cells, and with the scene's 3,009, steps take a minute
+    run = result("armadillo_fold", *few)
     held = run.region(run.scene.anchor[0])
     let_go = int(np.searchsorted(run.time, run.scene.anchor[0].stop - 1e-9))
     assert run.contacts[let_go - 1] > 10 > run.contacts[-1]

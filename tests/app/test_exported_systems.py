@@ -27,7 +27,8 @@ from msmpetsc.study.export import export_systems
 SOLID = {"law": "neo-hookean", "young_modulus": 1e5, "density": 1000.0, "poisson_ratio": 0.3}
 SWING = {"step": 0.05, "duration": 0.15}
 LINEAR = {"material": {"law": "linear", "young_modulus": 1e5, "density": 1000.0}}
-# of the matrix and of CG, well above rounding and below any term that may be lacking [-]
+# of the matrix and of CG, well above rounding and below any term that may be lacking
+# [-]
 EXACT = 1e-9
 
 

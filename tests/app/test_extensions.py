@@ -48,7 +48,8 @@ def heights(scene: Path) -> np.ndarray:
 
 def test_drag_is_that_of_the_velocity_that_starts_a_step(tmp_path: Path):
     msm.register_force("drag", lambda x, v, t: -RATE * v)
-    velocities = SPEED * (1 - RATE * STEP) ** np.arange(1, 11)  # v_(n+1) = v_n - t c v_n
+    # v_(n+1) = v_n - t c v_n
+    velocities = SPEED * (1 - RATE * STEP) ** np.arange(1, 11)
     assert np.allclose(
         heights(flying(tmp_path, "drag")), np.append(0, STEP * np.cumsum(velocities)), rtol=1e-9
     )
@@ -56,7 +57,8 @@ def test_drag_is_that_of_the_velocity_that_starts_a_step(tmp_path: Path):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_it_is_of_first_order_in_the_step(tmp_path: Path, integrator: str):
-    errors, below = [], np.array([0, 0, -0.1])  # so that it pulls from the start
+    # below the ground, so that the force pulls from the start
+    errors, below = [], np.array([0, 0, -0.1])
     for halvings in range(2):
         step, start = STEP / 2**halvings, {}
         msm.register_force(
@@ -73,7 +75,8 @@ def test_it_is_of_first_order_in_the_step(tmp_path: Path, integrator: str):
 def test_its_work_is_no_energy_from_nowhere(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     msm.register_force("motor", lambda x, v, t: RATE * v)
     frames = list(msm.frames(flying(tmp_path, "motor", 20)))
-    assert frames[-1].kinetic > 15 * frames[0].kinetic  # (1 + 0.08)^40 = 21.7
+    # (1 + 0.08)^40 = 21.7 in theory
+    assert frames[-1].kinetic > 15 * frames[0].kinetic
     assert max(frame.energy_gained for frame in frames) < 1e-6 * frames[-1].kinetic
     assert all(frame.potential == 0 for frame in frames)
     assert "nowhere" not in caplog.text
@@ -90,9 +93,11 @@ def test_it_acts_on_its_region_and_in_its_time(tmp_path: Path):
     region = {"box": [[-1, -1, -1], [0.2, 2, 2]]}
     scene = flying(tmp_path, "eye", 3)
     list(msm.frames(scene, set={"force.0.region": region}))
-    assert seen == [(2 * 5 * 3, 0.125, 0.0), (30, 0.125, 0.01), (30, 0.125, 0.02)]  # once a step
+    # the function is called once a step
+    assert seen == [(2 * 5 * 3, 0.125, 0.0), (30, 0.125, 0.01), (30, 0.125, 0.02)]
     msm.register_force("late", lambda x, v, t: [0, 0, 1.0])
-    late = heights(flying(tmp_path, "late", 4, begin=0.02))  # in the steps that begin from then on
+    # the force acts in the steps that begin at or after its start
+    late = heights(flying(tmp_path, "late", 4, begin=0.02))
     assert np.allclose(np.diff(late), STEP * (SPEED + STEP * np.array([0, 0, 1, 2])))
 
 
@@ -122,14 +127,16 @@ def test_what_is_no_force_is_said_in_one_line(tmp_path: Path, words: str):
 
 def test_presets_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     msm.register_preset("tight", {"ksp_rtol": 1e-8, "ksp_max_it": 400}, about="a narrow one")
-    msm.register_force("drag", lambda x, v, t: -RATE * v * x[:, :1])  # it bends the block
+    # the force bends the block
+    msm.register_force("drag", lambda x, v, t: -RATE * v * x[:, :1])
     scene = flying(tmp_path, "drag", 2)
     tight, usual = (
         [frame for frame in msm.frames(scene, set={"solver.preset": name})]
         for name in ("tight", "newton")
     )
     assert np.allclose(tight[-1].position, usual[-1].position, atol=1e-8)
-    assert tight[-1].ksp_its > usual[-1].ksp_its  # its option has a say
+    # the option of the preset has an effect
+    assert tight[-1].ksp_its > usual[-1].ksp_its
     path = msm.run(scene, tmp_path / "x.h5", preset="tight", quiet=True)
     with msm.open(path) as result:
         assert result.scene["solver"]["preset"] == "tight"

@@ -41,7 +41,8 @@ def test_it_writes_what_the_command_writes(scene: Path, tmp_path: Path, capsys):
     words = ["--frames", "2", "--set", "material.density=900.0", "--preset", "newton"]
     assert main(["run", str(scene), "-o", str(tmp_path / "command.h5"), *words]) == 0
     assert np.array_equal(positions(path), positions(tmp_path / "command.h5"))
-    with msmpetsc.open(path) as result:  # what it was is a command that can be pasted
+    # the stored command can be pasted
+    with msmpetsc.open(path) as result:
         command = result.attributes["command"]
         assert command.startswith(
             f"msmpetsc run {scene} --output={path} --preset=newton --frames=2 --set="
@@ -127,7 +128,8 @@ def test_help_shows_all_keywords_with_their_types():
     assert all(f"{name} " in msmpetsc.run.__doc__ for name in OPTIONS)
 
 
-FAILING_RANKS = [  # ranks that fail, where, and how
+# ranks that fail, place and kind of the failure
+FAILING_RANKS = [
     ("1", "step", "input"),
     ("0", "model", "memory"),
     ("1,2", "model", "input"),

@@ -27,12 +27,14 @@ def scene(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_frames_are_those_of_the_file(scene: Path, tmp_path: Path, integrator: str):
     changes = {"material.young_modulus": 2e5, "time.integrator": integrator}
-    frames = list(msm.frames(scene, set=changes))  # kept, though the next step goes on from them
+    # a list: each frame must outlive the next step
+    frames = list(msm.frames(scene, set=changes))
     with msm.open(msm.run(scene, tmp_path / "x.h5", set=changes, quiet=True)) as result:
         assert np.array_equal([frame.position for frame in frames], result.frames.position[:])
         assert [frame.time for frame in frames] == list(result.frames.time)
         assert [frame.elastic for frame in frames] == list(result.frames.elastic)
-    assert np.ptp(frames[-1].position - frames[0].position) > 1e-4  # it does bend
+    # the block bends
+    assert np.ptp(frames[-1].position - frames[0].position) > 1e-4
 
 
 def test_tables_and_scenes_are_as_good_as_a_file(
@@ -40,20 +42,19 @@ def test_tables_and_scenes_are_as_good_as_a_file(
 ):
     expected = [frame.position for frame in msm.frames(scene, 2)]
     tables = tomllib.loads(scene.read_text())
-    tables["mesh"]["source"] = (
-        tmp_path / "scene.ply"
-    )  # a path, an array and a number of numpy's stand in Python
+    # Python takes paths, arrays and NumPy's numbers
+    tables["mesh"]["source"] = tmp_path / "scene.ply"
     tables["gravity"]["acceleration"] = np.array([0, 0, -G])
     tables["material"]["density"] = np.float64(DENSITY)
-    monkeypatch.chdir("/")  # outside which the mesh lies nowhere, but where the tables say
+    # relative to / there is no mesh; relative to the tables there is
+    monkeypatch.chdir("/")
     for source in (tables, msm.Scene.of(tables), msm.Scene.load(scene)):
         assert np.array_equal([frame.position for frame in msm.frames(source, 2)], expected)
         path = msm.run(source, tmp_path / "x.h5", frames=2, overwrite=True, quiet=True)
         with msm.open(path) as result:
             assert np.array_equal(result.frames.position[:], expected)
-            assert (
-                msm.Scene.of(result.scene).material.density == DENSITY
-            )  # what the file says can be run again
+            # the scene of the file can be run again
+            assert msm.Scene.of(result.scene).material.density == DENSITY
     with pytest.raises(InputError, match="say output"):
         msm.run(tables, quiet=True)
 
@@ -80,7 +81,8 @@ def test_changes_are_checked_as_a_file_is(scene: Path):
         "pin.7.region": "is no item of a list of 1",
     }.items():
         with pytest.raises(InputError, match=words):
-            simulation.frames(set={wrong: 1.0})  # at the call, before the first frame is asked for
+            # the error comes at the call, before the first frame
+            simulation.frames(set={wrong: 1.0})
     with pytest.raises(InputError, match="frames must be at least 1"):
         simulation.frames(0)
     with pytest.raises(InputError, match="unknown preset 'newtno', did you mean 'newton'"):
@@ -218,9 +220,8 @@ for modulus in (1e5, 2e5):
 
 def test_on_ranks_each_has_its_rows(scene: Path, tmp_path: Path):
     done = run(3, "-c", ON_RANKS, scene, tmp_path, status=0)
-    assert (
-        done.stdout.count("refused:") == done.stdout.count(" exists") == 3
-    )  # the second time, on all ranks
+    # only the second call fails, on all ranks
+    assert done.stdout.count("refused:") == done.stdout.count(" exists") == 3
     assert done.stderr.count("frame 1/1") == 1
     for modulus in (1e5, 2e5):
         *_, last = msm.frames(scene, set={"material.young_modulus": modulus})

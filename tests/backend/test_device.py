@@ -54,7 +54,8 @@ def test_a_solver_that_computes_elsewhere_than_the_run_is_refused(tmp_path: Path
     if device.what_is_missing():
         pytest.skip(device.what_is_missing())
     petsc_options(mat_type="seqaijcusparse")
-    device.sender(MPI.COMM_SELF)  # which tells PETSc whether MPI knows GPUs
+    # the sender tells PETSc whether MPI knows GPUs
+    device.sender(MPI.COMM_SELF)
     with (
         patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array),
         pytest.raises(InputError, match="-mat_type seqaijcusparse: the run computes on the CPU"),

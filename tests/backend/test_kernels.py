@@ -17,7 +17,8 @@ from msmpetsc.backend import kernel_cache
 
 PACKAGE = Path(msmpetsc.__file__).parent
 FILES = resource.RLIMIT_FSIZE
-NOWHERE = "/dev/null/home"  # not even root can make this folder
+# not even root can make this folder
+NOWHERE = "/dev/null/home"
 PLAIN = (
     "from typing import NamedTuple\nFACTOR = 2.0\nclass Pair(NamedTuple):\n    first: float\n"
     "    second: float\n"

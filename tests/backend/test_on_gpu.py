@@ -48,7 +48,8 @@ PLATE = {
     "shape": "box", "box": [[-1, -1, 0.25], [2, 2, 0.5]], "response": "penalty", "friction": 0.3,
     "path": [{"time": 4 * T, "by": [0.01, 0, -0.05]}],
 }  # fmt: skip
-THIN = {"shape": "box", "box": [[-1, -1, -0.0041], [2, 2, -0.004]]}  # passed within a step
+# thinner than the way of a step
+THIN = {"shape": "box", "box": [[-1, -1, -0.0041], [2, 2, -0.004]]}
 HELD = {"pin": [{"region": {"box": [[0, 0, 0], [0.1, 1, 1]], "relative": True}}]}
 LED = {
     "anchor": [{"region": {"box": [[0.9, 0, 0], [1, 1, 1]], "relative": True}, "stop": 4 * T,
@@ -117,7 +118,8 @@ CASES = {
 }  # fmt: skip
 
 
-FAILING = {  # struck too hard for a plain iteration
+# bodies struck too hard for the plain iteration
+FAILING = {
     **CASES["pressed and rubbed"], "time": {"step": T, "duration": 4 * T},
     "solver": {"preset": "fast-msm", "error": 1e-9}, "start": {"velocity": [0.1, 0, -10.0]},
 }  # fmt: skip
@@ -235,10 +237,11 @@ def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case:
         assert_goes_on_exactly(block_scene(tmp_path, **CASES[case]), every=4)
 
 
+# 12 threads, because simulated threads are slow
 SMALLEST = {
     "sides": np.array([2, 1, 1]) * CELL,
     "start": {"velocity": [0.3, 0, -3.0], "scale": [1, 1, 0.45]},
-}  # 12 threads: a simulated one is slow
+}
 SIMULATED = {
     "pressed": {
         **CASES["pressed and rubbed"], "time": {"step": T, "duration": 2 * T},
@@ -326,7 +329,8 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
         with patch("numba.cuda.dispatcher.get_current_device", lambda: h100):
             ptx = launcher.ptx_of(body, kinds, (9, 0))
         assert ".target sm_90" in ptx
-        words = (0, *chain.from_iterable(words))  # the count first
+        # the number of words comes first
+        words = (0, *chain.from_iterable(words))
         assert len(words) == len(re.findall(r"^\s*\.param ", ptx, re.M)), body.__name__
         struct.pack("q" + "".join(map(launcher.format_of, kinds)), *words)
         if shutil.which("ptxas"):

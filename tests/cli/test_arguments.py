@@ -63,7 +63,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "loop.h5").symlink_to("loop.h5")
     os.mkfifo(folder / "pipe")
     try:
-        os.mknod(folder / "device", 0o20666, os.makedev(1, 3))  # another /dev/null
+        # a device like /dev/null
+        os.mknod(folder / "device", 0o20666, os.makedev(1, 3))
     except PermissionError:
         os.mkfifo(folder / "device")
     return folder
@@ -81,7 +82,8 @@ def test_a_path_that_cannot_be_used_is_refused_in_one_line(folder, monkeypatch, 
             and "-o" in command
             and path in (".", "..", "/", "folder", "folder/")
         ):
-            continue  # a study has a folder
+            # a study writes a folder instead
+            continue
         status = main([word.format(path) for word in command])
         told = capsys.readouterr().err.splitlines()
         assert status == 2 and len(told) == 1 and told[0].startswith("msmpetsc: error: "), (

@@ -51,9 +51,8 @@ def numbers(scene: Path) -> Path:
 def test_the_numbers_say_how_they_were_made(numbers: Path):
     stored = json.loads(numbers.read_text())
     assert read(numbers).run == Recipe(cells=None, steps=STEPS, changes=["material.density=900.0"])
-    springs = (
-        (60 + 60 + 50) + 2 * (48 + 40 + 40) + 4 * 32
-    )  # edges, diagonals of faces, of the 4 x 4 x 2 cells
+    # springs along edges and face diagonals of 4 x 4 x 2 cells
+    springs = (60 + 60 + 50) + 2 * (48 + 40 + 40) + 4 * 32
     assert stored["counts"] == {
         "cells": 32,
         "nodes": 75,
@@ -87,7 +86,8 @@ def test_what_differs_is_named(scene: Path, numbers: Path, capfd):
 def test_a_scene_that_fails_is_named_and_the_others_are_checked(
     scene: Path, numbers: Path, tmp_path: Path, capfd
 ):
-    alone = tmp_path / "alone.toml"  # without its mesh
+    # a scene whose mesh is elsewhere
+    alone = tmp_path / "alone.toml"
     alone.write_text(scene.read_text())
     alone.with_suffix(".baseline.json").write_text(numbers.read_text())
     assert main(["check", str(alone), str(scene)]) == 1
@@ -140,7 +140,8 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
 
 DAMAGE = {
     "scales.m": ("scales", "m", np.inf),
-    "steps": ("run", "steps", 10**9),  # after so many any difference would be allowed
+    # after so many steps any difference would be allowed
+    "steps": ("run", "steps", 10**9),
     "cells asked for": ("run", "cells asked for", "30, 40"),
     "run.changes": ("run", "changes", "mesh.source=x"),
     "counts.cells": ("counts", "cells", "32"),

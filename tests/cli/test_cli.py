@@ -108,7 +108,8 @@ def test_each_option_changes_the_run(scene: Path, tmp_path: Path):
         assert "--frames=2" in file.attrs["command"]
         assert finished(file) == 3
         assert 0 < file["frames/step_error"][:].max() <= 1e-6
-        assert len(file["lattice/cells"]) < 120  # 80 asked, 150 in the file
+        # 80 cells were asked for, and the file has 150
+        assert len(file["lattice/cells"]) < 120
         assert file["frames/surface"].shape == (3, len(ball.vertices), 3)
     assert out.with_suffix(".xdmf").is_file()
 
@@ -134,9 +135,8 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
         for line in done.stdout.splitlines()
         if line.startswith("--- Event Stage")
     ]
-    assert {"Main Stage", "set-up", "steps", "output"} <= set(
-        stages
-    ) and "Unknown" not in stages  # 3.22 lists all
+    # PETSc 3.22 lists all stages
+    assert {"Main Stage", "set-up", "steps", "output"} <= set(stages) and "Unknown" not in stages
 
 
 @pytest.mark.parametrize(
@@ -182,18 +182,19 @@ def test_our_options_and_petscs_stand_in_any_order(given: str, ours: str, petsc:
 def test_an_unused_option_of_a_name_that_solving_might_read_is_told_at_the_end(
     scene: Path, tmp_path: Path
 ):
-    done = on(
-        1, scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view"
-    )  # newton has no NPC
+    # the preset newton has no nonlinear preconditioner
+    done = on(1, scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view")
     assert_one_line(done, 2, "-npc_ksp_view")
+    # the frames computed before the failure are complete
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "o.h5",
         "o.xdmf",
-    ]  # what was computed is kept, whole
+    ]
 
 
 def test_a_preconditioner_that_ranks_do_not_share_is_refused(scene: Path, tmp_path: Path):
-    done = on(2, scene, "-o", tmp_path / "o.h5", "-pc_type", "icc")  # PETSc's ICC is for one rank
+    # PETSc's ICC works on a single rank
+    done = on(2, scene, "-o", tmp_path / "o.h5", "-pc_type", "icc")
     assert_one_line(done, 2, "ICC")
     assert list(tmp_path.iterdir()) == []
 
@@ -206,7 +207,8 @@ def sets(*pairs: str) -> list[str]:
     return [word for pair in pairs for word in ("--set", pair)]
 
 
-BAD = {  # what is wrong: arguments after the scene, and what the one line must say
+# by kind of mistake: arguments after the scene, and the words of the error
+BAD = {
     "mesh missing": (mesh("gone.ply"), ["gone.ply"]),
     "mesh NaN": (mesh("nan.ply"), ["nan.ply", "NaN"]),
     "mesh thin for its cells": (mesh("foil.ply", "cages={cell_size=1e-5}"), ["cages.max_cells"]),

@@ -119,7 +119,8 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
     (cells,) = [
         line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cells")
     ]
-    volume = 4 / 3 * np.pi * 0.98  # of 320 triangles inside the sphere
+    # volume of 320 triangles inside the sphere
+    volume = 4 / 3 * np.pi * 0.98
     assert int(cells) == pytest.approx(volume / 0.02**3, rel=0.1)
 
 
@@ -163,7 +164,8 @@ def test_a_body_thinner_than_a_cell_is_told_with_the_cells_that_would_do(
 
 def test_memory_is_that_of_the_process_not_of_its_parent():
     code = "from msmpetsc.backend.machine import peak_memory; print(peak_memory())"
-    large = np.ones(75_000_000)  # 600 MB
+    # 600 MB
+    large = np.ones(75_000_000)
     assert 1e7 < int(python("-c", code).stdout) < large.nbytes
 
 
@@ -176,8 +178,10 @@ def lattice(tmp_path: Path) -> Lattice:
 
 def test_the_bytes_of_a_lattice_are_those_of_its_arrays(lattice: Lattice):
     arrays = {name: value for name, value in vars(lattice).items() if isinstance(value, np.ndarray)}
-    del arrays["ghosts"]  # of other ranks: nodes, once more
-    del arrays["first_of_body"]  # one number
+    # ghosts are nodes, which count already
+    del arrays["ghosts"]
+    # a single number
+    del arrays["first_of_body"]
     arrays["table"] = lattice.table.keys
     counts = len(lattice.cells), len(lattice.nodes), len(lattice.springs)
     assert sum(array.nbytes for array in arrays.values()) == BYTES @ counts

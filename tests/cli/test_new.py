@@ -26,7 +26,8 @@ from msmpetsc.scene.reading import load_scene
 def chair(upwards: int, back: int) -> trimesh.Trimesh:
     """A chair of boxes that stands on y (1) or z (2), its back towards one end (1) or the other
     (-1)."""
-    boxes = [[[0, 0.4, 0], [0.45, 0.45, 0.45]], [[0, 0.45, 0], [0.45, 0.9, 0.05]]]  # seat and back
+    # seat and back
+    boxes = [[[0, 0.4, 0], [0.45, 0.45, 0.45]], [[0, 0.45, 0], [0.45, 0.9, 0.05]]]
     boxes += [[[x, 0, z], [x + 0.05, 0.4, z + 0.05]] for x in (0, 0.4) for z in (0, 0.4)]
     mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in boxes])
     turns = [trimesh.transformations.rotation_matrix(np.pi, [0, 1, 0])] * (back < 0)
@@ -82,7 +83,8 @@ def test_parts_are_measured_by_their_area_and_thickness_by_rays():
         trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0]),
     ]
     two = surface_of(trimesh.util.concatenate(boxes))
-    assert measured(two, examine(two), "z").parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
+    # 24 of 30 m^2, and 6
+    assert measured(two, examine(two), "z").parts == pytest.approx([0.8, 0.2])
     cube = surface_of(trimesh.creation.box([6, 6, 6]))
     assert measured(cube, examine(cube), "z").thickness.thin == pytest.approx(6)
 

@@ -130,7 +130,8 @@ class Missing:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Missing())
 """
-    (tmp_path / "sitecustomize.py").write_text(hook)  # of the processes that it starts, too
+    # the hook also acts in processes that the command starts
+    (tmp_path / "sitecustomize.py").write_text(hook)
     (tmp_path / "tqdm.py").write_text(
         'raise ImportError("libold.so: cannot open shared object file")'
     )

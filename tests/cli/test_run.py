@@ -15,6 +15,7 @@ def fall(tmp_path_factory: pytest.TempPathFactory) -> h5py.File:
     """The shipped scene at its own time step until it has struck the ground, solved tightly by
     newton."""
     path = tmp_path_factory.mktemp("runs") / "fall.h5"
+    # cells of 23 mm
     words = (
         "--set",
         "cages.count=600",
@@ -24,7 +25,7 @@ def fall(tmp_path_factory: pytest.TempPathFactory) -> h5py.File:
         "1e-9",
         "--frames",
         125,
-    )  # cells of 23 mm
+    )
     run(
         1,
         "-m",
@@ -49,7 +50,8 @@ def test_the_residual_of_every_step_before_contact_from_the_file_alone(fall: h5p
     )
     q, t = fall["frames/position"], fall["frames/time"][1]
     scale = np.linalg.norm(m[:, None] * GRAVITY * t**2)
-    for n in range(frames_before_contact(fall) - 1):  # in the step after these the ground pushes
+    # the ground pushes in the step after these frames
+    for n in range(frames_before_contact(fall) - 1):
         x, y = q[n + 1], 2 * q[n] - q[max(n - 1, 0)]
         along = x[ends[:, 0]] - x[ends[:, 1]]
         force = (k * (1 - r / np.linalg.norm(along, axis=1)))[:, None] * along

@@ -42,7 +42,8 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
 ):
     path, handler = tmp_path / "x.h5", signal.getsignal(number)
     with monkeypatch.context() as patch:
-        signal_after(patch, 10, number)  # between frames
+        # the signal comes between frames
+        signal_after(patch, 10, number)
         assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path)]) == STATUS[number]
     told = (
         f"stopped by {number.name} after step 10 of 40 (t = 0.1 s); to go on: msmpetsc run "
@@ -59,12 +60,13 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
 
 def test_stopped_again_and_again(whole: Path, tmp_path, monkeypatch):
     path = tmp_path / "x.h5"
+    # each command is the same
     arguments = [
         "run",
         str(whole.parent / "scene.toml"),
         "--resume",
         str(path),
-    ]  # the same command each time
+    ]
     for step in (0, 1, 7, 8, 27, 39):
         with monkeypatch.context() as patch:
             signal_after(patch, step, signal.SIGUSR1)
@@ -157,9 +159,8 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
     )
     process = start(scene, "-o", path, *endless, "-ksp_monitor", f"ascii:{seen}")
     with process:
-        wait_until(
-            lambda: seen.exists() and seen.stat().st_size
-        )  # before it, the first interrupt would end the run
+        # an interrupt before this line would end the run
+        wait_until(lambda: seen.exists() and seen.stat().st_size)
         for _ in range(20):
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)

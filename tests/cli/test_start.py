@@ -34,7 +34,8 @@ try:
 except SystemExit:
     pass
 """
-DOES_WITHOUT = [  # Python, its arguments, and what that does not import
+# Python, its arguments, and modules that it must not import
+DOES_WITHOUT = [
     (COMMAND, "--help", SLOW),
     (COMMAND, "run --help", SLOW),
     (COMMAND, "--version", SLOW - {"numpy", "mpi4py", "petsc4py"}),

@@ -18,10 +18,11 @@ from msmpetsc.solve.simulate import TimeLoop
 T = 0.01
 LEFT = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}
 RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}
+# 0.4 m/s; then 0.2 m/s sideways and upwards
 UP = [
     {"time": 0.05, "by": [0, 0, 0.02]},
     {"time": 0.1, "by": [0, 0.01, 0.03]},
-]  # 0.4 m/s; then 0.2 m/s aside and up
+]
 
 
 def place(path: list[dict], time: float) -> np.ndarray:

@@ -18,13 +18,17 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.toml import toml_value
 
 TIME = {"step": 0.01, "duration": 0.1}
+# the regions have 15 and 45 of 75 nodes
 LEFT, LEFT_HALF = (
     {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]},
     {"box": [[0, 0, 0], [0.26, 0.5, 0.25]]},
-)  # 15, 45 of 75 nodes
-RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}  # 15
-LEFT_CELLS = {"box": [[0, 0, 0], [CELL, 0.5, 0.25]]}  # 8 cells, whose nodes are in two layers
-TWO_LAYERS = {"box": [[0, 0, 0], [CELL + 0.01, 0.5, 0.25]]}  # 30 nodes: all of those cells
+)
+# 15 nodes
+RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}
+# 8 cells, with nodes in two layers
+LEFT_CELLS = {"box": [[0, 0, 0], [CELL, 0.5, 0.25]]}
+# 30 nodes, all nodes of LEFT_CELLS
+TWO_LAYERS = {"box": [[0, 0, 0], [CELL + 0.01, 0.5, 0.25]]}
 UP, ASIDE = [{"time": 0.05, "by": [0, 0, 0.02]}], [{"time": 0.05, "by": [0.01, 0, 0]}]
 
 
@@ -46,10 +50,11 @@ def heard(caplog):
     caplog.set_level(logging.INFO, "msmpetsc")
 
     def since() -> list[tuple[str, str]]:
+        # the command line renames these levels
         names = {
             logging.WARNING: "WARNING",
             logging.INFO: "INFO",
-        }  # the command line has words of its own for them
+        }
         lines = [(names[record.levelno], record.getMessage()) for record in caplog.records]
         caplog.clear()
         return lines
@@ -107,10 +112,11 @@ def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path):
 
 
 def test_nodes_that_two_anchors_want_are_warned_of(tmp_path, heard):
+    # 25 and 5 nodes
     low, low_edge = (
         {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]},
         {"box": [[0, 0, 0], [0.5, 0.01, 0.01]]},
-    )  # 25 and 5 nodes
+    )
     build(
         tmp_path,
         anchor=[{"region": LEFT, "path": UP}, {"region": low, "path": ASIDE}],

@@ -11,7 +11,8 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 
-STEP = 1 / 64  # [s]: a binary fraction, so that steps end just at the table's times
+# [s]: a binary fraction, so that steps end just at the table's times
+STEP = 1 / 64
 MASS = DENSITY * SIDES.prod()
 ALL = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, 1]}}
 FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}

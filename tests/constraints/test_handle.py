@@ -39,7 +39,8 @@ def test_nodes_turn_about_an_axis_at_a_steady_speed_and_go_on_as_they_were_let_g
         np.testing.assert_allclose(frame.position[led], expected, atol=1e-14)
     share = frames[4].time / 0.05
     gone_on = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array([0.05, 0, 0])
-    assert np.linalg.norm(frames[4].position[led] - gone_on, axis=1).min() > 1e-4  # let go
+    # the released nodes leave the path
+    assert np.linalg.norm(frames[4].position[led] - gone_on, axis=1).min() > 1e-4
 
 
 def test_without_a_center_nodes_turn_about_their_centre_of_mass(tmp_path: Path):

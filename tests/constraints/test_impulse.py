@@ -8,9 +8,11 @@ from block_scene import block_scene, play
 
 import msmpetsc as msm
 
-STEP = 1 / 60  # [s]
+# time step [s]
+STEP = 1 / 60
 HALF = {"half_space": {"point": [0.25, 0, 0], "normal": [1, 0, 0]}}
-PULL = np.array([20.0, 0.0, -40.0])  # [N]
+# force [N]
+PULL = np.array([20.0, 0.0, -40.0])
 TABLE = {
     "times": [1.2 * STEP, 3.7 * STEP, 5.1 * STEP],
     "values": [[0, 0, 0], [8, 0, -40], [8, 4, 0]],
@@ -54,7 +56,8 @@ def test_a_free_body_gets_the_integral_and_no_energy_from_nowhere(
         time={"step": STEP, "duration": 8 * STEP} | TIMES[time],
     )
     _, frames = play(scene)
-    # Velocities are differences of positions over a step, and chosen steps may be a thousandth.
+    # Velocities are differences of positions over a step, and chosen steps may be a
+    # thousandth.
     rounding = 1e-9 if "chosen" in time else 1e-11
     for frame in frames[6:]:
         np.testing.assert_allclose(frame.momentum, integral, atol=rounding * np.abs(integral).max())

@@ -49,7 +49,8 @@ def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
     pull = np.array([30.0, 0, 200.0]) + 1000 * SIDES.prod() * np.array(G)
     assert frame.load == pytest.approx(pull, rel=1e-12)
     assert frame.reaction[0] == pytest.approx(-pull, abs=1e-9 * np.abs(pull).max())
-    assert (frame.reaction[1] == 0).all()  # the first has all its nodes
+    # the first pin holds all nodes of the second
+    assert (frame.reaction[1] == 0).all()
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
@@ -68,7 +69,8 @@ def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping,
     assert pushed > 100 and max(np.abs(frame.push[0, :2]).max() for frame in frames) > 1e-4 * pushed
     if integrator == "implicit-euler":
         rates = [(b - a) / 0.01 + damping * b for a, b in pairwise(p)]
-    else:  # of the third step on, which looks back to two
+    else:
+        # the acceleration of BDF2's third step, which uses two earlier steps
         rates = [None, None, (3 * p[3] - 4 * p[2] + p[1]) / 0.02 + damping * p[3]]
     for frame, rate in zip(frames[1:], rates, strict=True):
         if rate is not None:
@@ -124,8 +126,7 @@ def test_a_probe_goes_with_its_cell(tmp_path):
         output={"surface": False, "probe": [{"name": "edge", "point": [CELL, 0.1, 0.0]}]},
     )  # fmt: skip
     _, frames = play(scene)
-    assert frames[1].probe == pytest.approx(
-        np.array([[CELL, 0.1, 0.02 / 3]]), abs=1e-12
-    )  # a held face, as it is led
+    # the probe lies on a held face, so that it follows the anchor
+    assert frames[1].probe == pytest.approx(np.array([[CELL, 0.1, 0.02 / 3]]), abs=1e-12)
     with pytest.raises(InputError, match=r"output\.probe\.0\.point: \(9, 0, 0\) m lies in no cell"):
         play(scene, 'output.probe=[{name="far", point=[9, 0, 0]}]')

@@ -163,9 +163,8 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     contacts.find(start, with_points=True)
     contacts.find(end, with_points=True)
     free = 0.02 / (0.02 + 2.5 * SIDE)
-    assert (
-        0.75 * free < contacts.free_share(start, end) < free
-    )  # a tenth of what collision detection finds is spared
+    # a tenth of the way that collision detection finds is kept as distance
+    assert 0.75 * free < contacts.free_share(start, end) < free
 
 
 def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
@@ -173,16 +172,16 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
     assert crossings(model, frames) == 0
     contacts = np.array([frame.self_contacts for frame in frames])
     first = int(np.argmax(contacts > 0))
-    assert 5 <= first <= 7 and (contacts[-20:] > 0).all()  # free fall by 2 cm takes 64 ms
+    # free fall by 2 cm takes 64 ms
+    assert 5 <= first <= 7 and (contacts[-20:] > 0).all()
     assert (
         0 < min(frame.self_distance for frame in frames[first:] if frame.self_contacts) < DISTANCE
     )
     assert frames[-1].kinetic < 0.02 * max(frame.kinetic for frame in frames)
     ball, mass = model.lattice.body == 1, model.lattice.mass
     height = np.array([mass[ball] @ frame.position[ball, 2] for frame in frames]) / mass[ball].sum()
-    assert (
-        height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2
-    )  # it stays above, and is hardly dented
+    # the body stays above, with hardly a dent
+    assert height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2
 
 
 @pytest.fixture
@@ -269,10 +268,11 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
         body("block", [0, 0, 0]),
         body("ball", [0, 0, SIDE + 0.002], start={"velocity": [0, 0, -5.0]}),
     ]
+    # the velocity and gravity each move the ball by 5 cm
     time, gravity = (
         {"step": 0.01, "duration": 0.01},
         {"acceleration": [0, 0, -500.0]},
-    )  # either moves them 5 cm
+    )
     scene = load_scene(write(folder, "through", body=bodies, time=time, gravity=gravity))
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         environment, stepper, state = (
@@ -313,7 +313,8 @@ def test_blocks_that_collide_in_space_keep_their_momentum(folder: Path, friction
     assert np.abs(momentum - momentum[0]).max() < 1e-7 * scale
     lower = model.lattice.body == 0
     speed = mass[lower] @ (frames[-1].position - frames[-2].position)[lower, 2] / 0.005 / scale
-    assert speed < 0.7  # much of its 1 m/s went to the other
+    # the other body takes much of the 1 m/s
+    assert speed < 0.7
 
 
 def test_on_three_ranks_they_end_as_on_one(folder: Path):

@@ -26,7 +26,8 @@ SIDEWAYS = Motion.through([Pose(time=1.0, by=(0.5, 0.2, 0.0))])
 
 OBLIQUE = plane([0.1, 0, 0.2], [1, -2, 3])
 CUBE = box([-0.6, -0.7, -0.5], [0.7, 0.6, 0.5])
-CASES = {  # during a step, nodes slip by about 0.02; below 0.1 * stick they hold
+# nodes slip by about 0.02 in a step, and stick below 0.1 * stick
+CASES = {
     "plane": [Penalty(OBLIQUE, 300.0, 0.0, 1.0)],
     "box": [Penalty(CUBE, 300.0, 0.0, 1.0)],
     "plane, sticking": [Penalty(OBLIQUE, 300.0, 0.5, 2.0)],
@@ -98,7 +99,8 @@ def test_a_small_change_keeps_its_digits(penalties: list[Penalty]):
     contact, q, v = pressed(penalties)
     nodes, blocks = hessian(contact, q)
     moved = q + 1e-11 * v
-    v = moved - q  # q + v is rounded
+    # q + v is rounded
+    v = moved - q
     second = 0.5 * np.einsum("ai,aij,aj", v[nodes], blocks, v[nodes])
     assert contact.change(moved, q) == pytest.approx(
         (gradient(contact, q) * v).sum() + second, rel=1e-8, abs=0
@@ -194,7 +196,8 @@ def test_duals_of_friction_follow_its_forces(name: str):
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_node_in_a_box_is_pushed_out_through_the_nearest_face(axis: int, side: int):
     q = np.array([[0.05, -0.02, 0.03], [0.05, -0.02, 0.03]])
-    q[0, axis], q[1, axis] = side * 0.8, side * 1.1  # in a cube from -1 to 1, and out of it
+    # a point inside and a point outside the cube from -1 to 1
+    q[0, axis], q[1, axis] = side * 0.8, side * 1.1
     contact = Contact([Penalty(box([-1] * 3, [1] * 3), 50.0, 0.0, 1.0).during(q, T, T)], 2)
     push = np.zeros((2, 3))
     push[0, axis] = side * 50 * 0.2
@@ -204,17 +207,20 @@ def test_a_node_in_a_box_is_pushed_out_through_the_nearest_face(axis: int, side:
 def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
     """A node 0.2 deep in a plane that goes 0.05 along x in the step; mu N f'(u), f' = 2 s - s^2 at
     s = u/e < 1."""
-    moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)  # 0.5 and 0.2 m/s
+    # speeds of 0.5 and 0.2 m/s
+    moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)
     start = np.array([[0.0, 0, -0.2]])
     carried = start + np.array([0.05, 0.02, 0])
+    # slips of 0.2, 0.05 and 0.001
     for stick, share in {
         2.0: 2 * 0.25 - 0.25**2,
         0.5: 1.0,
         0.01: 1.0,
-    }.items():  # e = 0.2, 0.05, 0.001
+    }.items():
         contact = Contact([Penalty(moving, 100.0, 0.3, stick).during(start, 0.3, T)], 1)
         np.testing.assert_allclose(gradient(contact, carried), [[0, 0, -20]], atol=1e-12)
-        slipped = carried - [0.05, 0, 0.1]  # deeper, but N is that of the start
+        # deeper, but the normal force is that of the start
+        slipped = carried - [0.05, 0, 0.1]
         np.testing.assert_allclose(
             gradient(contact, slipped), [[-0.3 * 20 * share, 0, -30]], atol=1e-12
         )
@@ -319,14 +325,16 @@ def test_friction_goes_on_from_the_slip_that_the_last_step_ended_with():
     ground, stick = Penalty(plane([0, 0, 0], [0, 0, 1]), 100.0, 0.5, 0.01), 0.01 * T
     start = np.array([[0.0, 0.0, -0.02], [0.0, 0.0, -0.01]])
     first = ground.during(start, T, T)
-    end = start + stick * np.array([[0.3, 0, 0], [5.0, 0, 0]])  # one holds, one slips
+    # the first node sticks, the second slips
+    end = start + stick * np.array([[0.3, 0, 0], [5.0, 0, 0]])
     then = ground.during(end, 2 * T, T).after([first], end)
     u, _ = then.friction.slip(end)
     np.testing.assert_allclose(u, stick * np.array([[0.3, 0, 0], [1, 0, 0]]), atol=1e-15)
     back = end - u
     assert then.friction.released(end) == pytest.approx(0, abs=1e-18)
     assert then.friction.released(back) == pytest.approx(then.friction.change(end, back), rel=1e-9)
-    shorter = ground.during(end, 1.5 * T, T / 2).after([first], end)  # with the same force
+    # a shorter step with the same force
+    shorter = ground.during(end, 1.5 * T, T / 2).after([first], end)
     np.testing.assert_allclose(shorter.friction.force(end), then.friction.force(end), rtol=1e-9)
 
 
@@ -364,7 +372,8 @@ def test_a_block_slides_down_a_steep_slope_as_coulomb_says(tmp_path: Path):
     )
 
 
-PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}  # [s], [N]
+# pressing force [N] over time [s]
+PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:
@@ -391,7 +400,8 @@ def error_of_a_slide(folder: Path, t: float) -> float:
 
 def test_friction_under_a_push_that_changes_is_of_second_order_with_bdf2(tmp_path: Path):
     errors = [abs(error_of_a_slide(tmp_path, t)) for t in (0.01, 0.005, 0.0025)]
-    assert errors[0] < 3e-4  # by the push of the start 3e-3, and slopes of 0.9
+    # the normal force of the start gives 3e-3 and orders of 0.9
+    assert errors[0] < 3e-4
     assert np.log2(errors[0] / errors[1]) > 1.6 and np.log2(errors[1] / errors[2]) > 1.6
 
 
@@ -400,7 +410,8 @@ PRESSING_PLANE = {
     "friction": 0.8,
     "path": [{"time": 1.0, "by": [0, 0, 0.3]}],
 }  # fmt: skip
-SLIDES = {  # it falls on the ground, slides a little and is pressed
+# blocks that fall on the ground, slide a little and are pressed
+SLIDES = {
     "sides": np.array([6, 3, 3]) * CELL,
     "mesh": {"source": "scene.ply", "base": [0, 0, 0.01]},
     "start": {"velocity": [0.3, 0.0, -1.5]},
@@ -420,7 +431,8 @@ def test_duals_of_friction_save_iterations(tmp_path: Path):
 # ---- a press
 
 TALL = np.array([0.25, 0.25, 0.5])
-AREA, BOTTOM = 0.25**2, 9  # nodes under it
+# area of the block's base [m^2], and the number of its nodes
+AREA, BOTTOM = 0.25**2, 9
 PUSH, PRESS_STOP, PRESS_T = 0.02, 0.8, 0.04
 
 
@@ -445,7 +457,8 @@ def test_a_plate_presses_a_block_with_E_A_strain_and_lets_it_go(tmp_path: Path):
     last = [frame for frame in frames if frame.time < PRESS_STOP - 1e-9][-1]
     z = last.position[:, 2]
     below, above = k * np.maximum(-z, 0).sum(), k * np.maximum(z - (0.5 - PUSH), 0).sum()
-    assert below == pytest.approx(above, rel=1e-4)  # slow: as good as at rest
+    # slow motion, close to static balance
+    assert below == pytest.approx(above, rel=1e-4)
     strain = (0.5 - (z[high].mean() - z[low].mean())) / 0.5
     assert 0.03 < strain < PUSH / 0.5
     assert below == pytest.approx(YOUNG * AREA * strain, rel=0.04)
@@ -490,15 +503,15 @@ def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its
     floor = plane([0, 0, 0], [0, 0, 1], path)
     q, before = np.array([[0.3, 0, 0.2], [0.3, 0, 0.4]]), np.array([[0.2, 0, 0.23], [0.3, 0, 0.4]])
     for e in (1.0, 0.5, 0.0):
-        after, after_before = Exchange(floor, e).exchanged(
-            q, before, StepTaken(0.5, T)
-        )  # the plane is at 0.25
+        # the plane has moved to 0.25
+        after, after_before = Exchange(floor, e).exchanged(q, before, StepTaken(0.5, T))
         v, v_plane = -0.3, 0.5
         np.testing.assert_allclose(
             (after - after_before)[0] / T, [1.0, 0, v_plane + e * (v_plane - v)]
         )
         np.testing.assert_array_equal((after[1], after_before[1]), (q[1], before[1]))
-    leaving = q + np.array([0, 0, 0.06])  # 0.9 m/s up, faster than the plane: is not held back
+    # 0.9 m/s upwards: faster than the plane, so the plane does not hold the node
+    leaving = q + np.array([0, 0, 0.06])
     np.testing.assert_array_equal(
         Exchange(floor, 1.0).exchanged(leaving[:1], before[:1], StepTaken(0.5, T))[0], leaving[:1]
     )

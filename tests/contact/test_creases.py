@@ -13,13 +13,15 @@ from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
 from msmpetsc.contact.surface.continuous_collision import free_share, sweep
 from msmpetsc.geometry.surface import Surface
 
+# sizes of a block, of the groove's bottom, and its half width [m]
 LONG, HIGH, BOTTOM, HALF = (
     0.5,
     0.25,
     0.0625,
     0.07,
-)  # [m]: of a block, of the groove's bottom, and its half width
-DISTANCE = 0.15  # [m]: more than the groove is wide
+)
+# distance of the barrier [m], more than the width of the groove
+DISTANCE = 0.15
 LAW = BarrierLaw(DISTANCE, 100.0, 0.5, 0.01)
 
 
@@ -69,16 +71,15 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     assert folded > 0 and dropped == 0
     candidates = barrier.candidates(points, 0.0)
     assert all(pairs.empty() for pairs in barrier.contacts(candidates, points))
-    tight = (
-        DISTANCE / 4
-    )  # the upper edges are 0.14 m apart: no more than half of that, of 0.15 m over powers of 4
+    # 0.15 m over a power of 4, at most half of the 0.14 m between the upper edges
+    tight = DISTANCE / 4
     level = barrier.distances.index(tight)
-    assert barrier.contacts(barrier.creases, closed(points, 1.1 * tight))[
-        level
-    ].empty()  # to walls it is less
+    # pairs of walls push from a smaller distance
+    assert barrier.contacts(barrier.creases, closed(points, 1.1 * tight))[level].empty()
     assert not barrier.contacts(barrier.creases, closed(points, 0.99 * tight))[level].empty()
     through = closed(points, -2 * HALF) - points
-    assert 0.3 < free_share(barrier, points, through, candidates) < 0.5  # they meet halfway
+    # the sides meet halfway
+    assert 0.3 < free_share(barrier, points, through, candidates) < 0.5
     assert 0.3 < sweep(barrier, points, through) < 0.5
     assert 0.3 < free_share(barrier, points, through, barrier.creases) < 0.5
     assert free_share(barrier, points, closed(points, 0.05) - points, candidates) == 1
@@ -87,7 +88,8 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
 def test_the_derivatives_in_a_crease_are_those_of_its_energy():
     barrier, points, _ = barrier_of()
     points = closed(points, DISTANCE / 10)
-    points[:7] += 1e-3 * np.random.default_rng(1).normal(size=(7, 3))  # no edges that are parallel
+    # no edges are parallel
+    points[:7] += 1e-3 * np.random.default_rng(1).normal(size=(7, 3))
     direction = np.random.default_rng(0).normal(size=points.shape)
     candidates, step = barrier.candidates(points, 0.01), 1e-7
 
@@ -123,7 +125,8 @@ def test_walls_are_clear_as_long_as_they_cannot_come_near():
 
 
 def test_walls_that_all_but_touch_are_left_out_and_counted():
-    _, _, (folded, dropped) = barrier_of(half=0.4e-3 * DISTANCE)  # less than a thousandth apart
+    # the sides are less than a thousandth of the distance apart
+    _, _, (folded, dropped) = barrier_of(half=0.4e-3 * DISTANCE)
     assert folded > 0 and dropped > 0
 
 

@@ -8,7 +8,8 @@ from msmpetsc.constraints.loads import Load, Timed, shares_by_mass, total_of
 from msmpetsc.geometry.inside import inside
 from msmpetsc.scene.body import Region
 
-BOUNDS = np.array([[-1.0, 0.0, 2.0], [3.0, 2.0, 3.0]])  # sides 4, 2, 1
+# box of sides 4, 2 and 1 m
+BOUNDS = np.array([[-1.0, 0.0, 2.0], [3.0, 2.0, 3.0]])
 
 
 def holds(region: dict, *points: list[float]) -> list[bool]:
@@ -25,7 +26,8 @@ def test_box_absolute_and_relative():
     ]
     # relative: x from -1 to 3, y from 0 to 2, z from 2 to 2.5
     points = [[-1, 0, 2], [3, 2, 2.5], [3.01, 1, 2.2], [0, 1, 2.51], [0.5, 0.5, 0.2]]
-    # at the body's own bounds in x, in y and below it is open outwards: cells stick out there
+    # at the body's own bounds in x, in y and below it is open outwards: cells stick out
+    # there
     assert holds(box | {"relative": True}, *points) == [True, True, True, False, True]
 
 

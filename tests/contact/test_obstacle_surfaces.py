@@ -90,9 +90,11 @@ def test_a_plate_presses_a_block_that_is_held_at_its_foot(tmp_path: Path):
     model, frames = play(fine_block(tmp_path, time=time, obstacle=[PLATE], pin=FOOT))
     assert not any(crossed(model, frame) for frame in frames)
     last = frames[-1]
-    pressed = 0.05 / SIDES[2]  # at most: a little less by the distance
+    # upper bound: the barrier's distance takes a little of it
+    pressed = 0.05 / SIDES[2]
     force = pressed * SOLID["young_modulus"] * SIDES[0] * SIDES[1]
-    assert force < -last.push[0, 2] < 2 * force  # stiffer, for its foot does not spread
+    # stiffer than a bar, because the foot cannot spread
+    assert force < -last.push[0, 2] < 2 * force
     assert last.reaction[0, 2] == pytest.approx(-last.push[0, 2], rel=0.01)
 
 
@@ -168,7 +170,8 @@ def test_a_ball_pressed_into_a_hole_stays_on_its_rim(tmp_path: Path, response: s
     assert 5 < frames[-1].push[0, 2] < 60
 
 
-PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}  # [s], [N]
+# pressing force [N] over time [s]
+PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:

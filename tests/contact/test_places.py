@@ -13,7 +13,8 @@ from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.places import PairSet
 from msmpetsc.geometry.surface import Surface
 
-CELLS = 8  # of a plate's grid along either side of 1 m
+# cells of a plate's grid along each side of 1 m
+CELLS = 8
 DHAT = 0.25 / CELLS
 FRICTION = 0.3
 
@@ -106,7 +107,8 @@ def test_a_vertex_in_a_concave_crease_has_both_sides_less_their_link():
         np.abs(tips[:, 2] - 0.5 * side) / np.hypot(1, 0.5)
         for side in (np.abs(aside), -np.abs(aside))
     )
-    # The farther side counts if its nearest place is inside it. Else that place is the link itself.
+    # The farther side counts if its nearest place is inside it. Else that place is the
+    # link itself.
     foot = 0.5 * tips[:, 2] > np.abs(aside)
     other = np.where(foot, b(far) - b(np.hypot(aside, tips[:, 2])), 0.0)
     assert tip_energies(0.5, tips) == pytest.approx(b(near) + other, rel=1e-9, abs=1e-15)

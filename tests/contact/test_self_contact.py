@@ -25,7 +25,8 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import refuse_bad_options
 
 COMM = MPI.COMM_SELF
-GAP = 4e-4  # [m] between the arms, of a distance of 1e-3 m
+# gap between the arms [m]; the barrier begins at 1e-3 m
+GAP = 4e-4
 T = 0.01
 
 
@@ -53,18 +54,18 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     return SurfaceContact(Contacts(NearPairs(COMM, model.collision), 0.0, T), q, T), end
 
 
-@pytest.mark.parametrize(
-    "slid", [0.0, 1e-7, 1e-4]
-)  # without friction, below the kink of friction, beyond it
+# without friction, below the kink of friction, and beyond it
+@pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])
 def test_gradient_is_that_of_the_energy(model, slid: float):
     term, q = contact(model, slid)
     gradient = np.zeros_like(q)
     term.add_gradient(q, gradient)
     direction = np.random.default_rng(0).normal(size=q.shape)
+    # larger moves than those whose change of energy is computed from the forces
     for step in (
         1e-6,
         1e-7,
-    ):  # which move points by more than a change of energy is told from the forces for
+    ):
         difference = term.change(q + step * direction, q - step * direction) / (2 * step)
         assert difference == pytest.approx(np.vdot(gradient, direction), rel=1e-3)
     assert np.abs(gradient).max() > 0
@@ -76,22 +77,21 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
     lead down."""
     term, q = contact(model, slid)
     forward = np.zeros_like(q)
-    forward[q[:, 0] < 0, 0] = 1.0  # one arm nearer to the other
+    # the left arm approaches the right arm
+    forward[q[:, 0] < 0, 0] = 1.0
     product, hessian, step = np.zeros_like(q), term.hessian(q, False), 1e-13
     assert hessian is not None
     hessian.add_product(forward, product)
-    bend = term.change(q + step * forward, q) + term.change(
-        q - step * forward, q
-    )  # the linear parts cancel
+    # the linear parts cancel
+    bend = term.change(q + step * forward, q) + term.change(q - step * forward, q)
     assert bend / (step**2 * np.vdot(product, forward)) == pytest.approx(1, rel=1e-3)
     longest = np.abs(model.collision.points.moved(forward)).max()
     below, above = (
         term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share
         for share in (0.999, 1.001)
     )
-    assert below / above == pytest.approx(
-        1, rel=0.01
-    )  # where one formula takes over from the other
+    # on both sides of the move at which another formula takes over
+    assert below / above == pytest.approx(1, rel=0.01)
 
 
 @pytest.mark.parametrize("slid", [0.0, 1e-7])
@@ -99,7 +99,8 @@ def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: flo
     term, q = contact(model, slid)
     hessian, step = term.hessian(q, False), 1e-8
     assert hessian is not None
-    # the arms come nearer as a whole: where pairs neither turn nor slide nothing is left out
+    # the arms come nearer as a whole: where pairs neither turn nor slide nothing is
+    # left out
     direction = np.zeros_like(q)
     direction[q[:, 0] < 0, 0] = 1.0
     product, after, before = (np.zeros_like(q) for _ in range(3))
@@ -116,9 +117,8 @@ def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: flo
 
 def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_ends_with(model):
     q = closed(model)
-    came = np.where(
-        q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0
-    )  # the left arm, nearer to the right one and along it
+    # the left arm moves towards the right arm and along it
+    came = np.where(q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0)
     contacts = Contacts(NearPairs(COMM, model.collision), 0.0, T)
     now, before = (SurfaceContact(contacts, at, T).friction for at in (q, q - came))
     friction = SurfaceContact(contacts, q, T, q - came).friction
@@ -171,18 +171,21 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     through, apart, carried = q.copy(), q.copy(), q + np.array([5.0, 0, 0])
     through[q[:, 0] < 0, 0] += 2 * GAP
     apart[q[:, 0] < 0, 0] -= 2 * GAP
-    assert 0.3 < term.contacts.free_share(q, through) < 0.5  # they meet halfway
+    # the arms meet halfway
+    assert 0.3 < term.contacts.free_share(q, through) < 0.5
     assert term.contacts.free_share(q, apart) == term.contacts.free_share(q, carried) == 1.0
     far = q.copy()
-    far[q[:, 0] < 0, 0] += 500 * GAP  # many edges, and the ends are apart again
+    # a way of many edge lengths, whose end is free again
+    far[q[:, 0] < 0, 0] += 500 * GAP
     assert 0 < term.contacts.free_share(q, far) < 1 / 500
 
 
+# otherwise the ends of the arms turn inside out
 SOLID = {
     "young_modulus": 1e5,
     "density": 1000,
     "law": "neo-hookean",
-}  # or the arms' ends turn inside out
+}
 
 
 def test_arms_that_close_do_not_cross(tmp_path):
@@ -328,13 +331,14 @@ def test_a_block_holds_on_a_tilted_one(tmp_path):
     """It gives way once in the 20 steps for which that is remembered, as far as it would in each,
     were it not."""
     speed, frames = along_and_frames(sliding(tmp_path, 20.0))
-    stick = 1e-2 * 1.5  # of the longest side of both, which are one mesh [m/s]
+    # stick speed [m/s], by the longest side of the two equal meshes
+    stick = 1e-2 * 1.5
     creep = stick * (1 - np.sqrt(1 - np.tan(np.radians(20.0)) / 0.5))
-    assert speed.mean() == pytest.approx(creep / 20, rel=0.3)  # steps 51 to 70 forget once
+    # friction starts anew once in steps 51 to 70
+    assert speed.mean() == pytest.approx(creep / 20, rel=0.3)
     assert abs(speed[:9].mean()) < 0.01 * creep
-    assert (
-        max(frame.iterations for frame in frames) <= 8
-    )  # a step starts where the last one ended, not in mid-air
+    # a step starts from the end of the last step, not in free flight
+    assert max(frame.iterations for frame in frames) <= 8
 
 
 def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
@@ -361,9 +365,8 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
     points, moved = np.random.default_rng(1).normal(size=(2, 6, 3))
     along, same = (pairs.slips(points) @ moved.ravel() for pairs in (one, other))
     assert along.any() and np.array_equal(along, same)
-    assert along @ (one.weights @ points[one.numbers[0]])[0] == pytest.approx(
-        0
-    )  # in the plane of contact
+    # motion within the plane of contact
+    assert along @ (one.weights @ points[one.numbers[0]])[0] == pytest.approx(0)
 
 
 @pytest.mark.slow

@@ -88,9 +88,8 @@ def test_normals_are_the_slope_of_depths_and_a_small_change_keeps_its_digits(sol
     # but where the nearest triangle changes
     assert len(x) > 30 and np.median(off) < 1e-8 and (off < 1e-4).mean() > 0.95
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
-    moved = 1e-9 * rng.normal(
-        size=x.shape
-    )  # of which a difference of depths would keep seven digits
+    # a difference of depths would keep seven of its digits
+    moved = 1e-9 * rng.normal(size=x.shape)
     np.testing.assert_allclose(
         solid.depth_change(x + moved, moved, face),
         -(moved * normals).sum(axis=1),
@@ -133,7 +132,8 @@ def test_a_function_is_the_sphere_that_it_describes(
     for obstacle in (BALL, OWN):
         _, frames = play(block_scene(tmp_path, obstacle=[obstacle | response], **FALLING | time))
         positions.append(frames[-1].position)
-    assert np.ptp(positions[0][:, 0]) > 0.5 + 1e-3  # and is bent
+    # the body is bent
+    assert np.ptp(positions[0][:, 0]) > 0.5 + 1e-3
     np.testing.assert_allclose(positions[1], positions[0], atol=2e-6)
 
 
@@ -182,11 +182,15 @@ def test_the_surface_of_a_function_is_in_the_file(tmp_path: Path):
     assert abs(far - RADIUS).max() < 0.02 and np.ptp(points, axis=0)[:2].min() > 0.59
 
 
-FLAT = 1e5  # [m]: over the block's 0.5 m it sinks by 3e-7 m, and a depth is rounded to 1e-11 m
+# radius [m]: the surface sinks by 3e-7 m over the block, and depths are rounded to
+# 1e-11 m
+FLAT = 1e5
 PLANE = {"shape": "plane", "point": [0, 0, -0.02], "normal": [0, 0, 1]}
 SPHERE = {"shape": "sphere", "center": [0.25, 0.25, -0.02 - FLAT], "radius": FLAT}
-SLOPED = {"acceleration": [2.0, 0, -G]}  # it slides
-ERROR = 1e-6  # of steps: the push is known to no more than a depth is
+# gravity that makes the block slide
+SLOPED = {"acceleration": [2.0, 0, -G]}
+# step error: the push is as accurate as a depth
+ERROR = 1e-6
 PLAIN = [{"response": "reflect", "restitution": 0.5}, {"response": "penalty", "friction": 0.3}]
 
 
@@ -202,9 +206,8 @@ def test_a_large_sphere_is_a_plane(tmp_path: Path, integrator: str, response: di
         )
         model, frames = play(path)
         moved.append(frames[-1].position - model.lattice.nodes)
-    assert (
-        moved[0][:, 2].mean() > -0.06 and np.abs(moved[0]).max() > 0.01
-    )  # it has met the ground, and slid
+    # the block has met the ground and slid
+    assert moved[0][:, 2].mean() > -0.06 and np.abs(moved[0]).max() > 0.01
     np.testing.assert_allclose(moved[1], moved[0], atol=5e-3 * np.abs(moved[0]).max())
 
 
@@ -215,9 +218,8 @@ def test_a_node_is_turned_back_along_the_radius():
         sphere([1.0, 2.0, 3.0], 0.5),
         np.array([[1.0, 2.3, 3.3], [1.0, 2.5, 3.5], [1.0, 2.2, 3.1]]),
     )
-    q_previous = q + np.array(
-        [[0.1, 0.2, 0.4], [0.1, 0.2, 0.4], [0, -0.1, -0.05]]
-    )  # in, outside, on its way out
+    # a node inside, a node outside and a leaving node
+    q_previous = q + np.array([[0.1, 0.2, 0.4], [0.1, 0.2, 0.4], [0, -0.1, -0.05]])
     after, before = Exchange(ball, 0.5).exchanged(q, q_previous, StepTaken(1.0, 0.1))
     normal = np.array([0, 1, 1]) / np.sqrt(2)
     speed = (q - q_previous)[0] @ normal

@@ -110,9 +110,8 @@ def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
     forms[cut] *= RNG.uniform(0.5, 1.0, size=(cut.sum(), 1))
     of_cells = lattice.solid._replace(forms=forms, shear=shear)
     blocks = NeoHookean.of_lattice(Lattice(**(vars(lattice) | {"solid": of_cells}))).blocks
-    assert (
-        len(blocks.nodes) == 12 and len(blocks.constants) <= 2 + 2 + 2
-    )  # two whole, two in part, two of cut cells
+    # two full cells, two of parts, two cut cells
+    assert len(blocks.nodes) == 12 and len(blocks.constants) <= 2 + 2 + 2
     kept = blocks.constants[blocks.which].reshape(12, 15, 8).transpose(0, 2, 1).reshape(96, 15)
     order = [
         np.flatnonzero(lattice.local_cells[:, 0] == first)[0]
@@ -208,9 +207,8 @@ def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_
             lowest = np.linalg.eigvalsh(dense_hessian(elastic, q) + np.diag(concavity)).min()
             assert lowest > -1e-12 * size
             worst = max(worst, -np.linalg.eigvalsh(dense_hessian(elastic, q)).min())
-    assert (
-        worst > 0.1 * YOUNG * H * lattice.solid.volume.mean() / H**3
-    )  # there was something to bound
+    # the bound was tested by some cells
+    assert worst > 0.1 * YOUNG * H * lattice.solid.volume.mean() / H**3
     assert elastic.concavity(lattice.nodes).max() < 1e-9 * YOUNG * H
 
 

@@ -43,10 +43,10 @@ def hessian_times(q: np.ndarray, v: np.ndarray, projected: bool = False) -> np.n
 def test_one_spring_has_hookes_energy_and_force():
     q = np.array([[0.0, 0, 0], [0, 3, 4]])
     one = Springs(np.array([[0, 1]]), np.array([2.0]), np.array([10.0]))
-    assert energy(q, one) == pytest.approx(0.5 * 10 * (5 - 2) ** 2)  # Eq. 13
-    np.testing.assert_allclose(
-        gradient(q, one), [[0, -18, -24], [0, 18, 24]]
-    )  # k (l - r) along the spring
+    # Eq. 13
+    assert energy(q, one) == pytest.approx(0.5 * 10 * (5 - 2) ** 2)
+    # k (l - r) along the spring
+    np.testing.assert_allclose(gradient(q, one), [[0, -18, -24], [0, 18, 24]])
 
 
 def test_gradient_is_the_slope_of_the_energy():
@@ -84,7 +84,8 @@ def test_projected_hessian_is_positive_where_the_true_one_is_not():
 def test_a_change_of_energy_keeps_its_digits():
     """Against the first and second derivative: a plain difference of energies has no digit left
     here."""
-    v = (Q + 1e-10 * RNG.normal(size=Q.shape)) - Q  # as it is after rounding
+    # Q + dQ is rounded, so v is dQ after rounding
+    v = (Q + 1e-10 * RNG.normal(size=Q.shape)) - Q
     first, second = (gradient(Q) * v).sum(), 0.5 * (hessian_times(Q, v) * v).sum()
     change = OwnedSprings(HOOKE).change(Q + v, Q)
     # near a minimum only this is left, without the loads

@@ -59,7 +59,8 @@ def complaints(reader: vtk.vtkAlgorithm) -> list[str]:
 
 def test_gltf_moves_in_vtk_and_stands_in_trimesh(result: Path, tmp_path: Path):
     path = export(result, tmp_path / "x.glb")
-    (mesh,) = trimesh.load(path).dump()  # as the scene's node turns it: y is up there
+    # the node of the scene turns z up to y up
+    (mesh,) = trimesh.load(path).dump()
     turned = surface(0)[:, [0, 2, 1]] * [1, 1, -1]
     assert {tuple(np.round(p, 5)) for p in mesh.vertices} == {tuple(np.round(p, 5)) for p in turned}
     reader = vtk.vtkGLTFReader()
@@ -72,7 +73,8 @@ def test_gltf_moves_in_vtk_and_stands_in_trimesh(result: Path, tmp_path: Path):
     assert reader.GetAnimationDuration(0) == pytest.approx(DT * (FRAMES - 1))
     reader.EnableAnimation(0)
     reader.UpdateInformation()
-    for index in (0, 1, 3, 2.5):  # between frames it goes straight
+    # positions are linear between frames
+    for index in (0, 1, 3, 2.5):
         reader.UpdateTimeStep(DT * index)
         (block,) = pyvista.wrap(reader.GetOutput()).recursive_iterator()
         assert np.allclose(block.points, surface(index)[:, [0, 2, 1]] * [1, 1, -1], atol=1e-6), (
@@ -106,9 +108,8 @@ def test_normals_are_those_of_a_ball():
     ball = trimesh.creation.icosphere(subdivisions=2)
     assert np.allclose(normals(ball.vertices, ball.faces), ball.vertices, atol=0.03)
     alone = normals(np.zeros((4, 3)), np.array([[0, 1, 2]]))
-    assert np.allclose(
-        np.linalg.norm(alone, axis=1), 1
-    )  # of a collapsed body any direction, of length 1
+    # a collapsed body may have normals of any direction, but of length 1
+    assert np.allclose(np.linalg.norm(alone, axis=1), 1)
 
 
 @pytest.mark.parametrize("ending", [".obj", ".ply", ".stl"])
@@ -137,7 +138,8 @@ def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tm
     with h5py.File(result, "r+") as file:
         del file["frames/surface"]
     mesh = meshio.read(export(result, tmp_path / "x.ply", frames=[3]))
-    rows = small_result.cells()[[0, 1, 1, 0]]  # W has 1/8 for each corner of a point's cell
+    # a point has the weight 1/8 of each corner of its cell
+    rows = small_result.cells()[[0, 1, 1, 0]]
     assert np.allclose(mesh.points, position(3)[rows].mean(axis=1))
 
 

@@ -49,7 +49,8 @@ def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Pa
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetDefaultPrim().GetPath() == mesh.GetPath().GetParentPath()
     assert mesh.GetPointsAttr().GetTimeSamples() == list(range(FRAMES))
-    for index in (0, 1, 2.5, 4):  # between frames it goes straight
+    # positions are linear between frames
+    for index in (0, 1, 2.5, 4):
         code = Usd.TimeCode(index * DT * rate)
         points = np.array(mesh.GetPointsAttr().Get(code))
         assert points_of(mesh, code) == pytest.approx(surface(index), abs=1e-6)
@@ -96,7 +97,8 @@ def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):
     assert (first.GetPrim().GetName(), second.GetPrim().GetName()) == ("body_0", "body_1")
     assert points_of(first, 3) == pytest.approx(surface(3), abs=1e-6)
     assert points_of(second, 3) == pytest.approx(5 + surface(-3), abs=1e-6)
-    assert list(second.GetFaceVertexIndicesAttr().Get()) == [0, 1, 2]  # of its own points
+    # indices count the body's own points
+    assert list(second.GetFaceVertexIndicesAttr().Get()) == [0, 1, 2]
 
 
 def test_chosen_frames_keep_their_times(result: Path, tmp_path: Path):
@@ -106,7 +108,8 @@ def test_chosen_frames_keep_their_times(result: Path, tmp_path: Path):
         [0.01, 0.03, 0.04]
     )
     assert points_of(mesh, 0.03 * rate) == pytest.approx(surface(3), abs=1e-6)
-    assert frames_a_second(np.array([0.5])) == 1  # of one frame
+    # a single frame
+    assert frames_a_second(np.array([0.5])) == 1
 
 
 @pytest.mark.parametrize(

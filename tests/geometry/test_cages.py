@@ -37,7 +37,8 @@ MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
 with_meshes = pytest.mark.skipif(
     "MSMPETSC_MESH_DIR" not in os.environ, reason="needs $MSMPETSC_MESH_DIR"
 )
-SIDE = 6  # cells of the small grid of the boundary tests
+# cells of the small grid of the boundary tests
+SIDE = 6
 
 
 # --- boundary cells ---
@@ -49,8 +50,10 @@ def cells_of(corners: np.ndarray, low=(0, 0, 0), high=(SIDE,) * 3) -> set[tuple[
     return set(map(tuple, unpacked(keys).tolist()))
 
 
-UNIT = 64  # triangles of the oracle have corners at multiples of 1/64
-FINE = 1 << 34  # and a half-open cell is one that ends 1/64 * 2^-34 before its far faces
+# corners of the oracle's triangles are multiples of 1/64
+UNIT = 64
+# a half-open cell ends 1/64 * 2^-34 before its far faces
+FINE = 1 << 34
 
 
 def boxes_touched(triangle: np.ndarray, gap: int) -> set[tuple[int, ...]]:
@@ -75,7 +78,8 @@ off_planes = st.integers(0, SIDE * UNIT // 2 - 1).map(lambda x: 2 * x + 1)
 often_on_planes = st.integers(0, SIDE * 4 - 1).map(lambda x: 16 * x)
 
 
-@settings(max_examples=300, deadline=None)  # the first example compiles
+# no deadline, because the first example compiles
+@settings(max_examples=300, deadline=None)
 @given(
     st.one_of(
         *(arrays(np.int64, (3, 3), elements=place) for place in (off_planes, often_on_planes))
@@ -147,7 +151,8 @@ def test_interior_is_what_a_dense_flood_fill_finds(name):
 def test_a_cavity_is_filled_but_where_cells_count_by_what_is_inside_and_it_is_wound_as_one(
     turned, boundary
 ):
-    # the flood comes from outside and cannot reach it: the paper's interior is what is enclosed
+    # the flood comes from outside and cannot reach it: the paper's interior is what is
+    # enclosed
     cages = fill([body_of(hollow_ball(turned))], 0.1, boundary=boundary)
     middle = np.floor((0 - cages.grids.grids[0].origin) / 0.1).astype(int)
     assert dense(cages, INTERIOR)[tuple(middle)] != (turned and boundary == "fill")
@@ -158,15 +163,15 @@ def test_time_and_memory_follow_the_cells_not_the_bounding_box():
     # each of its cells is 1 TB
     ends = np.array([[0, 0, 0], [20_000, 20_000, 20_000]])
     body = body_of(trimesh.creation.cylinder(radius=1.5, segment=ends, sections=5))
-    fill([body], 2000.0)  # compile
+    # compile before the measurement
+    fill([body], 2000.0)
     tracemalloc.start()
     cages = fill([body], 1.0)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert cages.grids.grids[0].shape.min() >= 20_000 and (cages.kind == INTERIOR).sum() > 10_000
-    assert peak < 800 * len(
-        cages.kind
-    )  # bytes: most while triangles are cut, whose pieces have 17 sums each
+    # bytes; the peak comes while triangles are cut into pieces of 17 sums each
+    assert peak < 800 * len(cages.kind)
 
 
 # --- cages ---
@@ -244,9 +249,8 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     assert not body.report.closed
     cages = fill([body], 0.1)
     assert len(cages.kind) == 150
-    assert (
-        cages.kind == INTERIOR
-    ).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
+    # one layer more, because no triangle marks the upper layer as boundary
+    assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +290,8 @@ def test_too_many_cells_are_refused():
         fill([aligned_box()], 0.1, max_cells=149)
     assert len(fill([aligned_box()], 0.1, max_cells=150).kind) == 150
     with pytest.raises(InputError, match=r"above cages.max_cells"):
-        fill([aligned_box()], 1e-5)  # at once: 1.5e14 cells are not tried
+        # the refusal comes at once, without an attempt at 1.5e14 cells
+        fill([aligned_box()], 1e-5)
     with pytest.raises(InputError, match=r"cages.cell_size: 1e-08 m would cut the body into 1e"):
         fill([aligned_box()], 1e-8)
 

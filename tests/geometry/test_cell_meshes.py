@@ -13,9 +13,11 @@ from msmpetsc.geometry.cell_meshes import KINDS
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import examine
 
-N = 2  # cubes along each side of 1 m
+# cubes along each side of 1 m
+N = 2
 CUBE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-PARTS = {  # of a cube, by its corners in VTK's order; 8 is its middle
+# cells of a cube by its corners in VTK's order; 8 is the middle of the cube
+PARTS = {
     "hexahedron": [range(8)],
     "wedge": [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]],
     "tetra": [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
@@ -82,8 +84,10 @@ def test_the_boundary_of_cells_encloses_their_volume(
     report = examine(surface)
     assert report.closed and report.inconsistent_edges == report.nonmanifold_edges == 0
     assert report.volume == pytest.approx(1, rel=1e-5) and report.area == pytest.approx(6, rel=1e-5)
-    assert len(surface.points) == len(np.unique(surface.triangles))  # unused points are dropped
-    if kind != "wedge":  # which has triangles on some sides
+    # unused points are dropped
+    assert len(surface.points) == len(np.unique(surface.triangles))
+    # wedges have triangles on some sides
+    if kind != "wedge":
         cuts = {1: 2, 2: 8 if kind == "tetra" else 6}
         assert len(surface.triangles) == 6 * N**2 * cuts[order]
 
@@ -109,7 +113,8 @@ def test_sets_of_cells_and_points_are_groups(tmp_path: Path):
     meshio.gmsh.write(tmp_path / "x.msh", mesh, "2.2", binary=False)
     groups = read_surface(tmp_path / "x.msh").groups
     assert groups.keys() == {"left", "2", "7", "tip"}
-    for name in ("left", "2"):  # closed, and wound outwards on both sides of the face between them
+    # both groups are closed and wound outwards on their common face
+    for name in ("left", "2"):
         report = examine(groups[name])
         assert report.closed and report.volume == pytest.approx(0.5)
     assert np.array_equal(groups["tip"].points[groups["tip"].triangles[0]], points[[2, 1, 3]])

@@ -29,8 +29,10 @@ from msmpetsc.view.drawable import drawable_of_result
 from msmpetsc.view.mesh import drawn
 
 H = 0.1
-LENGTH, BASE, WIDTH, DEPTH = 20, 4, 5, 2  # of the fork [cells]; its slit runs along x
-YOUNG, FORCE = 1e6, 0.5  # [Pa], [N]
+# the fork [cells]; its slit runs along x
+LENGTH, BASE, WIDTH, DEPTH = 20, 4, 5, 2
+# [Pa], [N]
+YOUNG, FORCE = 1e6, 0.5
 COMM = MPI.COMM_SELF
 
 
@@ -175,7 +177,8 @@ def test_the_surface_follows_its_own_part(tmp_path: Path):
         weights = embed([body.surface.points], cages, net.table, kind)
         nodes = cages.grids.node_positions(net.ijk)
         np.testing.assert_allclose(weights @ nodes, body.surface.points, atol=1e-6)
-        # nodes beyond the end of the slit are labelled by the prong that their cells fill
+        # nodes beyond the end of the slit are labelled by the prong that their cells
+        # fill
         fills = cages.of_cells(net.keys, cages.fills).mean(axis=(1, 2, 3))
         ijk = decode_morton(net.keys)
         side = np.zeros(len(net.ijk))

@@ -11,12 +11,15 @@ from hypothesis import strategies as st
 from msmpetsc.geometry.embedding import stencil_weights
 
 KINDS = ("mvc", "cages", "affine")
-BAR, RADIUS = np.array([4, 1, 1]), 3.0  # sides of a bar, and what its middle is bent to [m]
-SIZES = np.array([1 / 2, 1 / 4, 1 / 8, 1 / 16])  # cell size [m]
+# sides of a bar [m], and the radius to which its middle is bent [m]
+BAR, RADIUS = np.array([4, 1, 1]), 3.0
+# cell size [m]
+SIZES = np.array([1 / 2, 1 / 4, 1 / 8, 1 / 16])
+# standard deviation of random displacements and step of one-sided differences [cells]
 MOVED, STEP = (
     0.1,
     1e-4,
-)  # standard deviation of random node displacements, step of one-sided differences [cells]
+)
 BLOCK = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(27, 3)
 NODES = np.stack(np.meshgrid(*[range(-1, 3)] * 3, indexing="ij"), -1).reshape(64, 3)
 ALL_KINDS = pytest.mark.parametrize("kind", KINDS)
@@ -71,7 +74,8 @@ def plain_mvc(p, cells):
     w = np.zeros(64)
     for triangle in surface_triangles(cells):
         e = [(v - p) / np.linalg.norm(v - p) for v in triangle]
-        beta = [np.arccos(e[i - 2] @ e[i - 1]) for i in range(3)]  # opposite to vertex i
+        # angle opposite to vertex i
+        beta = [np.arccos(e[i - 2] @ e[i - 1]) for i in range(3)]
         n = [np.cross(e[i - 2], e[i - 1]) for i in range(3)]
         n = [x / np.linalg.norm(x) for x in n]
         for i, v in enumerate(triangle):
@@ -107,7 +111,8 @@ def test_mvc_and_cages_agree_with_their_equations_evaluated_plainly():
         np.array([0.3, 0.995, 0.002]),
     ]
     masks = random_masks(rng, len(points))
-    masks[0] = np.isin(np.arange(27), [13, 14])  # 4 of the corners are not in B_c
+    # four of the corners are outside B_c
+    masks[0] = np.isin(np.arange(27), [13, 14])
     for u, mask in zip(points, masks, strict=True):
         np.testing.assert_allclose(weights("mvc", u, mask), plain_mvc(u, {(0, 0, 0)}), atol=1e-10)
         for h in (1.0, 0.4):

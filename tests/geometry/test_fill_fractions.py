@@ -82,9 +82,8 @@ def test_corners_of_an_oblique_cell_are_those_of_many_samples():
             axis=1
         )
         found = 8 * functions[:, inside].sum(axis=1) / len(points)
-        np.testing.assert_allclose(
-            fills[cell].ravel(), found, atol=0.02
-        )  # 4 standard deviations of a sample
+        # four standard deviations of a sample
+        np.testing.assert_allclose(fills[cell].ravel(), found, atol=0.02)
 
 
 # ---- cages
@@ -100,9 +99,8 @@ def test_the_longest_side_may_be_any_and_faces_may_be_wound_inwards(axis: int):
     mesh = trimesh.creation.box(bounds=[[0, 0, 0], np.roll([1.0, 0.53, 0.38], axis)])
     expected = fill([body_of(mesh)], 0.1)
     top = expected.ijk[:, (axis + 2) % 3] == 3
-    assert volume(expected) == pytest.approx(
-        mesh.volume, rel=1e-3
-    )  # the least fill of corners that are out of it
+    # corners outside the body have a least fill, which adds to the volume
+    assert volume(expected) == pytest.approx(mesh.volume, rel=1e-3)
     along = np.moveaxis(expected.fills[top], 1 + (axis + 2) % 3, -1)[:, :, :, 1]
     assert along.max() < 0.8**2 + 1e-12
     mesh.invert()

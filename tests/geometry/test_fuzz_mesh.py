@@ -142,9 +142,8 @@ def test_a_whole_mesh_is_read_and_a_truncated_one_refused(tmp_path, kind, conten
     assert report.closed and report.volume == pytest.approx(
         {QUADS: 1.0, gltf(): 12.0}.get(content, 6.0)
     )
-    if not content.startswith(
-        (b"v ", b"#", b"mtllib")
-    ):  # the lines of an OBJ that are left may be a mesh
+    # the remaining lines of an OBJ file may be a mesh
+    if not content.startswith((b"v ", b"#", b"mtllib")):
         assert read(tmp_path, kind, content[: len(content) * 3 // 4])
     assert capfd.readouterr() == ("", "")
 

@@ -34,7 +34,8 @@ def real(name: str) -> Surface:
     return read_surface(Path(folder) / name)
 
 
-BALL = trimesh.creation.icosphere(subdivisions=5)  # 20,480 triangles
+# 20,480 triangles
+BALL = trimesh.creation.icosphere(subdivisions=5)
 BODY = surface_of(BALL)
 
 
@@ -51,7 +52,8 @@ def test_merge_joins_loose_triangles_and_drops_what_is_of_no_use():
     merged = prepare(Surface(points, triangles), ["merge"])
     assert merged.points.shape == (8, 3) and merged.triangles.shape == (12, 3)
     assert examine(merged).volume == pytest.approx(1)
-    assert np.array_equal(merged.points[0], points[0])  # the order of the first points stays
+    # the first points keep their order
+    assert np.array_equal(merged.points[0], points[0])
 
 
 def test_largest_part_is_the_one_of_most_area_not_of_most_triangles():
@@ -65,7 +67,8 @@ def test_union_of_overlapping_boxes_counts_the_overlap_once():
     parts = joined((box(), inside_out(box((0.5, 0, 0))), box((9, 0, 0))))
     solid = prepare(parts, ["union"])
     report = examine(solid)
-    assert report.closed and report.volume == pytest.approx(2.5)  # 1 + 1 - 1/2 + 1
+    # 1 + 1 - 1/2 + 1
+    assert report.closed and report.volume == pytest.approx(2.5)
 
 
 def test_union_refuses_an_open_part():
@@ -200,7 +203,8 @@ def test_orient_refuses_a_one_sided_surface():
 )
 def test_size_and_base_place_the_bounding_box(size, base, sides):
     points = box().points * sides + 3.0
-    stray = np.vstack([points, [[1e6, 1e6, -1e6]]])  # a point of no triangle
+    # a point that no triangle uses
+    stray = np.vstack([points, [[1e6, 1e6, -1e6]]])
     placed = prepare(Surface(stray, box().triangles), [], size=size, base=base).points[:8]
     low, high = placed.min(axis=0), placed.max(axis=0)
     assert (high - low).max() == pytest.approx(size, rel=1e-9)

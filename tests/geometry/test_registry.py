@@ -25,8 +25,10 @@ def sha256(content: bytes) -> str:
 
 
 BOX = trimesh.creation.box()
-ORIGINAL = BOX.export(file_type="stl")  # loose triangles: 36 points
-COPY = BOX.export(file_type="ply")  # 8 points
+# loose triangles: 36 points
+ORIGINAL = BOX.export(file_type="stl")
+# 8 points
+COPY = BOX.export(file_type="ply")
 
 
 class QuietHandler(SimpleHTTPRequestHandler):
@@ -117,7 +119,8 @@ def test_a_name_gives_the_same_surface_wherever_it_is_found(toy):
 
 
 def test_another_file_under_the_name_is_refused(toy):
-    install(toy, ORIGINAL)  # another version of the package: as if it were not there
+    # another version of the package counts as absent
+    install(toy, ORIGINAL)
     with pytest.raises(InputError, match="comes with a package"):
         locate("toyscan", toy)
     fetch("toybox").write_bytes(COPY)
@@ -153,7 +156,8 @@ def test_a_failed_connection_is_one_line(toy, site, monkeypatch, capfd):
     (folder / "box.stl").unlink()
     with pytest.raises(InputError, match=r"cannot fetch .*HTTP status 404"):
         fetch("toybox")
-    closed = {"http://127.0.0.1:9/box.stl": sha256(ORIGINAL)}  # nothing answers there
+    # no server answers at this address
+    closed = {"http://127.0.0.1:9/box.stl": sha256(ORIGINAL)}
     monkeypatch.setitem(MODELS, "toybox", replace(MODELS["toybox"], downloads=closed))
     assert "ConnectionError" in input_error(lambda: fetch("toybox"))
     assert capfd.readouterr() == ("", "")

@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface, check_encloses, examine, first_of_equal
 
-# name: points, triangles, boundary edges, non-manifold edges (from the notes that come with them)
+# name: points, triangles, boundary edges, non-manifold edges (from the notes that come
+# with them)
 SIDES = (1.0, 2.0, 3.0)
 
 
@@ -67,7 +68,8 @@ def test_volume_does_not_depend_on_place_or_numbering(shift, seed, sides):
 @given(arrays(np.int64, (12, 3), elements=st.integers(-1, 1)))
 def test_equal_points_share_the_number_of_the_first(points):
     points = points.astype(float)
-    points[0] *= -1.0  # may give -0.0, which equals 0.0
+    # this may give -0.0, which equals 0.0
+    points[0] *= -1.0
     expected = [next(j for j in range(12) if (points[j] == points[i]).all()) for i in range(12)]
     assert first_of_equal(points).tolist() == expected
 

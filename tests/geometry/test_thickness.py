@@ -117,5 +117,6 @@ def test_strips_across_the_grid_that_bend_too_little_are_told(degrees: float, th
     told, real = found.bending(1.0, SOLID), bent_strip(thickness, degrees, 0.25)
     assert told == pytest.approx(real, abs=0.05)
     assert told < ENOUGH or real > ENOUGH
-    # a wall of three cells at 30 degrees, and all walls that are thicker across the grid, will do
+    # a wall of three cells at 30 degrees, and all walls that are thicker across the
+    # grid, will do
     assert (told >= ENOUGH) == (thickness / np.sin(np.radians(2 * degrees)) > 3.4)

@@ -21,7 +21,8 @@ TRIALS = settings(
 )
 NUMBERS = [*b"nan inf 1e400 -1 0 1000000000000 18446744073709551616 1e12 x 1/2/3".split(), b""]
 NUMBER = re.compile(rb"[-+]?\d[\d.eE+-]*")
-SECONDS, BYTES = 10, 2**31  # a trial takes a hundredth of that
+# limits of time [s] and memory [byte]; a trial takes a hundredth
+SECONDS, BYTES = 10, 2**31
 
 place = st.floats(0, 1, exclude_max=True)
 damage = st.lists(

@@ -12,13 +12,15 @@ from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import TimeLoop
 
-CELL = 1 / 8  # [m]: a binary fraction, so that the block is a whole number of cells long
+# cell size [m]: a binary fraction, so that the block is a whole number of cells long
+CELL = 1 / 8
 SIDES = np.array([0.5, 0.5, 0.25])
 YOUNG, DENSITY, G = 1e5, 1000.0, 9.81
 GRAVITY = {"acceleration": [0, 0, -G]}
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty"}
 ROUGH_GROUND = GROUND | {"friction": 0.5}
-STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (lattice.material)
+# stiffness of an edge inside the block (lattice.material)
+STIFFEST = 4 / 7 * YOUNG * CELL
 
 
 def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **tables) -> Path:

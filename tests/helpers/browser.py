@@ -25,7 +25,8 @@ CHROMIUM = next(
 )
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-PATIENCE = 30.0  # [s] for an answer, or until something holds
+# longest wait for an answer or a condition [s]
+PATIENCE = 30.0
 
 
 class Browser:
@@ -33,7 +34,8 @@ class Browser:
 
     def __init__(self, page: Path, size: tuple[int, int] = (600, 700), address: str = ""):
         """Open a page at an address ("frame=3") in a window of so many pixels."""
-        ours, theirs = os.pipe(), os.pipe()  # from it, to it
+        # pipes from the browser and to the browser
+        ours, theirs = os.pipe(), os.pipe()
         read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 20) for fd in (theirs[0], ours[1]))
         profile = page.with_suffix(".profile")
         words = [
@@ -43,7 +45,8 @@ class Browser:
             f"--user-data-dir={profile}",
             "--hide-scrollbars",
         ]
-        shell = ["bash", "-c", f'exec "$@" 3<&{read} 4>&{write}', "bash"]  # it reads 3 and writes 4
+        # the browser reads file 3 and writes file 4
+        shell = ["bash", "-c", f'exec "$@" 3<&{read} 4>&{write}', "bash"]
         self._process = subprocess.Popen(
             [*shell, *words, f"--window-size={size[0]},{size[1]}"], pass_fds=(read, write),
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,

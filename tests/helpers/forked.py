@@ -34,7 +34,8 @@ def run_forked(
         try:
             status = child.wait(timeout)
         except subprocess.TimeoutExpired:
-            os.killpg(child.pid, signal.SIGKILL)  # its session: what it started, too
+            # the session, with all processes that the child started
+            os.killpg(child.pid, signal.SIGKILL)
             raise
         return subprocess.CompletedProcess(
             list(arguments), status, out.read_text(), error.read_text()
@@ -73,7 +74,8 @@ def run_ranks(
             finally:
                 mpiexec.kill()
                 for child in children:
-                    if child.is_alive():  # another rank has ended all
+                    # a failure on another rank has ended all ranks
+                    if child.is_alive():
                         os.killpg(child.pid, signal.SIGKILL)
         return subprocess.CompletedProcess(
             command, mpiexec.returncode, *(path.read_text() for path in streams)
@@ -96,7 +98,8 @@ def _hand_on(children: list, mpiexec: subprocess.Popen, folder: str, end: float)
         wait([child.sentinel for child in running.values()], 0.05)
         for rank in [rank for rank, child in running.items() if not child.is_alive()]:
             status = running.pop(rank).exitcode
-            pipe = os.open(Path(folder, f"{rank}.status"), os.O_RDWR)  # never waits for a reader
+            # opening for reading and writing never waits for a reader
+            pipe = os.open(Path(folder, f"{rank}.status"), os.O_RDWR)
             os.write(pipe, b"%d\n" % (status if status >= 0 else 128 - status))
 
 
@@ -122,5 +125,6 @@ def _python(arguments: list[str]) -> None:
     if kind == "-c":
         exec(compile(rest[0], "<string>", "exec"), {"__name__": "__main__"})
         return
-    sys.modules.pop(rest[0], None)  # of the server's, of which runpy would warn
+    # the server has loaded the module, and runpy would warn of it
+    sys.modules.pop(rest[0], None)
     runpy.run_module(rest[0], run_name="__main__", alter_sys=True)

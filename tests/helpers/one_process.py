@@ -29,7 +29,8 @@ PETSc.garbage_view()
 """
 
 
-Answers = list[tuple[int, str]]  # status and what was told, of each rank
+# status and message of each rank
+Answers = list[tuple[int, str]]
 
 
 def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers]:

@@ -6,11 +6,12 @@ import numpy as np
 import tomli_w
 import trimesh
 
+# radius of the tube, length of its straight arms, their distance from the U's axis [m]
 RADIUS, ARM, HALF = (
     0.02,
     0.12,
     0.05,
-)  # [m]: of the tube, of its straight arms, from their middles to the U's axis
+)
 
 
 def u_tube(around: int = 16, along: int = 60) -> trimesh.Trimesh:

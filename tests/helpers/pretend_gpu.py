@@ -24,7 +24,8 @@ KNOWN = [
     "empty_like",
     "flatnonzero", "linalg.norm", "nonzero", "tile", "vdot", "where", "zeros", "zeros_like",
 ]  # fmt: skip
-FEW = 9  # numbers are no array that grows with a body
+# most numbers of an array that does not grow with a body
+FEW = 9
 counted = Counter()
 
 
@@ -136,7 +137,8 @@ def bare(value):
         return value.values
     if isinstance(value, np.ndarray) and value.ndim:
         raise TypeError("Unsupported type <class 'numpy.ndarray'>")
-    make = getattr(value, "_make", type(value))  # of a NamedTuple
+    # NamedTuples are made by _make
+    make = getattr(value, "_make", type(value))
     return make(map(bare, value)) if isinstance(value, (tuple, list)) else value
 
 

@@ -9,10 +9,12 @@ from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.fields import STRESS, Frame
 from msmpetsc.results.writer import ResultFile
 
-H, DT, FRAMES = 0.5, 0.01, 5  # [m], [s]
+# cell size [m], time between frames [s], number of frames
+H, DT, FRAMES = 0.5, 0.01, 5
 CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
 X = np.array([1, 0, 0])
-NODES = H * np.unique(np.concatenate([CORNERS, CORNERS + X]), axis=0)  # (12, 3)
+# nodes (12, 3) [m]
+NODES = H * np.unique(np.concatenate([CORNERS, CORNERS + X]), axis=0)
 POINTS = np.array([[0.1, 0.2, 0.3], [0.6, 0.2, 0.1], [0.9, 0.4, 0.4], [0.5, 0.5, 0.5]])
 SCENE = "[material]\ndensity = 1000\n\n[time]\nstep = 0.01\n"
 

@@ -8,7 +8,8 @@ from small_strain import DENSITY, E, hessian
 
 from msmpetsc.lattice.lattice import Lattice
 
-C11, C12, C44 = 6 / 5 * E, 2 / 5 * E, 2 / 5 * E  # [Pa]
+# [Pa]
+C11, C12, C44 = 6 / 5 * E, 2 / 5 * E, 2 / 5 * E
 
 
 def elastic_constant(lattice: Lattice, G: np.ndarray, other: np.ndarray) -> float:

@@ -80,7 +80,8 @@ def alive(pid: int) -> bool:
         return False
 
 
-VOID = {"meta", "br"}  # elements of HTML that need no end
+# HTML elements without an end tag
+VOID = {"meta", "br"}
 
 
 def row_of(label: str, **given) -> dict[str, str]:

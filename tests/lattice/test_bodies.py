@@ -202,7 +202,8 @@ def test_no_two_bodies_have_a_node_in_common_and_one_follows_the_other():
 def test_coarse_cells_join_no_bodies_until_they_are_as_large():
     """A node of a grid coarsened l times, whose weight reaches from i to i + 1, is of one body."""
     several = grids((7, 7, 7), (7, 7, 7), (7, 7, 7))
-    for level in range(4):  # at 3 a body is one cell
+    # a body is a single cell at level 3
+    for level in range(4):
         reached = [
             {*range((x := int(several.first(body)[0])) >> level, ((x + 7) >> level) + 2)}
             for body in range(3)
@@ -253,9 +254,8 @@ def test_tables_of_the_scene_are_of_all_bodies(folder: Path):
     assert (velocity[first & ~lattice.pinned] == [1, 0, 0]).all() and (
         velocity[~first] == [0, 1, 0]
     ).all()
-    np.testing.assert_allclose(
-        lattice.mass[first], lattice.mass[~first], rtol=1e-12
-    )  # the part is of both
+    # the part lies in both bodies
+    np.testing.assert_allclose(lattice.mass[first], lattice.mass[~first], rtol=1e-12)
 
 
 def test_in_statics_each_body_must_be_held(folder: Path):

@@ -155,7 +155,8 @@ def test_a_group_stays_where_it_is_whatever_prepares_the_mesh(step, tmp_path: Pa
 def test_a_large_mesh_turns_with_its_groups(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("msmpetsc.geometry.prepare.LEAST_CACHED", 1)
     turn = {"prepare": [{"rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0}}]}
-    for _ in range(2):  # the second finds what the first left
+    # the second pass reads the mesh that the first pass cached
+    for _ in range(2):
         group = model_of(grouped(tmp_path, mesh=turn)).bodies[0].surface.groups["right"]
         assert np.allclose(group.points[:, 1], SIDES[0])
 

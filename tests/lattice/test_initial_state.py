@@ -18,7 +18,8 @@ from msmpetsc.solve.simulate import TimeLoop
 
 T = 1 / 128
 MIDDLE, MASS = SIDES / 2, DENSITY * SIDES.prod()
-NEAR = [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}]  # the nodes at x = 0
+# the nodes at x = 0
+NEAR = [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}]
 
 
 def begin(folder: Path, start: dict, **tables) -> tuple[Model, list[Frame]]:

@@ -53,9 +53,8 @@ def fem_sag(across: int, order: int = 1) -> float:
     of order 2."""
     sides = [np.linspace(0, side * WIDTH, side * across + 1) for side in (BEAM, 1, 1)]
     element = skfem.ElementVector({1: skfem.ElementHex1, 2: skfem.ElementHex2}[order]())
-    basis = skfem.Basis(
-        skfem.MeshHex.init_tensor(*sides), element, intorder=2 * order + 1
-    )  # exact for cubes
+    # exact for cubes
+    basis = skfem.Basis(skfem.MeshHex.init_tensor(*sides), element, intorder=2 * order + 1)
     K = linear_elasticity(*lame_parameters(E, NU)).assemble(basis).tocsc()
     f = skfem.LinearForm(lambda v, _: -DENSITY * GRAVITY * v[2]).assemble(basis)
     free = basis.complement_dofs(basis.get_dofs(lambda x: np.isclose(x[0], 0)))
@@ -77,7 +76,8 @@ def test_it_comes_to_the_solid_of_scikit_fem_with_second_order():
     """Trilinear hexahedra on the same grid: their excess is 1/2 (h/b)^2, so the difference goes as
     h^2."""
     difference = [1 - lattice_beam(across)[0] / fem_sag(across) for across in ACROSS]
-    assert 0 < difference[-1] < 0.013  # (169/140 - 1/2) / 8^2 = 1.1%
+    # (169/140 - 1/2) / 8^2 = 1.1%
+    assert 0 < difference[-1] < 0.013
     assert 1.6 < slope(1 / np.array(ACROSS), difference) < 2.2
     solid = fem_sag(2, order=2)
     errors = [1 - lattice_beam(across)[0] / solid for across in ACROSS]
@@ -93,12 +93,10 @@ def test_a_compression_wave_runs_at_the_root_of_E_over_rho(poisson: float | None
     Euler damps it."""
     centre, peak, height = study.wave_speeds(*study.struck_bar(1 / 4, poisson))
     assert abs(centre) < study.STRAIN
-    assert peak == pytest.approx(
-        late, abs=1e-4
-    )  # of springs by linear theory: bar -0.11%, cells -0.18%, Euler +0.05%
-    near, far = (
-        5**2 + station / 4 for station in study.STATIONS
-    )  # variance of the pulse [cells^2]
+    # linear theory of springs: bar -0.11%, cells -0.18%, implicit Euler +0.05%
+    assert peak == pytest.approx(late, abs=1e-4)
+    # variance of the pulse [cells^2]
+    near, far = (5**2 + station / 4 for station in study.STATIONS)
     assert height == pytest.approx(np.sqrt(near / far), rel=0.01)
 
 

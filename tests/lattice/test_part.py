@@ -14,9 +14,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 
 T = 1 / 64
-FAR = {
-    "half_space": {"point": [0.25, 0, 0], "normal": [1, 0, 0]}
-}  # cells beyond the middle of the length
+# the cells beyond the middle of the length
+FAR = {"half_space": {"point": [0.25, 0, 0], "normal": [1, 0, 0]}}
 BACK = {"half_space": {"point": [0, 0.25, 0], "normal": [0, 1, 0]}}
 ALL = {"box": [[-1, -1, -1], [1, 1, 1]]}
 ONCE = {"step": T, "duration": T}
@@ -34,7 +33,8 @@ def of_parts(folder: Path, *parts: dict, **tables) -> Model:
 def test_each_cell_gives_its_own_mass_to_its_corners(tmp_path: Path):
     lattice = of_parts(tmp_path, {"region": FAR, "density": 3 * DENSITY}).lattice
     assert lattice.mass.sum() == pytest.approx(2 * DENSITY * SIDES.prod(), rel=1e-14)
-    section = DENSITY * CELL * SIDES[1] * SIDES[2]  # a layer of cells across
+    # mass of a layer of cells across the bar
+    section = DENSITY * CELL * SIDES[1] * SIDES[2]
     for place, layers in {0: 1 / 2, 1: 1, 2: 1 / 2 + 3 / 2, 3: 3, 4: 3 / 2}.items():
         at = lattice.nodes[:, 0] == place * CELL
         assert lattice.mass[at].sum() == pytest.approx(layers * section, rel=1e-14)
@@ -152,7 +152,8 @@ def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp
     model, frames = play(path)
     mass, last = model.lattice.mass, frames[-1]
     np.testing.assert_allclose(frames[0].momentum, [0, 0, mass.sum()], rtol=1e-12, atol=1e-3)
-    fallen = 2.0 - 0.5 * 2.0 * (2.0 + 0.1)  # implicit Euler's: n (n + 1) / 2 steps
+    # implicit Euler falls by n (n + 1) / 2 steps
+    fallen = 2.0 - 0.5 * 2.0 * (2.0 + 0.1)
     np.testing.assert_allclose(
         last.position - model.lattice.nodes, np.tile([0, 0, fallen], (len(mass), 1)), atol=1e-6
     )
@@ -162,7 +163,8 @@ def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp
 
 
 def test_a_part_of_no_cell_is_refused(tmp_path: Path):
-    corner = {"box": [[0, 0, 0], [5e-4, 5e-4, 5e-4]]}  # holds a node, but no sample of a cell
+    # the box has a node, but no sample of a cell
+    corner = {"box": [[0, 0, 0], [5e-4, 5e-4, 5e-4]]}
     with pytest.raises(
         InputError, match=r"^part\.0\.region holds no part of a cell: the body is from .* m$"
     ):

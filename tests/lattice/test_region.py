@@ -40,7 +40,8 @@ def test_a_relative_box_up_to_one_holds_what_sticks_out(tmp_path, cells):
     path = block_scene(tmp_path, sides, time=TIME, cages={"count": cells}, pin=[upper])
     model = build(path)
     nodes = model.lattice.nodes
-    assert nodes[:, 2].max() > sides[2]  # they do stick out
+    # some nodes stick out of the body
+    assert nodes[:, 2].max() > sides[2]
     np.testing.assert_array_equal(model.lattice.pinned, nodes[:, 2] >= 0.8 * sides[2] - 1e-9)
 
 
@@ -100,7 +101,8 @@ def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
 
 @pytest.mark.parametrize("kind", ["pin", "anchor", "force", "part"])
 def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind):
-    table = {"region": {"box": [[0, 0, 0.251], [1, 1, 2]]}}  # of the nodes that stick out alone
+    # only nodes that stick out of the body
+    table = {"region": {"box": [[0, 0, 0.251], [1, 1, 2]]}}
     own = {
         "anchor": {"path": [{"time": 1, "by": [0, 0, 1]}]},
         "force": {"total": [0, 0, 1]},

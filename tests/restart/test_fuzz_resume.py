@@ -74,11 +74,13 @@ edit = st.one_of(
 @pytest.mark.slow
 @settings(TRIALS, max_examples=40)
 @given(edits=st.lists(edit, min_size=1, max_size=2))
-@example(edits=[("attribute", "petsc_options", "-pc_type 'x")])  # what no shell would take apart
+# no shell could split these words
+@example(edits=[("attribute", "petsc_options", "-pc_type 'x")])
 @example(edits=[("attribute", "true_error", "x")])
 @example(edits=[("dataset", "checkpoint/step", ((2,), "f8"))])
 @example(edits=[("value", "checkpoint/q", np.nan)])
-@example(edits=[("value", "checkpoint/step", 12.0)])  # beyond the end
+# a step beyond the end of the run
+@example(edits=[("value", "checkpoint/step", 12.0)])
 def test_it_goes_on_or_says_in_one_line_why_not(stopped, tmp_path, capsys, edits):
     path = tmp_path / "x.h5"
     path.write_bytes(stopped.read_bytes())

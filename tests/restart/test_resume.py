@@ -42,14 +42,14 @@ GRAVITY = {"acceleration": [0.0, 1.0, -9.81]}
 SIDE = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
 FAR = {"box": [[0.49, -1, -1], [0.51, 1, 1]]}
 LED = [{"region": FAR, "path": [{"time": 0.05, "by": [0.05, 0, 0.05]}], "stop": 0.08}]
-PUSHED = [
-    {"region": {"box": [[0.24, -1, -1], [0.26, 1, 1]]}, "path": LED[0]["path"], "stop": 0.1}
-]  # and let go later
+# the anchor is released later
+PUSHED = [{"region": {"box": [[0.24, -1, -1], [0.26, 1, 1]]}, "path": LED[0]["path"], "stop": 0.1}]
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
 PRESSING = [
     GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}
 ]
-THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}  # passed within a step
+# thinner than the way of a step
+THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}
 SOFT = {"young_modulus": 1e4, "density": 1000.0}
 
 
@@ -93,9 +93,11 @@ CASES = {
         for preset in PRESETS
         for name, obstacle in {"reflected": [GROUND], "pressed": PRESSING}.items()
         if preset in ("newton", "lbfgs") or name == "pressed"
-        if preset != "anderson"  # which runs astray there
+        # anderson diverges there
+        if preset != "anderson"
     },
-    "loose, pressed": fall(  # the estimate of a start knows what the preconditioner was
+    # the estimate at a start depends on the earlier preconditioner
+    "loose, pressed": fall(
         solver={"preset": "newton", "error": 0.3},
         obstacle=PRESSING,
         time={"step": 0.01, "duration": 0.24},
@@ -112,8 +114,8 @@ CASES = {
         solver=solver("anderson"),
         start={"scatter": 0.9},
         safety={"on_failure": "substep"},
-        material=SOFT
-        | {"young_modulus": 1e6},  # pieces of an eighth and more, which the next step begins with
+        # pieces of an eighth and more, with which the next step begins
+        material=SOFT | {"young_modulus": 1e6},
     ),
     "fallback, scattered": swing(
         solver=solver("anderson"),
@@ -143,7 +145,8 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
         with TimeLoop(COMM, read, build_model(COMM, read)) as simulation:
             return simulation.saved.rows.keys() - {"q", "q_previous"}
 
-    followed = {"lowest_mode"}  # whether a step is at a minimum is asked of every implicit one
+    # each implicit step is examined for a minimum
+    followed = {"lowest_mode"}
     assert rows(swing(solver=LOOSE)) == followed
     assert rows(by("verlet", swing())) == set()
     assert rows(by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))) == followed | {
@@ -181,7 +184,8 @@ def test_what_was_asked_for_beside_the_frames_is_there_after_going_on(whole: Pat
     cost, picture = stopped.with_suffix(".json"), stopped.with_suffix(".png")
     pytest.importorskip("pyvista")
     assert main(["run", "--resume", str(stopped), "--measure", str(cost), "--picture"]) == 0
-    assert_same(stopped, whole)  # its true errors, too
+    # the true errors are equal, too
+    assert_same(stopped, whole)
     assert json.loads(cost.read_text())["time"]["stepping"] > 0 and picture.stat().st_size > 1000
     assert stopped.with_suffix(".xdmf").read_text().count("<Time") == 2 * finished(h5py.File(whole))
 
@@ -200,7 +204,8 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
     with h5py.File(path) as file:
         assert max(file["checkpoint/step"]) == 0 and finished(file) == 8
         times = file["frames/wall_time"][:]
-    assert main(["run", "--resume", str(path)]) == 0  # a file that was trimmed: it is written anew
+    # the trimmed file is written anew
+    assert main(["run", "--resume", str(path)]) == 0
     assert_same(path, whole)
     with h5py.File(path) as file:
         assert np.array_equal(file["frames/wall_time"][:8], times)
@@ -273,7 +278,8 @@ def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
         with h5py.File(path) as file:
             assert tomllib.loads(file.attrs["scene"])["time"]["duration"] == 0.56
             assert "(to step " in file.attrs["earlier"]
-    assert sorted(path.suffix for path in tmp_path.glob(".*")) == []  # nothing is left beside them
+    # no temporary file is left
+    assert sorted(path.suffix for path in tmp_path.glob(".*")) == []
 
 
 def left_by_a_kill(

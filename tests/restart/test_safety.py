@@ -32,9 +32,8 @@ def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
     """Implicit Euler only loses; explicit substeps and BDF2 swing about what is there by a few
     percent."""
     _, frames = play(beam(tmp_path, time=TIME | {"integrator": integrator}))
-    worked = (
-        of(frames, "potential")[0] - of(frames, "potential").min()
-    )  # [J] that the weight put in
+    # energy from the weight [J]
+    worked = of(frames, "potential")[0] - of(frames, "potential").min()
     assert worked > 0
     assert (
         of(frames, "energy_gained").sum()
@@ -101,7 +100,8 @@ def test_rescue_carries_such_a_run_on(tmp_path: Path, monkeypatch: pytest.Monkey
         beam(tmp_path, time={"step": STEP, "duration": 0.5}), f"safety.on_failure={way}"
     )
     assert len(frames) == 31 and of(frames, f"{way}s").sum() > 0
-    assert np.abs(frames[-1].position).max() < 1.5  # the beam is 1 m long
+    # the beam is 1 m long
+    assert np.abs(frames[-1].position).max() < 1.5
 
 
 def test_a_step_that_is_not_finite_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

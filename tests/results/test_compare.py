@@ -16,7 +16,8 @@ from msmpetsc.results.comparison import COMPARED, compare, compare_surfaces, dif
 from msmpetsc.results.reader import Result
 from msmpetsc.study.metrics import surface_error
 
-DISPLACED = 0.1 * (FRAMES - 1) * 0.5  # [m]: the top of the sheared bar at the last frame
+# displacement of the sheared bar's top in the last frame [m]
+DISPLACED = 0.1 * (FRAMES - 1) * 0.5
 
 
 @pytest.fixture
@@ -66,23 +67,26 @@ def test_the_first_frame_and_node_that_differ_are_named(a: Path, tmp_path: Path,
 @pytest.mark.parametrize(
     ("name", "value", "error"),
     [
+        # relative to the largest energy of the run, 2 * 4 J of the elastic energy
         (
             "kinetic",
             3.008,
             0.008 / 8,
-        ),  # of the largest energy in the run, the elastic one's 2 * 4 J
+        ),
         ("elastic", 6.0 + 8e-4, 1e-4),
         ("potential", -1.8, 0.1),
+        # m = 12 * 0.25 kg, K = 4 J
         (
             "momentum",
             np.array([1, 0.03, 3]),
             0.03 / np.sqrt(2 * 12 * 0.25 * 4),
-        ),  # m = 12 * 0.25 kg, K = 4 J
+        ),
+        # the body moves by 0.01 m a frame, so frame 4 is the farthest
         (
             "surface",
             POINTS + np.array([0.03, 0.004, 0]),
             0.1,
-        ),  # moved by 0.01 m a frame; frame 4 is the farthest
+        ),
     ],
 )
 def test_errors_are_relative_to_what_is_stated(
@@ -193,7 +197,8 @@ def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(
 ):
     b = other_lattice(tmp_path / "b.h5", by=0.02)
     status, out, _ = told(capsys, a, b)
-    largest = np.hypot(0.04, 0.02)  # of a displacement in b
+    # largest displacement in b
+    largest = np.hypot(0.04, 0.02)
     assert status == 1 and "their surfaces alone are compared" in out
     assert (
         "from frame 2 on, t = 0.02 s: surface, surface, rms" in out

@@ -13,8 +13,10 @@ from stopped_runs import assert_same, at_step, every_step_forgets, hanging  # no
 from msmpetsc.cli.main import main
 from msmpetsc.results.untrusted_file import finished
 
-STEPS, BEFORE = 12, 5  # steps; the one after which there is no room
-FINE = {"cages": {"cell_size": 1 / 32}, "output": {"surface": False}}  # 2,601 nodes, 62 kB a frame
+# number of steps, and the step after which the disk is full
+STEPS, BEFORE = 12, 5
+# 2,601 nodes, 62 kB a frame
+FINE = {"cages": {"cell_size": 1 / 32}, "output": {"surface": False}}
 
 
 @pytest.fixture(scope="module")

@@ -169,7 +169,8 @@ def test_names_and_versions_act_on_no_terminal(bar_result, tmp_path):
     path = tmp_path / "x.h5"
     path.write_bytes(bar_result.read_bytes())
     with h5py.File(path, "r+") as file:
-        file["frames/\x1b[31m"] = np.ones(2)  # too short, and left alone
+        # too short for a frame, and left unchanged
+        file["frames/\x1b[31m"] = np.ones(2)
     assert not refusal(lambda: read_all(path))
     with h5py.File(path, "r+") as file:
         file.attrs["format_version"] = "\x1b[31m" + "x" * 5000

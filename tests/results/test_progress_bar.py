@@ -51,9 +51,8 @@ def test_a_log_has_a_line_now_and_then(monkeypatch):
 
 def test_a_resumed_run_counts_its_own_frames_for_the_rate(monkeypatch):
     monkeypatch.setattr(progress_bar, "LINE_EVERY", 0.0)
-    monkeypatch.setattr(
-        "tqdm.std.time", count(0.0, 0.1).__next__
-    )  # so much time passes whenever tqdm asks
+    # time passes whenever tqdm asks for it
+    monkeypatch.setattr("tqdm.std.time", count(0.0, 0.1).__next__)
     lines = shown(monkeypatch, io.StringIO(), range(50, 60)).splitlines()
     assert (
         lines[0].startswith("frame 50/100")
@@ -77,6 +76,7 @@ def test_log_lines_stand_above_the_bar_and_not_in_it(monkeypatch):
     bar.close()
     log.warning("afterwards")
     screen = terminal.getvalue().split("\n")
-    assert screen[0].split("\r")[-1] == "a cell is inside out"  # the bar before it was wiped out
+    # the bar was wiped out before the warning
+    assert screen[0].split("\r")[-1] == "a cell is inside out"
     assert "0/10" in screen[1] and "\r" in screen[1] and screen[-2] == "afterwards"
     assert log.handlers is handlers

@@ -66,7 +66,8 @@ def newest_checkpoint(file: h5py.File) -> tuple[int, np.ndarray, np.ndarray] | N
 
 @pytest.mark.parametrize("ranks", [1, 3])
 def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
-    run_on_ranks(ranks, "all", tmp_path / "out" / "x.h5")  # the folder is made
+    # the run makes the folder
+    run_on_ranks(ranks, "all", tmp_path / "out" / "x.h5")
     assert os.listdir(tmp_path / "out") == ["x.h5"]
     with h5py.File(tmp_path / "out" / "x.h5") as file:
         assert finished(file) == STEPS + 1
@@ -118,7 +119,8 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
     path = tmp_path / "x.h5"
 
     monkeypatch.setattr(writer, "open_to_write", disk.opened)
-    marks = {}  # number of writes made -> (frames, newest checkpoint) that were then finished
+    # number of writes -> (frames, newest checkpoint) that were complete by then
+    marks = {}
     file = ResultFile(path, MPI.COMM_SELF, {})
     file.start_frames(40, NODES, {"surface": POINTS})
     for index in range(12):
@@ -132,7 +134,8 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
         )
     marks[len(disk.log)] = 12, 11
     file.close()
-    assert len(disk.log) > max(marks)  # the trimming wrote
+    # the trimming wrote to the file
+    assert len(disk.log) > max(marks)
 
     for writes, image in disk.images(start=min(marks)):
         count, checkpoint = marks[max(mark for mark in marks if mark <= writes)]
@@ -167,9 +170,8 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
     file.close(trim=False)
     with h5py.File(io.BytesIO(before)) as laid:
         numbers = sorted(places(laid))
-    assert {change for change in disk.log if isinstance(change, int)} <= {
-        len(before)
-    }  # not cut, not stretched
+    # the file was neither cut nor extended
+    assert {change for change in disk.log if isinstance(change, int)} <= {len(before)}
     for offset, data in [change for change in disk.log if not isinstance(change, int)]:
         changed = [at for at, byte in enumerate(data, offset) if byte != before[at]]
         inside = [any(start <= at < end for start, end in numbers) for at in changed]
@@ -203,7 +205,8 @@ class Disk(io.BytesIO):
 
     def __init__(self):
         super().__init__()
-        self.log = []  # (offset, bytes), or a length it was cut or stretched to
+        # (offset, bytes), or the length to which the file was cut or extended
+        self.log = []
 
     def opened(self, _, mode):
         return h5py.File(self, mode, libver="earliest", rdcc_nbytes=0)
@@ -267,7 +270,8 @@ def test_replaced_only_when_told_and_only_by_a_new_one(tmp_path):
     with pytest.raises(InputError, match=r"x\.h5 exists: --overwrite replaces it"):
         ResultFile(path, MPI.COMM_SELF, {})
     with ResultFile(path, MPI.COMM_SELF, {}, Begin.OVERWRITE):
-        pass  # never came to its first frame
+        # the run ended before its first frame
+        pass
     with open_result(path) as file:
         assert finished(file) == 3
     with ResultFile(path, MPI.COMM_SELF, {}, Begin.OVERWRITE) as file:
@@ -283,9 +287,8 @@ def test_refused_on_all_ranks_together(tmp_path):
     assert (
         run_on_ranks(2, "refuse", path) == f"refused: {path} exists: --overwrite replaces it\n" * 2
     )
-    assert (
-        run_on_ranks(2, "refuse", path / "y.h5").count("cannot be written: ") == 2
-    )  # a folder that is a file
+    # the folder is a file
+    assert run_on_ranks(2, "refuse", path / "y.h5").count("cannot be written: ") == 2
 
 
 @pytest.mark.parametrize("action", ["full", "full for one"])
@@ -296,9 +299,8 @@ def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path, 
         == f"refused: {path} cannot be written: No space left on device\n" * 3
     )
     with open_result(path) as file:
-        assert (
-            finished(file) == 2 and len(file["frames/position"]) == STEPS + 1
-        )  # left as it was: room to go on
+        # the file is unchanged, so that a run can continue
+        assert finished(file) == 2 and len(file["frames/position"]) == STEPS + 1
         assert_holds(file, 2, None)
 
 

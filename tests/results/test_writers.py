@@ -165,7 +165,8 @@ def test_a_disk_that_fills_up(sources: Path, tmp_path: Path, name: str):
         assert re.search("File too large|cannot be written", text) and str(full.parent) in text
         left, made = contents(full.parent), contents(whole.parent)
         assert left.get(name) == before.get(name)
-        for other in left.keys() - {name}:  # written before it, and whole
+        # files written earlier are complete
+        for other in left.keys() - {name}:
             assert left[other] == before.get(other, made[other]), other
     writer.write(full)
     assert full.stat().st_size > 0

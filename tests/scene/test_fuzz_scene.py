@@ -60,7 +60,8 @@ def test_a_scene_names_no_file_outside_its_folder(folder, name):
     path = naming(folder, name)
     said = refusal(lambda: load_scene(path))
     assert "mesh.source" in said and "--set mesh.source=PATH allows it" in said
-    assert load_scene(path, [f"mesh.source={name}"]).mesh.source == name  # the user's own word
+    # the user's own name stays
+    assert load_scene(path, [f"mesh.source={name}"]).mesh.source == name
     assert refusal(lambda: load_scene(path, [f"mesh.source={name}"], by_user=False))
 
 
@@ -104,7 +105,8 @@ STUDY = '[[scene]]\nname = "a"\nfile = "scene.toml"\nset = ["{}"]\n[[sweep]]\nop
 def test_a_study_chooses_solvers_and_no_more(folder, options):
     (folder / "study.toml").write_text(STUDY.format("time.step=0.01", options))
     if options == "evil.py":
-        load_study(folder / "study.toml")  # a value of no option: nothing PETSc would load
+        # the value belongs to no option, so PETSc would not load it
+        load_study(folder / "study.toml")
     else:
         assert "only solver options" in refusal(lambda: load_study(folder / "study.toml"))
 
@@ -119,9 +121,11 @@ def test_a_study_names_no_mesh_outside(folder):
 
 def test_the_own_scenes_and_studies_name_what_they_may():
     for path in (ROOT / "scenes").rglob("*.toml"):
-        if path.name == "cases.toml":  # the table of scripts/yardstick.py
+        # this file is the table of scripts/yardstick.py
+        if path.name == "cases.toml":
             continue
-        if "[material]" in path.read_text():  # which a study has not
+        # a study has no materials
+        if "[material]" in path.read_text():
             load_scene(path)
         else:
             load_study(path)

@@ -55,7 +55,8 @@ def test_a_table_or_a_key_is_chosen_by_its_name_and_a_number_does_not_matter():
 def test_the_json_schema_takes_every_shipped_scene_and_no_mistake(name: str):
     schema, scene = json_schema(), tomllib.loads(shipped_text(name))
     valid = Draft202012Validator(schema).is_valid
-    assert "null" not in str(schema) and "None" not in str(schema)  # which TOML has not
+    # TOML has no null
+    assert "null" not in str(schema) and "None" not in str(schema)
     assert valid(scene)
     assert not valid(scene | {"obstacles": []})
     assert not valid(scene | {"material": {"density": 1000.0}})

@@ -136,7 +136,8 @@ def test_every_key_is_described_with_its_unit():
 # --- one mistake, one line
 
 SPHERE = "{ sphere = { center = [0, 0, 1], radius = 0.5 } }"
-MISTAKES = [  # what is changed, into what, the key that is named, and its line
+# old text, new text, key of the message, and its line
+MISTAKES = [
     ("count = 9946", "count = -3", "cages.count", 9),
     ("count = 9946", "count = 1e4", "cages.count", 9),
     ("count = 9946", "cout = 9946", "cages.cout", 9),
@@ -398,7 +399,8 @@ def test_a_swirl_whose_table_is_no_function_is_refused(tmp_path: Path, table: st
 
 
 TABLES = [name for name, field in SceneFile.model_fields.items() if field.annotation is not str]
-PLACES = [  # of tables and vectors within tables
+# tables and vectors within tables
+PLACES = [
     "gravity.acceleration", "start.velocity", "start.spin", "start.scale", "start.twist",
     "start.gradient", "start.swirl", "pin.0.region",
     "anchor.0.path", "force.0.total", "obstacle.0.path", "output.probe",

@@ -14,12 +14,14 @@ from conftest import AS_ROOT, ROOT
 SCRIPTS = sorted(
     path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem not in ("clone", "lab")
 )
+# no environment is activated
 HOME = {
     "PATH": "/usr/local/bin:/usr/bin:/bin",
     "HOME": "/nonexistent",
     **AS_ROOT,
-}  # nothing is activated
-SYSTEM_PYTHON = sys._base_executable  # what the clone's .venv was made with
+}
+# the Python that made the clone's .venv
+SYSTEM_PYTHON = sys._base_executable
 
 
 @pytest.mark.skipif(not (ROOT / ".venv").exists(), reason="the clone has no .venv")
@@ -45,7 +47,8 @@ def test_a_clone_that_is_not_set_up_says_so(tmp_path: Path):
     for name in ("clone.py", "lab.py"):
         (scripts / name).write_text((ROOT / "scripts" / name).read_text())
     code = "import sys; sys.path.insert(0, sys.argv[1]); import lab"
-    command = [SYSTEM_PYTHON, "-S", "-c", code, scripts]  # -S: without site-packages
+    # -S: without site-packages
+    command = [SYSTEM_PYTHON, "-S", "-c", code, scripts]
     done = subprocess.run(command, env=HOME, capture_output=True, text=True)
     assert done.returncode == 1 and "run scripts/setup first" in done.stderr, done.stderr
 
@@ -98,10 +101,12 @@ def test_pip_is_silent_and_not_asked_twice(clone: Path):
     again = set_up(clone)
     assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
     assert (clone / "pip.log").read_text() == asked
-    assert set_up(clone, "test").stdout == "setting up .venv\n"  # more is wanted
+    # the extra test needs more packages
+    assert set_up(clone, "test").stdout == "setting up .venv\n"
     (clone / "bin" / "python").rename(clone / "bin" / "python3.99")
     (clone / "bin" / "python").symlink_to("python3.99")
-    assert set_up(clone).stdout == "setting up .venv\n"  # it is another Python
+    # the interpreter is another Python
+    assert set_up(clone).stdout == "setting up .venv\n"
     assert set_up(clone).stdout == ""
 
 
@@ -192,6 +197,5 @@ def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
     (prefix / "env").write_text("export PETSC_DIR=there\n")
     done = build(bare, prefix, "--", "--with-x=1")
     assert (done.returncode, done.stdout) == (0, "export PETSC_DIR=there\n"), done
-    assert (
-        build(bare, prefix, "--", "--with-x=2").returncode == 2
-    )  # another build: goes on to look for compilers
+    # another build of PETSc, so that the compilers are searched next
+    assert build(bare, prefix, "--", "--with-x=2").returncode == 2

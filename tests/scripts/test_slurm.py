@@ -17,7 +17,8 @@ STAND_INS = {
     "srun": """while [[ $1 == --* ]]; do shift; done
         exec mpirun --oversubscribe -n 2 "$@" """,
     "scontrol": 'echo "$@" >> requeued',
-    # keeps the contract of msmpetsc run and msmpetsc study: what a signal does, what --resume says
+    # keeps the contract of msmpetsc run and msmpetsc study: what a signal does, what
+    # --resume says
     "msmpetsc": """echo "$@ threads=$OMP_NUM_THREADS" >> "told-$$"
         trap 'touch "$4"; exit 0' USR1
         trap 'exit 130' TERM
@@ -121,7 +122,8 @@ def test_a_run_out_of_time_is_queued_again_and_goes_on(script: Path, tmp_path: P
     assert job.requeued == ["requeue 77"] and (tmp_path / result).exists()
     assert job.status() == 0
     assert job.told() == [f"run --resume {result}{petsc} threads=1"] * 2
-    assert job.requeued == ["requeue 77"]  # not again
+    # the job is not requeued again
+    assert job.requeued == ["requeue 77"]
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)

@@ -111,7 +111,8 @@ def test_the_estimate_of_a_bar_two_cells_across_that_is_let_go(tmp_path: Path, s
     assert 0.5 < ratio < 2
 
 
-LANDING = {  # it falls by 5 mm, lands at 0.5 m/s, and slides under a force that comes and goes
+# bodies that fall by 5 mm, land at 0.5 m/s and slide under a varying force
+LANDING = {
     "mesh": {"source": "scene.ply", "base": [0, 0, 0.005]},
     "start": {"velocity": [0.3, 0.0, -0.5]},
     "gravity": GRAVITY,
@@ -160,7 +161,8 @@ def test_a_fall_is_a_few_long_steps_and_an_impact_many_short_ones(tmp_path: Path
     steps = np.array([frame.steps for frame in frames])
     assert steps[:9].max() <= 1 and steps[9:].max() >= 4
     fallen = 0.5 * 9.81 * frames[8].time ** 2
-    assert frames[8].position[:, 2].min() == pytest.approx(-fallen, rel=1e-6)  # BDF2 is exact there
+    # BDF2 is exact in free fall
+    assert frames[8].position[:, 2].min() == pytest.approx(-fallen, rel=1e-6)
     assert frames[-1].momentum[2] > 0
 
 
@@ -177,13 +179,15 @@ def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float)
     last = next(frame for frame in frames if frame.time == pytest.approx(stop))
     tip = model.lattice.nodes[:, 0] > 0.99
     assert last.position[tip, 2] - model.lattice.nodes[tip, 2] == pytest.approx(0.02, rel=1e-8)
-    assert (frames[-1].position[tip, 2] - model.lattice.nodes[tip, 2]).min() > 0.0201  # flung on
+    # the tip moves on after its release
+    assert (frames[-1].position[tip, 2] - model.lattice.nodes[tip, 2]).min() > 0.0201
 
 
 def test_a_failed_step_is_taken_again_shorter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     Failing(monkeypatch, {6, 7})
     _, frames = play(beam(tmp_path, error=0.1, duration=0.4))
-    assert sum(frame.substeps for frame in frames) == 0  # nothing was left for [safety] to do
+    # no step needed the recovery of [safety]
+    assert sum(frame.substeps for frame in frames) == 0
     assert len(frames) == 41
 
 

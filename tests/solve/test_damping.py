@@ -9,7 +9,8 @@ from block_scene import block_scene, play
 
 from msmpetsc.errors import InputError
 
-ALPHA, STEP = 3.0, 1 / 64  # [1/s], [s]
+# damping rate [1/s] and time step [s]
+ALPHA, STEP = 3.0, 1 / 64
 FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}
 SPEED = [0.5, 0.0, -1.0]
 
@@ -60,16 +61,17 @@ def test_a_swing_loses_its_energy_as_the_exponential(tmp_path: Path, integrator:
         _, frames = play(damped(tmp_path, integrator, 120, alpha=alpha, step=1 / 400, **swing))
         return np.array([frame.kinetic + frame.elastic for frame in frames])
 
-    ratio = (
-        energy(ALPHA)[60:] / energy(0.0)[60:]
-    )  # over several swings: kinetic energy alone is lost, half of the time
+    # several oscillations: only kinetic energy is damped, which is half of the energy
+    # in the mean
+    ratio = energy(ALPHA)[60:] / energy(0.0)[60:]
     expected = np.exp(-ALPHA * np.arange(60, 121) / 400)
     assert np.abs(ratio / expected - 1).max() < 0.1
     assert "nowhere" not in caplog.text
 
 
 SOLID = {"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"}
-RETARDATION = 0.1  # [s]
+# retardation time [s]
+RETARDATION = 0.1
 
 
 def viscous(
@@ -116,9 +118,8 @@ def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
         return model.lattice.mass @ np.cross(x, v)[:, 2]
 
     assert angular(len(frames) - 1) == pytest.approx(angular(2), rel=5e-3)
-    assert (
-        np.diff([frame.elastic for frame in frames[2:]]) > 0
-    ).all()  # it creeps, without a swing
+    # the body creeps without oscillation
+    assert (np.diff([frame.elastic for frame in frames[2:]]) > 0).all()
 
 
 @pytest.mark.parametrize("integrator", ["verlet", "static"])

@@ -16,7 +16,8 @@ SWINGS = {
     "time": {"step": 1 / 60, "duration": FRAMES / 60},
     "solver": {"preset": "newton", "error": 1e-6},
 }
-LINE = re.compile(r"^(\S.*?) +(\d+) \S+ (\S+) ")  # name, count, seconds
+# name, count and seconds of an event
+LINE = re.compile(r"^(\S.*?) +(\d+) \S+ (\S+) ")
 
 
 def logged(text: str) -> dict[str, dict[str, tuple[int, float]]]:
@@ -46,11 +47,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, dict, dict]:
         "mg",
         "-log_view",
     )
+    # these solves have no error estimate, so the error is estimated afterwards
     words = (
         *words,
         "-ksp_norm_type",
         "preconditioned",
-    )  # whose solves say nothing of their error: it is estimated
+    )
     done = on_ranks(
         1, "-m", "msmpetsc.cli.main", "run", block_scene(folder, **SWINGS), *words, status=0
     )

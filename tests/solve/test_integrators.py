@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from block_scene import block_scene, play
 
-DURATION = 0.03  # [s]: about a period
+# duration of about a period [s]
+DURATION = 0.03
+# released far from equilibrium
 SWING = {
     "start": {"scale": [1.2, 1.0, 0.9]},
     "output": {"surface": False, "every": 1000},
-}  # let go, far from at rest
+}
 
 
 def bar(folder: Path, **tables) -> Path:
@@ -78,12 +80,14 @@ def energy_left(integrator: str, wt: float, steps: int) -> float:
     """Of x'' = -w^2 x from x = 1, x' = 0, by the scheme itself on z = x + i x' / w, whose rate is
     -i w z; BDF2 with the history that an implicit Euler step of two thirds makes up
     (solve.integrators.implicit.Bdf2)."""
-    matrix = wt * np.array([[0, 1], [-1, 0]])  # t d/dt of (x, x' / w)
+    # matrix of t d/dt for (x, x' / w)
+    matrix = wt * np.array([[0, 1], [-1, 0]])
     one = np.array([1.0, 0.0])
     if integrator == "implicit-euler":
         return float((1 + wt**2) ** -steps)
     begun = np.linalg.solve(np.eye(2) - 2 / 3 * matrix, one)
-    a = -wt * begun[0]  # t x'' / w at the end of that step
+    # t x'' / w at the end of that step
+    a = -wt * begun[0]
     before, now = np.array([one[0] - wt * one[1] + wt * a / 2, one[1] - a]), one
     for _ in range(steps):
         before, now = now, np.linalg.solve(np.eye(2) - 2 / 3 * matrix, (4 * now - before) / 3)

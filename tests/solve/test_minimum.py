@@ -58,10 +58,11 @@ def write_case(folder: Path, name: str, **solver) -> Path:
     trimesh.creation.box(case.pop("sides")).export(folder / "body.ply")
     scene = {
         "mesh": {"source": "body.ply"},
+        # the scene in which the saddles were found
         "cages": {
             "count": case.pop("cells"),
             "boundary": "whole",
-        },  # as where the saddles were found
+        },
         "material": {"young_modulus": case.pop("young"), "density": 1000.0, "law": "linear"},
         "time": {"step": (step := case.pop("step")), "duration": case.pop("frames") * step},
         "solver": {"error": 1e-3} | solver,
@@ -144,7 +145,8 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     assert found >= lowest - 1e-9 and (found < 0) == (lowest < 0)
     if lowest > 0:
         assert found < lowest + 0.1
-    known = curvature.compression(q).least_curvature  # 0 for none
+    # 0 if no curvature was computed
+    known = curvature.compression(q).least_curvature
     assert known == 0 or lowest >= known - 1e-9
     simulation.destroy()
 
@@ -285,7 +287,8 @@ def test_a_mode_that_stiffens_hides_no_lower_one():
     before (1.57, when the lowest was 0.29): on the way to its solution the Hessian had negative
     curvatures."""
     said = shares_said(28, 11, 'solver.preset="newton-projected"')
-    assert len(said) == 3 and min(said) > 0.85  # 0.98 with PETSc 3.18, 0.896 with 3.22
+    # 0.98 with PETSc 3.18, 0.896 with 3.22
+    assert len(said) == 3 and min(said) > 0.85
 
 
 def test_a_preconditioner_far_from_the_hessian_bounds_no_error(tmp_path: Path):

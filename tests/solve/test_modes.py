@@ -27,7 +27,8 @@ from msmpetsc.view.drawable import drawable_of_result
 
 COMM = MPI.COMM_SELF
 YOUNG, DENSITY = 1e6, 1000.0
-SPEED = np.sqrt(YOUNG / DENSITY)  # [m/s] of longitudinal waves in a bar
+# speed of longitudinal waves in a bar [m/s]
+SPEED = np.sqrt(YOUNG / DENSITY)
 CLAMP = [{"region": {"half_space": {"point": [0.001, 0, 0], "normal": [-1, 0, 0]}}}]
 ENDS = [*CLAMP, {"region": {"half_space": {"point": [0.999, 0, 0], "normal": [1, 0, 0]}}}]
 ONCE = {"step": 0.01, "duration": 0.01}

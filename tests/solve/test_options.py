@@ -24,7 +24,8 @@ from msmpetsc.solve.refused_options import refuse_early, refuse_unused
 
 T = 1 / 60
 COMM = MPI.COMM_SELF
-SCENE = {  # that moves
+# a scene in motion
+SCENE = {
     "time": {"step": 0.01, "duration": 0.02},
     "gravity": {"acceleration": [0, 0, -9.81]},
     "pin": [{"region": {"box": [[-1, -1, 0.9], [2, 2, 2]], "relative": True}}],
@@ -76,9 +77,8 @@ def test_a_misspelt_option_is_told_with_the_nearest(petsc_options, name: str):
         refuse_unused(COMM, at_end=True)
 
 
-LINES = dict.fromkeys(
-    ("-ksp_type cg", "", '-log_view "a b"', "-shift -0.5", "alias -a -b"), True
-)  # PETSc can read it
+# PETSc can read the value
+LINES = dict.fromkeys(("-ksp_type cg", "", '-log_view "a b"', "-shift -0.5", "alias -a -b"), True)
 LINES |= dict.fromkeys(
     ("ksp_type cg", "-ksp_type cg -pc_type none", "-ksp_type cg jacobi", "-fp_trap"), False
 )

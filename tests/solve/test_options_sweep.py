@@ -24,7 +24,8 @@ from msmpetsc.solve.petsc.initialise import finalise, start_for_runs
 PINNED = [{"region": {"box": [[-1, -1, 0.9], [2, 2, 2]], "relative": True}}]
 FLOOR = [{"shape": "plane", "point": [0, 0, -0.001], "normal": [0, 0, 1], "response": "penalty"}]
 MOVES = {"time": {"step": 0.01, "duration": 0.01}, "gravity": GRAVITY}
-SCENES = {  # tables, and options that make the objects
+# tables of scenes, and options that make the objects
+SCENES = {
     "multigrid": (
         MOVES | {"pin": PINNED, "solver": {"preset": "newton-multigrid", "error": 1e-6}},
         [],
@@ -35,13 +36,13 @@ SCENES = {  # tables, and options that make the objects
     ),
     "anderson": (MOVES | {"pin": PINNED, "solver": {"preset": "anderson", "error": 1e-4}}, []),
 }
-OF_OBJECTS = re.compile(
-    r"(?!\w*(plot|_lg))\w*?(snes|ksp|pc|mat|mg|sub|npc)_"
-)  # there may be no display
+# the machine may have no display
+OF_OBJECTS = re.compile(r"(?!\w*(plot|_lg))\w*?(snes|ksp|pc|mat|mg|sub|npc)_")
 VIEWER = re.compile(r" (ascii|binary|draw|socket|saws)\[?:")
 CHOICES = re.compile(r"\((?:choose )?one of\)?(.*?)\(\w*\)?$")
 NOT_WORDS = ["abc", "0", "-1", "nan"]
-SECONDS = 60  # of a core: a case takes a fifth of one
+# limit of CPU time [s]; a case takes a fifth of a second
+SECONDS = 60
 SIGNALS = (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS, signal.SIGILL)
 
 
@@ -67,9 +68,8 @@ def attempt(folder: Path, words: list[str]) -> tuple[int | None, str]:
         status = 1
         try:
             resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-            for (
-                number
-            ) in SIGNALS:  # PETSc's handlers would wait for an MPI that this process does not have
+            # PETSc's handlers would wait for MPI, which this process has not started
+            for number in SIGNALS:
                 signal.signal(number, signal.SIG_DFL)
             said = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):

@@ -30,7 +30,8 @@ CASES = {
     for case in of.get("case", ())
     if case["file"].startswith("hard/")
 }
-SOLID = ", solid"  # a case with it in its name is of a neo-Hookean solid, not of springs
+# part of the names of cases with a neo-Hookean solid in place of springs
+SOLID = ", solid"
 SOLIDS = [
     name + SOLID
     for name in (
@@ -102,7 +103,8 @@ def play(name: str, *changes: str) -> Played:
 
 # ---- newton, the default, survives them all
 
-LONG = {"stiff half, twisted", "pressed flat, solid"}  # ten seconds
+# each case takes ten seconds
+LONG = {"stiff half, twisted", "pressed flat, solid"}
 
 
 @pytest.mark.parametrize(
@@ -188,7 +190,8 @@ def test_a_column_bows_aside(name: str):
     played = play(name)
     middle = np.abs(played.lattice.nodes[:, 0] - 0.5) < 0.01
     assert 0.15 < np.linalg.norm(played.moved[middle].mean(axis=0)[1:]) < 0.41
-    # Springs fold into a hinge. Corners of a solid's cells may, their mean strain does not.
+    # Springs fold into a hinge. Corners of a solid's cells may, their mean strain does
+    # not.
     assert (played.last.inverted == 0) == name.endswith(SOLID)
 
 
@@ -268,9 +271,8 @@ def test_lengths_and_times_a_million_times_as_long_or_short_are_the_same_motion(
         [(f.position - f.position.mean(axis=0)) / p.size for f in p.frames] for p in same
     ]
     for other in others:
-        assert (
-            max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 2e-2
-        )  # ten steps, of 1e-3 each
+        # ten steps with errors of 1e-3 each
+        assert max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 2e-2
 
 
 # ---- other methods
@@ -286,7 +288,8 @@ COMES_BACK = [
     ("fast-msm", "flat, solid"),
     ("fast-msm", "one cell, free"),
 ]  # fmt: skip
-NOT_FINITE = REASON[-4]  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
+# DIVERGED_FNORM_NAN, which PETSc 3.25 renames
+NOT_FINITE = REASON[-4]
 DIVERGES = [
     # A is no less than the Hessian of springs, but far from it where all are pressed:
     # steps are small, or too long
@@ -332,11 +335,13 @@ def test_what_anderson_cannot_do_is_rescued(how: str, changes: list[str]):
     name, anderson = "mirrored, solid", [*OTHERS["anderson"], *changes]
     assert "DIVERGED" in play(name, *anderson).words
     played = play(name, *anderson, f"safety.on_failure={how}")
-    # It still swings, by 2e-7 to 1.2e-3 with different roundings; a folded body is 0.1 off
+    # It still swings, by 2e-7 to 1.2e-3 with different roundings; a folded body is 0.1
+    # off
     assert not played.words and played.shape_error() < 5e-3
     assert played.inverted(played.last) == 0
     rescued = [getattr(frame, f"{how}s") for frame in played.frames]
-    assert max(rescued) > rescued[-1]  # less and less
+    # later steps need fewer rescues
+    assert max(rescued) > rescued[-1]
 
 
 def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):
@@ -363,9 +368,8 @@ def test_surfaces_that_meet_do_not_cross(name: str):
     assert len(frames) == 1 + scene.time.steps and np.isfinite(frames[-1].position).all()
     assert max(frame.self_contacts for frame in frames) > 5
     assert sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames) == 0
-    if name.startswith(
-        "tips"
-    ):  # nothing acts on them from outside: it stays what it was, none, to the steps' error
+    # the momentum stays zero up to the steps' error, because no external force acts
+    if name.startswith("tips"):
         speed = scene.body[0].start.velocity[2]
         assert (
             np.abs(frames[-1].momentum).max()

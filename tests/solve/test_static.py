@@ -18,19 +18,20 @@ from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.recovery import Halving
 
-COLUMN = np.array([0.25, 0.25, 2.0])  # [m]: 2 x 2 x 16 cells
+# sides [m]: 2 x 2 x 16 cells
+COLUMN = np.array([0.25, 0.25, 2.0])
 TOP = {"box": [[-9, -9, 1.99], [9, 9, 9]]}
 BOTTOM = {"box": [[-9, -9, -9], [9, 9, 0.01]]}
 STATE = {"step": 1.0, "duration": 1.0, "integrator": "static"}
 TIGHT = {"preset": "newton", "error": 1e-8}
 BEAM = {"pin": [{"region": BOTTOM}], "gravity": {"acceleration": [0.0, 1.0, -0.5]}}
-SWITCHED = [  # to one side, to the other, gone
+# force to one side, to the other side, and none
+SWITCHED = [
     {"region": TOP, "total": [1.0, 0.0, 0.0], "stop": 3.0},
     {"region": TOP, "total": [-1.0, 0.0, 0.0], "start": 3.0, "stop": 5.0},
 ]
-EULER = (
-    np.pi**2 / 4 * YOUNG * COLUMN[0] ** 4 / 12 / COLUMN[2] ** 2
-)  # [N] that a clamped column buckles at
+# buckling load of a clamped column [N]
+EULER = np.pi**2 / 4 * YOUNG * COLUMN[0] ** 4 / 12 / COLUMN[2] ** 2
 
 
 def column(folder: Path, time: dict = STATE, **tables) -> Path:
@@ -100,7 +101,8 @@ def test_an_obstacle_presses(tmp_path: Path):
     model, frames = play(column(tmp_path, anchor=guide, obstacle=[plane]))
     bottom = model.lattice.nodes[:, 2] < 0.01
     depth = 0.01 - frames[-1].position[bottom, 2]
-    along = YOUNG * COLUMN[0] ** 2 / COLUMN[2]  # [N/m]
+    # axial stiffness [N/m]
+    along = YOUNG * COLUMN[0] ** 2 / COLUMN[2]
     assert (depth > 0).all()
     assert 1e3 * depth.sum() == pytest.approx(along * (0.01 - depth.mean()), rel=0.03)
 

@@ -133,12 +133,15 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
 @pytest.mark.parametrize(
     ("preset", "options"),
     [
+        # this method takes no initial guess for its solves
         (
             "newton",
             {"ksp_type": "preonly", "pc_type": "cholesky"},
-        ),  # which takes no start for its solves
-        ("newton", {"ksp_type": "chebyshev"}),  # which tries the Hessian when it is set up
-        ("anderson", {"snes_type": "newtonls"}),  # which solves without an NPC
+        ),
+        # Chebyshev's method applies the Hessian when it is set up
+        ("newton", {"ksp_type": "chebyshev"}),
+        # Newton's loop solves without a nonlinear preconditioner
+        ("anderson", {"snes_type": "newtonls"}),
         ("anderson", {"snes_type": "newtontr"}),
     ],
 )

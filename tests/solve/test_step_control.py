@@ -68,9 +68,8 @@ def test_a_step_too_far_off_is_taken_again_shorter_but_for_the_shortest():
 def test_steps_start_at_multiples_of_themselves_and_end_at_events_and_at_the_end():
     ticks = Ticks(STEP, 10, -4, [0.03, 0.0556, 7.0])
     assert ticks.length(0) == 16 and ticks.time(3 * 16) == pytest.approx(0.03)
-    assert (
-        ticks.fitting(0, 6) == 1
-    )  # two steps, then half of the next two would be beyond the event
+    # two steps fit, but half of the next two would pass the event
+    assert ticks.fitting(0, 6) == 1
     assert ticks.fitting(2 * 16, 1) == 0
     assert ticks.fitting(3 * 16 + 1, 6) == -4
     assert 3 * 16 in ticks.events and 3 * 16 + 1 not in ticks.events

@@ -123,14 +123,16 @@ def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_p
         return away[-1], away.max()
 
     _, explicit = swing(tmp_path, T, 4.0, VERLET)
-    _, fine = swing(tmp_path, T, 4.0, VERLET, "time.substep=1e-3")  # of 8.3e-3: 1/70 of the square
+    # substeps of 1e-3 instead of 8.3e-3 have 1/70 of the square
+    _, fine = swing(tmp_path, T, 4.0, VERLET, "time.substep=1e-3")
     _, implicit = swing(tmp_path, T, 0.5)
     assert lost(implicit)[0] > 0.2
     # at the limit, which the springs that the clamp cuts set, 6%; of 70 times shorter
     # squares the 40th part or less
     assert lost(explicit)[1] < 0.07 and lost(fine)[1] < 0.07 / 40
     late = [f.kinetic for f in explicit if f.time > 3]
-    assert max(late) > 0.5 * max(f.kinetic for f in explicit)  # still swinging
+    # the oscillation continues
+    assert max(late) > 0.5 * max(f.kinetic for f in explicit)
 
 
 # ---- the stability limit
@@ -226,9 +228,8 @@ def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp
         place = model.lattice.nodes[prescribed] + [0, 0, 0.5 * frame.time]
         np.testing.assert_allclose(frame.position[prescribed], place, atol=1e-14)
     np.testing.assert_allclose(frames[-1].momentum, frames[7].momentum, atol=1e-10)
-    assert frames[-1].momentum[2] == pytest.approx(
-        0.5 * model.lattice.mass.sum(), rel=0.2
-    )  # the rest sways
+    # the rest of the body oscillates
+    assert frames[-1].momentum[2] == pytest.approx(0.5 * model.lattice.mass.sum(), rel=0.2)
 
 
 @pytest.mark.parametrize("stop", [6.0, 6.5])
@@ -248,7 +249,8 @@ def test_the_work_of_an_anchor_that_lets_go_is_no_energy_from_nowhere(tmp_path: 
     assert max(frame.energy_gained for frame in frames) < 3e-3 * frames[6].kinetic
 
 
-TILT = 0.3  # [rad] of the slope
+# angle of the slope [rad]
+TILT = 0.3
 
 
 def on_a_slope(folder: Path, friction: float, **time) -> Path:

@@ -76,9 +76,11 @@ def test_a_sweep_is_a_product(tmp_path: Path):
         + "\n".join(f"{name} = {json.dumps(values)}" for name, values in lists.items())
     )
     found = all_cases(tmp_path, text)
-    assert len(found) == 2 * 2 * 2 * 2 * (2 + 1) * 2  # an error or a budget, not both
+    # a case has an error or a budget, not both
+    assert len(found) == 2 * 2 * 2 * 2 * (2 + 1) * 2
     assert len({one.id for one in found}) == len(found)
-    assert len({one.label for one in found}) == 2 * 2 * 2  # of preset, options and ranks
+    # presets times options times ranks
+    assert len({one.label for one in found}) == 2 * 2 * 2
     last = shown_command(found[-1])
     assert last.startswith("mpiexec -n 2 msmpetsc run ")
     assert last.endswith("-pc_type icc")

@@ -91,7 +91,8 @@ def text(study: Path) -> str:
 
 # The Pareto front
 
-COSTS = st.integers(0, 6).map(float)  # few values, so that ties are common
+# few values, so that ties are common
+COSTS = st.integers(0, 6).map(float)
 
 
 @given(st.lists(st.tuples(COSTS, COSTS), max_size=12))
@@ -355,9 +356,8 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
     )
     text = write_report(write_rows(tmp_path, rows)).read_text()
     assert "Surface error over cost: heart" in text and (tmp_path / "size_heart.png").is_file()
-    assert (
-        len([title for title in tooltips(text) if "surface error " in title]) == 2 * 6
-    )  # over cost, over cells
+    # a chart over cost and a chart over cells
+    assert len([title for title in tooltips(text) if "surface error " in title]) == 2 * 6
     assert (
         "10%: whole 2,000" in text
         and "fill 418" in text
@@ -386,7 +386,8 @@ def profiled() -> list[dict[str, str]]:
             failed = {"status": "timeout", "cells": ""} if time is None else {}
             given = {"error": 1e-3, "cells": 1000 * (n + 1), "time_frame": time or ""} | failed
             rows.append(row_of(label, **given))
-    # the last problem is solved by a third method's budget alone, which is no comparison
+    # the last problem is solved by a third method's budget alone, which is no
+    # comparison
     return [*rows, row_of("newton", max_iterations=1, time_frame=1e-9, cells=1000)]
 
 

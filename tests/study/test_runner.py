@@ -32,12 +32,14 @@ def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     # run 1 is the reference, 2, 3 and 4 are the repeats
     assert row["status"] == "ok" and row["ranks"] == 2 and row["repeats"] == 3
     assert (row["cells"], row["nodes"], row["frames"], row["steps"]) == (1, 8, 6, 10)
-    assert row["time_setup"] == 3  # 2, 3 and 4
+    # median of 2, 3 and 4
+    assert row["time_setup"] == 3
     assert row["time_frame"] == pytest.approx(0.01 * 3)
     assert row["fps"] == pytest.approx(1 / 0.03) and row["time_second"] == pytest.approx(3)
     assert (row["iterations"], row["ksp_its"]) == (3, 30)
     assert row["trajectory_error"] == pytest.approx(1.01 / 1.001 - 1)
-    assert row["memory"] == 1000 - 4  # of the leanest run
+    # least memory of the three repeats
+    assert row["memory"] == 1000 - 4
     assert row["command"].startswith("mpiexec -n 2 msmpetsc run ")
     left = [
         path.name
@@ -51,7 +53,8 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
     text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = '
     first = carry_out(tmp_path, text + "[0.1, 0.01]")
     assert len(calls(tmp_path)) == 2
-    again = carry_out(tmp_path, text + "[0.2, 0.01]")  # one gone, one new, one kept
+    # one old case is gone, one is new, one is kept
+    again = carry_out(tmp_path, text + "[0.2, 0.01]")
     assert len(calls(tmp_path)) == 3
     assert [row["error"] for row in again] == [0.2, 0.01] and again[1] == first[1]
     carry_out(tmp_path, text + "[0.2, 0.01]", restart=True)
@@ -108,7 +111,8 @@ def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):
         ("ok", ""),
     ]
     assert rows[0]["time_frame"] is None and rows[0]["options"] == "-ksp_fail"
-    assert len(calls(tmp_path)) == 3  # what fails is not repeated
+    # a failed case is not repeated
+    assert len(calls(tmp_path)) == 3
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
@@ -121,7 +125,8 @@ def test_a_case_that_takes_too_long_is_ended_with_all_it_started(tmp_path: Path,
     assert not alive(int((tmp_path / "out" / "child").read_text()))
     carry_out(tmp_path, "timeout = 2\n" + text)
     assert len(calls(tmp_path)) == 1
-    carry_out(tmp_path, "timeout = 3\n" + text)  # more time: another try
+    # a longer timeout causes another attempt
+    carry_out(tmp_path, "timeout = 3\n" + text)
     assert len(calls(tmp_path)) == 2
 
 

@@ -179,9 +179,11 @@ class Bodies:
             cell_error,
             fails,
         )
-        self.most = most  # error of cells, out of step
+        # largest error of the cells [-]
+        self.most = most
         self.slow, self.inverted = slow, inverted
-        self.errors: dict[Path, float] = {}  # by the result
+        # errors by result file
+        self.errors: dict[Path, float] = {}
 
     def result_of(self, case: Case) -> Path:
         return Path(case.id)
@@ -205,7 +207,8 @@ class Bodies:
         steps = (
             1 if case.integrator == "static" else max(0.01 / case.time_step, case.time_step / 0.01)
         )
-        assert steps == pytest.approx(round(steps))  # so that frames come at the same times
+        # whole steps, so that frames come at the same times
+        assert steps == pytest.approx(round(steps))
         if explicit and (not self.explicit or self.slow(case.time_step)):
             return {"status": "timeout", "reason": "took longer than 1 s"}
         (cells,) = (
@@ -256,9 +259,8 @@ def test_the_plan_meets_the_error_and_wastes_little(
     plan, bench, _ = sized(tmp_path, monkeypatch, target, explicit=explicit)
     method, cells = plan.choice.method, plan.choice.cells
     assert plan.met and not plan.bounds and (explicit or method.integrator != "verlet")
-    assert (
-        0.7 * target < bench.error_of(case_of(method), cells) <= 1.01 * target
-    )  # what is measured is off by a little
+    # the plan extrapolates measured errors, which are slightly off
+    assert 0.7 * target < bench.error_of(case_of(method), cells) <= 1.01 * target
     assert plan.choice.budget.total <= target and len(plan.tried) >= 6
 
 
@@ -414,16 +416,20 @@ def test_explicit_trials_that_get_too_slow_are_no_part_of_the_answer(tmp_path: P
     assert plan.met and plan.choice.method.integrator in {"bdf2", "implicit-euler"}
 
 
-BOUNDS = {  # what bounds the error: error asked for, and the bodies
+# by the bound of the error: the target, and properties of the bodies
+BOUNDS = {
+    # at most 8 times the cells are allowed, which leaves 1.8e-2
     "the mesh's cells": (
         1e-2,
         {"cell_error": 4.0},
-    ),  # there may be 8 times the cells at most: 1.8e-2 is left
-    "the step": (0.1, {"impacts": True}),  # shorter steps do not come nearer to each other
+    ),
+    # shorter steps do not converge
+    "the step": (0.1, {"impacts": True}),
+    # the trials differ by 0.4, so the usual order is taken
     "the cells: their distances show no order": (
         0.2,
         {"cell_error": 5.0, "most": 0.45},
-    ),  # 0.4 apart: the usual order
+    ),
 }
 
 
@@ -497,7 +503,8 @@ def test_the_true_error_of_a_plan_is_what_was_asked_for(soft_beam: Path):
     words = ["--surface-error", "0.1", "--cells", "1000", "--frames", "20", "--write"]
     assert main(["plan", str(soft_beam), *words]) == 0
     every = max(1, round(1 / 60 / load_scene(soft_beam).time.step))
-    tried = 20 / 60  # [s]
+    # simulated time of the trials [s]
+    tried = 20 / 60
     fine = [f"time={{step = 0.016666666666666666, duration = {tried}, integrator = 'verlet'}}"]
     error = true_error(
         soft_beam, choice=[f"output.every={every}", f"time.duration={tried}"], finer=fine

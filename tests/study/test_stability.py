@@ -51,7 +51,8 @@ def test_a_map_is_each_method_at_each_place(tmp_path: Path):
         for label in ("newton", "explicit")
     ]
     assert len({one.id for one in found}) == 8
-    long = shown_command(found[2])  # a step longer than the scene
+    # a time step longer than the scene
+    long = shown_command(found[2])
     assert "material.density=10.0" in long and "gravity.acceleration=[0, 0, -10.0]" in long
     assert "step = 5.0, duration = 20.0" in long and 'preset = "newton", error = 0.01' in long
     assert long.endswith("-pc_type icc")

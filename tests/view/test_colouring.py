@@ -33,13 +33,12 @@ def test_displacement_of_a_fall_is_its_height(subject):
 
 def test_speed_is_the_way_over_the_time_around_a_frame(subject):
     values = colouring_of(subject, "speed").values
-    assert values(0) == pytest.approx(
-        np.full(len(subject.rest.points), 0.05 / 0.1), rel=1e-4
-    )  # towards frame 1
-    assert values(2) == pytest.approx(
-        np.full(len(subject.rest.points), 0.35 / 0.2), rel=1e-4
-    )  # 0.45 to 0.1 m
-    assert values(8) == pytest.approx(0.0, abs=1e-5)  # 0.2 m before and after
+    # motion towards frame 1
+    assert values(0) == pytest.approx(np.full(len(subject.rest.points), 0.05 / 0.1), rel=1e-4)
+    # from 0.45 to 0.1 m
+    assert values(2) == pytest.approx(np.full(len(subject.rest.points), 0.35 / 0.2), rel=1e-4)
+    # 0.2 m before and after the frame
+    assert values(8) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_stress_is_von_mises_at_the_nodes_in_a_unit_of_its_size(subject):

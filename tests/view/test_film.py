@@ -18,7 +18,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.view.composition import Style
 from msmpetsc.view.film import playback_of, usual_speed, write_film
 
-TIMES = np.arange(11) / 10  # of the ball's frames [s]
+# times of the ball's frames [s]
+TIMES = np.arange(11) / 10
 
 
 def render(*words: object) -> None:
@@ -49,7 +50,8 @@ def middle_of_body(picture: np.ndarray) -> float:
 
 
 def test_pace_leaves_frames_out_where_they_come_faster_than_pictures():
-    playback = playback_of(np.arange(4001) / 1000)  # four seconds of four thousand frames
+    # four seconds with 4,001 frames
+    playback = playback_of(np.arange(4001) / 1000)
     assert playback.fps == 30 and len(playback.numbers) == 121
     assert playback.numbers[[0, 3, -1]].tolist() == [0, 100, 4000]
 
@@ -78,7 +80,8 @@ def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplo
     with Image.open(tmp_path / "x.gif") as film:
         seconds = sum(picture.info["duration"] for picture in ImageSequence.Iterator(film)) / 1000
     assert 3 <= seconds <= 8 and "5 times slower than real" in caplog.text
-    pictures = np.array(pictures_of(tmp_path / "x.gif"))[:, :-68]  # above the caption
+    # the part above the caption
+    pictures = np.array(pictures_of(tmp_path / "x.gif"))[:, :-68]
     assert pictures.shape[1] > 1.5 * pictures.shape[2]
     body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
     rows = np.flatnonzero(body.any(axis=1))
@@ -88,9 +91,8 @@ def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplo
 def test_slow_motion_shows_all_frames_for_longer(falling_ball, tmp_path):
     slow = playback_of(TIMES, speed=0.1)
     assert slow.fps == pytest.approx(1) and len(slow.numbers) == 11
-    slower = playback_of(
-        TIMES, speed=0.02
-    )  # a picture a second at the least, so five pictures a frame
+    # at least a picture a second, so five pictures a frame
+    slower = playback_of(TIMES, speed=0.02)
     assert len(slower.numbers) == 51 and (abs(np.bincount(slower.numbers)[1:-1] - 5) <= 1).all()
     render(falling_ball, "-o", tmp_path / "x.gif", "--frames", "0:3", "--speed", 0.05)
     with Image.open(tmp_path / "x.gif") as film:
@@ -124,12 +126,15 @@ def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, ca
     assert capsys.readouterr().out.strip() == str(path)
     pictures = pictures_of(path)
     assert len(pictures) == len(HEIGHTS) and pictures[0].shape == (480, 320, 3)
-    whole = np.array(HEIGHTS) >= 0.1  # the underside of the squashed ball is too dark to be blue
+    # the underside of the squashed ball is too dark to be blue
+    whole = np.array(HEIGHTS) >= 0.1
     rows = np.array([middle_of_body(picture) for picture in pictures])[whole]
     centres = np.array(HEIGHTS)[whole]
-    scale = (rows[0] - rows[2]) / (centres[0] - centres[2])  # pixels a metre, downwards
+    # pixels per metre, downwards
+    scale = (rows[0] - rows[2]) / (centres[0] - centres[2])
     assert scale < 0 and rows - rows[0] == pytest.approx(scale * (centres - centres[0]), abs=6)
-    assert [path.name for path in path.parent.iterdir()] == [path.name]  # nothing half done is left
+    # no temporary file is left
+    assert [path.name for path in path.parent.iterdir()] == [path.name]
 
 
 def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
@@ -189,9 +194,8 @@ def test_no_third_of_a_film_is_empty(sides, tmp_path):
     )
     pictures = np.array(pictures_of(tmp_path / "x.gif"))
     body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
-    height = (
-        np.flatnonzero(body.any(axis=1))[-1] + np.flatnonzero(body.any(axis=1))[0]
-    )  # without the caption
+    # the part without the caption
+    height = np.flatnonzero(body.any(axis=1))[-1] + np.flatnonzero(body.any(axis=1))[0]
     for thirds in (
         np.array_split(body[:height], 3, axis=0),
         np.array_split(body[:height], 3, axis=1),

@@ -61,9 +61,8 @@ def test_the_page_holds_every_frame_to_its_levels(tmp_path):
     numbers = restored(stream(data, "positions"), len(HEIGHTS)).reshape(len(HEIGHTS), -1, 3)
     with Result(tmp_path / "x.h5") as run:
         for index, frame in enumerate(numbers):
-            error = abs(
-                low + frame / 65535 * (high - low) - run.frames.position[index]
-            )  # of the nodes, its points
+            # the points of the nodes
+            error = abs(low + frame / 65535 * (high - low) - run.frames.position[index])
             assert (error <= 0.5001 * (high - low) / 65535).all()
         assert (
             stream(data, "triangles").view("<u2").reshape(-1, 3) == run.surface.triangles[:]

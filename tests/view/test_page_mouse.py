@@ -60,7 +60,8 @@ def test_dragging_turns_the_body(browser: Browser):
         before, rel=0.01
     )
     browser.drag(middle, (0, 100))
-    assert browser.value("view.pitch") == pytest.approx(40)  # 0.4 degrees a pixel
+    # 0.4 degrees per pixel
+    assert browser.value("view.pitch") == pytest.approx(40)
 
 
 def test_an_address_is_a_frame_and_a_turn(path: Path, browser: Browser, tmp_path: Path):
@@ -70,7 +71,8 @@ def test_an_address_is_a_frame_and_a_turn(path: Path, browser: Browser, tmp_path
 
 
 def test_the_wheel_comes_nearer_and_goes_away(browser: Browser):
-    browser.value("goTo(2)")  # where the ball is in the middle
+    # the ball is in the middle of the picture
+    browser.value("goTo(2)")
     first = np.ptp(seen(browser), axis=0)
     browser.wheel(browser.middle("#view"), -300)
     browser.until("view.zoom > 1")
@@ -87,9 +89,8 @@ def test_dragging_with_shift_moves_the_body(browser: Browser):
     browser.value("goTo(2)")
     first = seen(browser).mean(axis=0)
     browser.drag(browser.middle("#view"), (60, -40), shift=True)
-    assert seen(browser).mean(axis=0) - first == pytest.approx(
-        [-40, 60], abs=2
-    )  # rows go downwards
+    # rows count downwards
+    assert seen(browser).mean(axis=0) - first == pytest.approx([-40, 60], abs=2)
     assert browser.value("[view.yaw, view.pitch]") == [0, 0]
 
 
@@ -103,7 +104,8 @@ def test_play_plays_and_pauses(browser: Browser):
     frame = browser.value("view.frame")
     after = seen(browser).mean(axis=0)
     assert browser.value("[view.frame, view.playing, play.textContent]") == [frame, False, "▶"]
-    assert after[0] > start[0] + 20  # the ball has fallen: frames 3 to 10 are lower than the first
+    # the ball has fallen, so frames 3 to 10 are lower than the first
+    assert after[0] > start[0] + 20
     browser.key(" ")
     browser.until(f"view.frame !== {frame}")
     assert browser.value("view.playing")
@@ -113,10 +115,12 @@ def test_the_slider_goes_to_a_frame(browser: Browser):
     """Of eleven frames the fourth stands at 3/10 of the slider; there the ball is 0.4 m lower than
     at the start."""
     first = seen(browser)
-    metre = np.ptp(first, axis=0)[0] / 0.2  # pixels, of the ball's 0.2 m
+    # pixels per metre; the ball is 0.2 m wide
+    metre = np.ptp(first, axis=0)[0] / 0.2
     x, y = browser.middle("#slider")
     width = browser.value("slider.getBoundingClientRect().width")
-    browser.click((x + (0.3 - 0.5) * (width - 16), y))  # the thumb is 16 pixels wide
+    # the thumb is 16 pixels wide
+    browser.click((x + (0.3 - 0.5) * (width - 16), y))
     assert browser.value("[view.frame, location.hash.split('&')[0]]") == [3, "#frame=3"]
     assert "0.300 s" in browser.value("byId('time').textContent")
     assert (seen(browser).mean(axis=0) - first.mean(axis=0))[0] == pytest.approx(

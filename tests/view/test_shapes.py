@@ -30,10 +30,11 @@ mesh.source = "statue.ply"
 path = [{ time = 1.0, by = [0, 0, -0.4] }]
 stop = 0.95
 """
+# box to the right of the ball [m]
 LOW, HIGH = (
     np.array([0.15, -0.05, 0.45]),
     np.array([0.25, 0.05, 0.55]),
-)  # to the right of the ball [m]
+)
 
 
 BAR = np.array([[0.15, -0.05, 0.49], [0.25, 0.05, 0.51]])
@@ -86,9 +87,11 @@ def test_a_sheet_has_it_where_it_is_and_none_when_it_is_gone(result: Path):
     np.testing.assert_allclose(middle[0].seen[[0, 7]], np.array([LOW, HIGH]) - [0, 0, 0.2])
     contact_sheet(result, result.with_suffix(".png"), frames=[0, 5, 10])
     picture = np.array(Image.open(result.with_suffix(".png")).convert("RGB")).astype(int)
-    bodies = np.array_split(picture[: picture.shape[0] * 3 // 4], 3, axis=1)  # without the captions
+    # without the captions
+    bodies = np.array_split(picture[: picture.shape[0] * 3 // 4], 3, axis=1)
     wide = [np.ptp(np.nonzero(body.min(axis=2) < 230)[1]) for body in bodies]
-    assert wide[0] == pytest.approx(1.75 * wide[2], rel=0.05)  # 0.35 m, and the ball alone 0.2 m
+    # 0.35 m wide; the ball alone is 0.2 m wide
+    assert wide[0] == pytest.approx(1.75 * wide[2], rel=0.05)
 
 
 @in_browser

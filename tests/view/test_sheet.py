@@ -31,6 +31,7 @@ def test_moments_tell_the_story(falling_ball):
         assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
         assert list(sheet.choose_moments(run, 3)) == [0, 5, 10]
         assert list(sheet.choose_moments(run, 1)) == [0]
+        # the first of the longest gaps is halved
         assert list(sheet.choose_moments(run, 6)) == [
             0,
             1,
@@ -38,7 +39,7 @@ def test_moments_tell_the_story(falling_ball):
             5,
             8,
             10,
-        ]  # the first of the longest gaps is halved
+        ]
         assert list(sheet.choose_moments(run, 99)) == list(range(11))
 
 
@@ -77,9 +78,8 @@ def test_camera_stands_upright_and_at_the_eye(gravity, eye):
     axes = np.array([camera.right, camera.away, camera.up])
     assert axes @ axes.T == pytest.approx(np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
     assert axes @ gravity == pytest.approx([0, 0, -np.linalg.norm(gravity)])
-    assert np.cross(camera.right, camera.upward) == pytest.approx(
-        camera.to_eye
-    )  # the picture is no mirror image
+    # the picture is no mirror image
+    assert np.cross(camera.right, camera.upward) == pytest.approx(camera.to_eye)
     assert camera.upward @ camera.up > -1e-9
     if eye is not None:
         assert camera.to_eye @ eye == pytest.approx(np.linalg.norm(eye))
@@ -115,7 +115,8 @@ def test_held_parts(tmp_path):
 
 
 def test_painted_points_mean_the_corners_of_their_cells():
-    x, y, z = np.mgrid[0:4, 0:2, 0:2].reshape(3, -1)  # three cells in a row along x
+    # three cells in a row along x
+    x, y, z = np.mgrid[0:4, 0:2, 0:2].reshape(3, -1)
     nodes = np.stack([x, y, z], axis=1)
     cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(3)])
     points = np.array([(0.9, 0.1, 0.1), (2.9, 0.9, 0.9), (1.1, 0.1, 0.9)])
@@ -149,7 +150,8 @@ def test_an_arrow_for_each_force_while_it_acts(stills):
     for still in (first, last):
         ((tail, tip),) = still.overlays.arrows
         assert tail == pytest.approx(pulled + np.array([0, 0, HEIGHTS[still.index]]), abs=1e-6)
-        assert tip - tail == pytest.approx([0, 0, -0.2 * 0.2])  # a fifth of the ball
+        # a fifth of the ball's size
+        assert tip - tail == pytest.approx([0, 0, -0.2 * 0.2])
 
 
 PLATE = """
@@ -175,10 +177,10 @@ def plane(height: float, normal: str) -> str:
 
 def test_what_would_hide_the_body_is_glass(stills):
     above = stills(plane(0.7, "[0, 0, -1]"), frames=[0])[0].overlays
-    assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(
-        np.full(4, 0.7)
-    )  # its face
-    assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
+    # the face of the plate
+    assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))
+    # a plate lies behind the plane
+    assert (above.glass[0][4:, 2] > 0.7).all()
     ground = plane(0.4, "[0, 0, 1]")
     below = stills(ground, frames=[0])[0].overlays
     assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
@@ -186,13 +188,11 @@ def test_what_would_hide_the_body_is_glass(stills):
     assert turned.grounds[0].corners == pytest.approx(below.grounds[0].corners), (
         "it is of the scene, not of the view"
     )
-    assert np.ptp(below.grounds[0].corners, axis=0)[:2] == pytest.approx(
-        [0.64, 0.64]
-    )  # of a ball of 0.2 m
+    # relative to a ball of 0.2 m
+    assert np.ptp(below.grounds[0].corners, axis=0)[:2] == pytest.approx([0.64, 0.64])
     assert stills(ground, frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
-    assert (
-        len(stills(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.grounds) == 0
-    )  # over half a ball away
+    # more than half a ball away
+    assert len(stills(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.grounds) == 0
 
 
 def test_an_enormous_box_is_cut_and_a_far_one_left_out(stills):
@@ -231,9 +231,8 @@ def test_glass_is_seen_at_its_place_and_through(tmp_path):
     across = np.flatnonzero(is_body(panels[2]).any(axis=0))
     left, ball = across[0] - 2, slice(across[0], across[-1] + 1)
     _, through, alone = [is_body(panel[:, ball]).sum() for panel in panels]
-    assert through == pytest.approx(
-        alone, rel=0.03
-    )  # at 0.1 s the plate stands before a thirteenth of the ball
+    # at 0.1 s the plate stands before a thirteenth of the ball
+    assert through == pytest.approx(alone, rel=0.03)
     above, before, gone = [
         np.flatnonzero((panel[:, :left] < 250).any(axis=(1, 2))) for panel in panels
     ]
@@ -264,18 +263,17 @@ def test_heights_sizes_and_captions_are_seen(falling_ball, tmp_path, capfd):
     picture = np.array(Image.open(tmp_path / "new" / "x.png"))
     panels = np.split(picture, 5, axis=1)
     (top, bottom), fallen, squashed, leapt, _ = [body_rows(panel) for panel in panels]
-    metre = (bottom - top) / 0.2  # the ball is 0.2 m high
-    assert metre * 0.4 == pytest.approx(
-        fallen[0] - top, rel=0.05
-    )  # less the cosine of the elevation
+    # the ball is 0.2 m high
+    metre = (bottom - top) / 0.2
+    # the cosine of the elevation shortens it
+    assert metre * 0.4 == pytest.approx(fallen[0] - top, rel=0.05)
     assert metre * 0.15 == pytest.approx(leapt[0] - top, rel=0.06)
     assert squashed[1] - squashed[0] < 0.75 * (bottom - top)
     ground = (abs(picture[..., :3].astype(int) - [239, 236, 230]).max(axis=2) < 3).any(axis=1)
     last_ground = np.flatnonzero(ground)[-1]
     ink = bottom + 9 + np.flatnonzero((panels[0][bottom + 9 :, :, :3] < 90).all(axis=2).any(axis=1))
-    assert (
-        fallen[1] < last_ground < ink.min()
-    )  # whole ball, ground, then captions (below the ball, dark itself)
+    # the ball above the ground above the captions, and the dark underside of the ball
+    assert fallen[1] < last_ground < ink.min()
 
 
 def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
@@ -351,10 +349,11 @@ def test_a_part_that_flies_off_does_not_shrink_the_others(tmp_path, caplog):
     ]
     sheet.draw_panels(composition, composition.stills([0, 10]), tmp_path / "x.png")
     first, last = np.split(np.array(Image.open(tmp_path / "x.png")), 2, axis=1)
+    # the resting ball; both are 0.6 m wide at first, and 4 px if 100 m were seen
     for panel in (
         first,
         last,
-    ):  # the ball that stays, of 0.6 m that both are wide at first: 4 px if 100 m were seen
+    ):
         assert np.ptp(np.flatnonzero(is_body(panel[:-100, : len(panel[0]) // 2]).any(axis=0))) > 100
     assert is_body(first[:-100, len(first[0]) // 2 :]).any(), "where both begin is in view"
     assert composition.bounds[1, 0] == pytest.approx(100.5) and composition.box[

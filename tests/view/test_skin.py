@@ -16,7 +16,8 @@ from msmpetsc.view.drawable import BodiesAtRest, Drawable
 from msmpetsc.view.mesh import CORNERS, drawn, split_at_edges, subdivided, trilinear
 from msmpetsc.view.renderer import Renderer
 
-CELLS, H = np.array([16, 2, 2]), 1 / 16  # of a block of 1 x 1/8 x 1/8 m
+# a block of 1 x 1/8 x 1/8 m
+CELLS, H = np.array([16, 2, 2]), 1 / 16
 
 
 def bent(points: np.ndarray) -> np.ndarray:
@@ -118,10 +119,12 @@ def test_pins_are_coloured_up_to_where_half_of_a_point_is_held():
     stills = composition.stills([0])
     with Renderer(composition, stills, (300, 60)) as renderer:
         row = renderer.picture(stills[0])[30].astype(int)
-    colours = row[(row < 250).any(axis=1)][3:-3]  # without the rim
+    # the part without the rim
+    colours = row[(row < 250).any(axis=1)][3:-3]
     steps = np.flatnonzero(np.abs(np.diff(colours, axis=0)).max(axis=1) > 2)
     assert len(steps) and np.ptp(steps) <= 2, "one edge, which antialiasing may widen by two pixels"
-    border = (1 + (1.0 - 0.5) / (1.0 - 0.3)) / 5  # between the second and the third pair of points
+    # between the second and the third pair of points
+    border = (1 + (1.0 - 0.5) / (1.0 - 0.3)) / 5
     assert (
         steps[0] == pytest.approx(border * len(colours), abs=4)
         and colours[0, 0] < colours[-1, 0] - 30
@@ -152,7 +155,8 @@ def test_a_clamp_ends_in_a_straight_line_whatever_the_triangles():
     composition = composition_of(drawn(clamped), [0], Style(eye=(0, -1, 0)))
     stills = composition.stills([0])
     low, high, _ = composition.room(stills)
-    scale = 900 / (high - low)[0]  # [px/m]
+    # pixels per metre
+    scale = 900 / (high - low)[0]
     with Renderer(composition, stills, (900, round(scale * (high - low)[1]))) as renderer:
         picture = renderer.picture(stills[0]).astype(int)
     dark = abs(picture - [int(FIXED[k : k + 2], 16) for k in (1, 3, 5)]).max(axis=2) < 40

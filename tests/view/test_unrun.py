@@ -28,21 +28,23 @@ def sized(folder: Path, sides: tuple[float, float, float]) -> Path:
     """A block with the points of its west side painted, pinned by a file, and pulled at its
     east."""
     path = block_scene(folder, np.array(sides), **SCENE)
-    (folder / "spots.txt").write_text(
-        "0 1 2 3\n"
-    )  # box: corners are numbered along x, so these are its west
+    # corners of a box are numbered along x, so these are its x = 0 face
+    (folder / "spots.txt").write_text("0 1 2 3\n")
     return path
 
 
 def test_a_scene_shows_pins_forces_and_cells(tmp_path):
     picture = drawn(sized(tmp_path, (0.5, 0.5, 0.5)), tmp_path / "x.png")
     left, right = np.array_split(picture, 2, axis=1)
-    assert (left[..., 0] < 58).sum() > 500  # pinned by the file: dark
-    assert (left[..., 0] - left[..., 2] > 90).sum() > 300  # the arrow
+    # nodes that the scene pins are dark
+    assert (left[..., 0] < 58).sum() > 500
+    # the arrow is orange
+    assert (left[..., 0] - left[..., 2] > 90).sum() > 300
+    # cells of the boundary are red and inner cells blue in the cut-open panel
     for less, more in (
         (2, 0),
         (0, 2),
-    ):  # red cells of the boundary, blue ones inside, in the panel cut open
+    ):
         counts = [(half[:-40, :, more] - half[:-40, :, less] > 75).sum() for half in (left, right)]
         assert counts[1] > 300 and counts[1] > 2 * counts[0]
 

@@ -33,10 +33,10 @@ def check_route(rng: np.random.Generator, rows: int, senders: int) -> None:
         rng.random((rows, 3)),
         rng.random((rows, 2, 2)),
     ):
-        same(route.send(whole[mine]), whole[here])  # holders are sorted: by sender, then in order
-        same(
-            route.answer(whole[here][..., None]), whole[mine][..., None]
-        )  # answers need not look like the rows
+        # holders are sorted by sender, then in order
+        same(route.send(whole[mine]), whole[here])
+        # answers may differ in shape from the rows
+        same(route.answer(whole[here][..., None]), whole[mine][..., None])
 
 
 def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit: int) -> None:
@@ -47,13 +47,11 @@ def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit:
     plain = np.unique(given)
     assert table.total == len(plain)
     same(table.keys, plain[table.first : table.first + len(table.keys)])
-    assert (
-        comm.allreduce(len(table.keys)) == table.total
-    )  # so no key is on two ranks, and none is lost
+    # no key is on two ranks, and none is lost
+    assert comm.allreduce(len(table.keys)) == table.total
     asked = np.concatenate([given, rng.integers(-1, limit, count + 2)])
-    asked = asked[: len(asked) // 2 * 2].reshape(2, -1)[
-        :, :: comm.rank + 1
-    ]  # ranks ask differently
+    # ranks ask for different keys
+    asked = asked[: len(asked) // 2 * 2].reshape(2, -1)[:, :: comm.rank + 1]
     expected = np.array(
         [[np.searchsorted(plain, key) if key in plain else -1 for key in row] for row in asked]
     )
@@ -109,7 +107,8 @@ def check_on_root() -> None:
 
 
 if __name__ == "__main__":
-    rng = np.random.default_rng(5)  # the same on every rank
+    # the same numbers on every rank
+    rng = np.random.default_rng(5)
     for rows in (0, 1, 5, 200):
         check_route(rng, rows, comm.size)
         check_route(rng, rows, 1)

@@ -45,7 +45,8 @@ def share(rows: int) -> slice:
 
 
 def write_all(path: str, gathers: bool = False) -> None:
-    layout.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
+    # several pieces and several chunks on each rank
+    layout.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24
     nodes, points = share(NODES), share(POINTS)
     with ResultFile(
         path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}, gathers=gathers

@@ -5,7 +5,8 @@ from hierarchies import COMM, LATTICES, SHAPES, build, hierarchy
 from mpi4py import MPI
 
 WORLD = MPI.COMM_WORLD
-CASES = {  # lattice, shape, contact, more
+# lattice, shape, contact, more
+CASES = {
     "block": ("twisted", True, {"pins": True, "contrast": 1e6}),
     "two bodies": ("crushed", False, {}),
     "thin sheet": ("crushed", True, {"poisson": 0.25, "pins": True}),

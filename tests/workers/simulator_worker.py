@@ -7,10 +7,11 @@ are pretended."""
 import os
 import sys
 
+# the simulator reads Python, not compiled code
 os.environ |= {
     "NUMBA_ENABLE_CUDASIM": "1",
     "NUMBA_DISABLE_JIT": "1",
-}  # the simulator reads Python, not what is compiled
+}
 from block_scene import play
 from numba import cuda
 from pretend_gpu import bare, module, pretended

@@ -31,7 +31,8 @@ CASES = {
 }
 
 
-QUICK = {"touching"}  # each takes some ten seconds
+# each case takes some ten seconds
+QUICK = {"touching"}
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,12 @@ import pytest
 from hierarchies import COMM, LATTICES, SHAPES, Case, at, block, build, figure, heavier, hierarchy
 from scipy.linalg import eigh
 
-SYMMETRIC = 1e-6  # of the greatest number: single precision has 6e-8
-BEYOND = 1e-5  # what single precision adds to the greatest eigenvalue, 1
-LOOSE = {"two bodies", "many bodies"}  # of which some are not held
+# relative to the greatest number; single precision has 6e-8
+SYMMETRIC = 1e-6
+# effect of single precision on the greatest eigenvalue, 1
+BEYOND = 1e-5
+# cases in which some bodies are free
+LOOSE = {"two bodies", "many bodies"}
 
 
 def check(
@@ -111,17 +114,21 @@ def test_a_sheet_with_its_underside_held(density: float, shape: str):
         check(case, 0.3)
 
 
-TOLERANCE = 3e-2  # -ksp_rtol of newton's presets
-STEPS = [1e-4, 1e-3, 1e-2, 1 / 60, 1e-1, 1.0]  # [s]: from hardly coupled nodes to statics
-NAMED = {  # cells at a fineness; pinned; fineness
+# -ksp_rtol of newton's presets
+TOLERANCE = 3e-2
+# time steps [s], from nearly decoupled nodes to statics
+STEPS = [1e-4, 1e-3, 1e-2, 1 / 60, 1e-1, 1.0]
+# cells at a fineness, whether pinned, the fineness
+NAMED = {
     "clamped beam": (lambda n: block(10 * n, 2 * n, 2 * n), True, (1, 2, 4)),
     "block": (lambda n: block(3 * n, 3 * n, 3 * n), False, (1, 2, 4)),
     "clamped sheet": (lambda n: block(10 * n, 10 * n, 1), True, (1, 2, 4)),
     "figure": (figure, False, (1, 2)),
 }
 MOST = {"clamped beam": 3, "block": 3, "clamped sheet": 4, "figure": 9}
-# one more than seen; between the figure's legs is one cell, so that they share coarse nodes
-GROWTH = 1  # from the coarsest lattice to the finest
+# one more than seen; between the figure's legs is one cell, so that they share coarse
+# nodes most additional iterations from the coarsest lattice to the finest
+GROWTH = 1
 
 
 def counts(name: str, fineness: int, shape: str) -> np.ndarray:
@@ -146,8 +153,10 @@ def test_few_iterations_at_any_step_and_fineness(name: str, shape: str):
 BENT = np.concatenate(
     [block(30, 4, 4), at(block(4, 30, 4), 30, 0, 0), at(block(4, 4, 30), 30, 30, 0)]
 )
-STATIC = 1e3  # [s]: a step so long that mass counts for nothing
-AT_REST = {None: 3, 0.25: 3, 0.45: 4, 0.49: 8, 0.499: 20}  # by Poisson's ratio, None of springs
+# time step [s] so long that inertia is negligible
+STATIC = 1e3
+# most iterations by Poisson's ratio; None for springs
+AT_REST = {None: 3, 0.25: 3, 0.45: 4, 0.49: 8, 0.499: 20}
 
 
 @pytest.mark.parametrize("poisson", AT_REST)

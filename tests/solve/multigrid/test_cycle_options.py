@@ -14,7 +14,8 @@ SCENE = {
     "pin": [{"region": {"box": [[0, 0, 0], [0.05, 1, 1]], "relative": True}}],
     "solver": {"preset": "newton-multigrid", "error": 1e-4},
 }
-OBEYED = {  # those that go together, and what they show
+# options that go together, and the effect that shows
+OBEYED = {
     "-pc_mg_levels 2 -mg_levels_ksp_max_it 2 -mg_coarse_pc_type cholesky "
     "-ksp_view": "MULTIPLICATIVE, levels=2",
     "-pc_mg_levels 3 -pc_mg_cycle_type w -matptap_via scalable -pc_mg_log "

@@ -7,7 +7,8 @@ from hierarchies import COMM, LATTICES, SHAPES, Case, build, heavier, hierarchy
 
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
 
-CASES = {  # lattice, shape, contact, more
+# lattice, shape, contact, more
+CASES = {
     "pinned": ("block", "twisted", False, {"pins": True}),
     "crushed": ("block that begins at odd indices", "crushed", False, {}),
     "of two materials": ("L", "twisted", False, {"contrast": 1e6, "pins": True}),
@@ -73,9 +74,8 @@ def test_levels_are_galerkin_products(name: str):
     with hierarchy(
         COMM, build(COMM, LATTICES[lattice], **more), SHAPES[shape], contact=contact, coarsest=10
     ) as case:
-        assert (
-            len(case.multigrid.levels) > 1 or name == "many"
-        )  # of one cell each: no grid is coarser
+        # each body is a single cell, so no grid is coarser
+        assert len(case.multigrid.levels) > 1 or name == "many"
         check_levels(case)
         np.testing.assert_allclose(case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y)),
         case.hessian(),

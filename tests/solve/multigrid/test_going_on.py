@@ -67,7 +67,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preconditioning, "expected_iterations", lambda ratio: 0.0)
 
 
-QUICK = {"solid, pressed", "switched, pressed", "fallback"}  # each takes some five seconds
+# each case takes some five seconds
+QUICK = {"solid, pressed", "switched, pressed", "fallback"}
 
 
 @pytest.mark.parametrize(

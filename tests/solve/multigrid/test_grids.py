@@ -34,7 +34,8 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
             np.testing.assert_allclose(
                 (p @ values.ravel()).reshape(-1, 3), fine @ slopes + at_origin, rtol=1e-12
             )
-            assert (p != 0).any(axis=0).all()  # no coarse node without fine ones
+            # each coarse node has fine nodes
+            assert (p != 0).any(axis=0).all()
             fine = ijk
 
 
@@ -63,7 +64,8 @@ def test_a_grid_that_is_not_much_smaller_is_none():
     copies = CoarseCopies(lattice, keys, np.zeros_like(keys))
     far = keys, copies, np.arange(216), 216
     assert [grid.table.total for grid in grids(COMM, *far, coarsest=1)] == [216]
-    assert len(grids(COMM, *far, coarsest=800)) == 1  # a coarse level there always is
+    # there always is a coarse level
+    assert len(grids(COMM, *far, coarsest=800)) == 1
 
 
 @pytest.mark.parametrize("name", LATTICES)

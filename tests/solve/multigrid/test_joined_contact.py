@@ -71,7 +71,8 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
         joined(stiff) + joined(others), joined(surface), atol=1e-12 * np.abs(joined(surface)).max()
     )
     assert np.abs(joined(stiff)).max() > 1e3 * np.abs(joined(others)).max()
-    one, rest = surface.split(compliance, 1)  # the stiffest alone
+    # the stiffest contact alone
+    one, rest = surface.split(compliance, 1)
     assert (
         one is not None
         and rest is not None
@@ -97,9 +98,8 @@ def test_the_coarsest_matrix_has_the_contact_of_now_and_room_for_that_of_before(
         np.testing.assert_allclose(matrix[:, :], 2 * np.eye(size) + T2 * contact)
         found.append(matrix.handle)
     assert found[0] == found[1] == found[2]
-    assert (
-        coarse.nonzeros.nnz == 9
-    )  # of the last contact alone: that of before would have taken ten times as many
+    # the last contact alone; the earlier contact would take ten times as many
+    assert coarse.nonzeros.nnz == 9
     coarse.destroy()
     without.destroy()
 

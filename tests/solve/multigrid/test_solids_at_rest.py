@@ -18,10 +18,14 @@ from msmpetsc.errors import InputError
 # needs manifold3d
 study = pytest.importorskip("solid_runs")
 
-TOLERANCE = 3e-2  # -ksp_rtol of newton's presets
-STATIC = 1e3  # [s]: a step so long that mass counts for nothing
-POISSON = (None, 0.25, 0.45, 0.49, 0.499)  # None of springs
-WHOLE, CUT = (4, 4, 4, 8, 16), (3, 3, 5, 8, 22)  # iterations at each of them, at most
+# -ksp_rtol of newton's presets
+TOLERANCE = 3e-2
+# time step [s] so long that inertia is negligible
+STATIC = 1e3
+# Poisson's ratios; None for springs
+POISSON = (None, 0.25, 0.45, 0.49, 0.499)
+# most iterations at each Poisson's ratio
+WHOLE, CUT = (4, 4, 4, 8, 16), (3, 3, 5, 8, 22)
 WANTED = {"beam": WHOLE, "long beam": WHOLE, "bunny": CUT, "rod": CUT}
 
 

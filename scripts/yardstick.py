@@ -24,7 +24,7 @@ import numpy as np
 from mpi4py import MPI
 
 import msmpetsc
-from msmpetsc.app.modes import find_modes
+from msmpetsc.app.mode_shapes import find_modes
 from msmpetsc.app.request import RunRequest
 from msmpetsc.build import build_model
 from msmpetsc.fields import FRAME_FIELDS

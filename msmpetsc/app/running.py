@@ -15,8 +15,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc import __version__
+from msmpetsc.app.abort import ending_together
 from msmpetsc.app.checkpoint_writer import Checkpoints
-from msmpetsc.app.ending import ending_together
 from msmpetsc.app.exported_systems import ExportedSystems
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene

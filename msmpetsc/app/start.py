@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.ending import ending_together, logged_on_root
+from msmpetsc.app.abort import ending_together, logged_on_root
 from msmpetsc.app.request import OPTIONS, RunRequest
 from msmpetsc.app.resume import earlier_run, kept_options
 from msmpetsc.build import Geometry, Model, build_model

@@ -20,8 +20,8 @@ from itertools import pairwise
 from typing import Any, NoReturn
 
 import msmpetsc
+from msmpetsc.app.abort import ending_together, logged_on_root
 from msmpetsc.app.checks import SCENE_NAMES
-from msmpetsc.app.ending import ending_together, logged_on_root
 from msmpetsc.app.ranks import world
 from msmpetsc.cli.command_table import COMMANDS, VERBOSITY, Shown
 from msmpetsc.errors import (

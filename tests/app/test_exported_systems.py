@@ -22,7 +22,7 @@ from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of
 from msmpetsc.solve.simulate import TimeLoop
-from msmpetsc.study.export import export_systems
+from msmpetsc.study.exported_problems import export_systems
 
 SOLID = {"law": "neo-hookean", "young_modulus": 1e5, "density": 1000.0, "poisson_ratio": 0.3}
 SWING = {"step": 0.05, "duration": 0.15}

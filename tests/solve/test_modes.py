@@ -22,7 +22,7 @@ from msmpetsc.build import build_model
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.results.checkpoint_reader import end_of_run
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.modes import Modes, modes_of
+from msmpetsc.solve.natural_modes import Modes, modes_of
 from msmpetsc.view.drawable import drawable_of_result
 
 COMM = MPI.COMM_SELF

@@ -4,11 +4,11 @@ import sys
 
 from mpi4py import MPI
 
-from msmpetsc.app import ending
+from msmpetsc.app import abort
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 
-ending.PATIENCE = 1.0
+abort.PATIENCE = 1.0
 WHAT = {
     "input": lambda: InputError("it fails"),
     "memory": lambda: MemoryError("Unable to allocate it all"),

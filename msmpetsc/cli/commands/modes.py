@@ -5,7 +5,7 @@ import json
 
 from mpi4py import MPI
 
-from msmpetsc.app.modes import find_modes
+from msmpetsc.app.mode_shapes import find_modes
 from msmpetsc.app.request import RunRequest
 
 

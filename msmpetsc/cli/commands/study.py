@@ -6,7 +6,7 @@ from pathlib import Path
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 from msmpetsc.study.cases import shown_command
-from msmpetsc.study.export import export_systems
+from msmpetsc.study.exported_problems import export_systems
 from msmpetsc.study.runner import StudyPart, list_study, run_study
 from msmpetsc.study.table import as_table, failed, swept
 

@@ -16,7 +16,7 @@ from msmpetsc.fields import Frame
 if TYPE_CHECKING:
     from msmpetsc.app.running import RunPlan
     from msmpetsc.build import Model
-    from msmpetsc.solve.modes import Modes
+    from msmpetsc.solve.natural_modes import Modes
 
 # Greatest displacement of a shape in the file, over the longest side [-]; well visible
 AMPLITUDE = 0.1
@@ -29,7 +29,7 @@ def find_modes(comm: MPI.Intracomm, request: RunRequest, count: int) -> "Modes":
     """
     with options_given(comm, request):
         from msmpetsc.app.running import described_model, prepare
-        from msmpetsc.solve.modes import modes_of
+        from msmpetsc.solve.natural_modes import modes_of
 
         if request.output and not request.overwrite:
             on_root(comm, lambda: refuse_existing(request))

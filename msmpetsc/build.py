@@ -10,16 +10,10 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import log, on_root
+from msmpetsc.constraints.anchors import Anchor
+from msmpetsc.constraints.forces import Load, OwnForce, PressureLoad, shares_by_mass
 from msmpetsc.constraints.holders import Holders, Regions, clamped, taken
-from msmpetsc.constraints.loads import (
-    Anchor,
-    Load,
-    Motion,
-    OwnForce,
-    Pressure,
-    shares_by_mass,
-    total_of,
-)
+from msmpetsc.constraints.time_functions import Motion, total_of
 from msmpetsc.contact.friction import smallest
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.moving_solid import Obstacle, build_obstacles
@@ -101,7 +95,7 @@ class Model:
     retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
     tractions: int = 0
-    pressures: tuple[Pressure, ...] = ()
+    pressures: tuple[PressureLoad, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     holders: Holders = field(
         default_factory=lambda: Holders((), np.zeros(0, np.int64), np.zeros((0, 3)))
@@ -418,7 +412,7 @@ def _loads(
 
 def _surface_loads(
     scene: Scene, finder: Finder, lattice: Lattice
-) -> tuple[list[Load], list[Pressure]]:
+) -> tuple[list[Load], list[PressureLoad]]:
     """Return the tractions and the pressures (collective).
 
     Raises InputError for a region without triangles, or a pressure without a potential.
@@ -430,7 +424,7 @@ def _surface_loads(
         if isinstance(load, Traction):
             tractions.append(Load(share=part.areas(), **acts))
         else:
-            pressures.append(Pressure(part=part, **acts))
+            pressures.append(PressureLoad(part=part, **acts))
     return tractions, pressures
 
 

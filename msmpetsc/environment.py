@@ -7,8 +7,8 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Positions
 from msmpetsc.build import Model
-from msmpetsc.constraints.acting import ActingForces, Anchors
-from msmpetsc.constraints.loads import Anchor
+from msmpetsc.constraints.anchors import Anchor, Anchors
+from msmpetsc.constraints.forces import ActingForces
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
 from msmpetsc.contact.obstacles.penalty import Contact

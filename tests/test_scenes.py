@@ -17,7 +17,7 @@ from conftest import run
 from crossings import count_crossings
 
 from msmpetsc.cli.main import main
-from msmpetsc.constraints.loads import Motion
+from msmpetsc.constraints.time_functions import Motion
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside
 from msmpetsc.geometry.registry import find

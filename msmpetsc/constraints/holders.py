@@ -26,7 +26,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
 from msmpetsc.comm import log
-from msmpetsc.constraints.loads import Anchor
+from msmpetsc.constraints.anchors import Anchor
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder

@@ -27,7 +27,7 @@ STATE = 20
 BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]
 
 
-class Blocks(NamedTuple):
+class CellBlocks(NamedTuple):
     """A solid's cells in blocks of LANES; the blocks of cells that the rank owns come first.
 
     The last owned block and the last of all are filled up with cells of zero stiffness.
@@ -55,7 +55,7 @@ class CellRows(NamedTuple):
     """Cells in sequence, as kernels take them: cell i is in lane i % LANES of block i // LANES.
 
     nodes     : (c, 8) local corner nodes, x fastest
-    constants : ``Blocks.constants``, flat
+    constants : ``CellBlocks.constants``, flat
     by_node   : True on a CPU, where a corner adds to its node's row; on a GPU it has its own row
     state     : (b, width, LANES) state of a Hessian, flat; empty if the kernel needs none
     width     : entries of a cell in the state, PROJECTED or STATE
@@ -71,7 +71,7 @@ class CellRows(NamedTuple):
     width: int
 
 
-def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
+def one_by_one(blocks: CellBlocks, state: Array | None = None) -> CellRows:
     """Return the cells of blocks in sequence, with the ``state`` of a Hessian if given."""
     constants, by_node = blocks.constants.ravel(), on_host(blocks.nodes)
     own = constants[:0] if state is None else state.ravel()
@@ -80,7 +80,7 @@ def one_by_one(blocks: Blocks, state: Array | None = None) -> CellRows:
     return CellRows(nodes, blocks.which, constants, blocks.h4, blocks.u, by_node, own, width)
 
 
-def blocks_of(lattice: Lattice, constants: Rows, u: int) -> Blocks:
+def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
     """Return the lattice's cells with their constants (c, ROWS), on the device of its nodes.
 
     Cells with equal constants share blocks, so that few distinct rows are stored.
@@ -105,7 +105,7 @@ def blocks_of(lattice: Lattice, constants: Rows, u: int) -> Blocks:
         around = rows_of(corners.ravel().astype(np.int64), lattice.owned)
     arrays = nodes, which.astype(np.int32), rows[first], around
     nodes, which, distinct, around = (like(lattice.nodes, array) for array in arrays)
-    return Blocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size, u)
+    return CellBlocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size, u)
 
 
 def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:

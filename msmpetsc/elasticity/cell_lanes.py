@@ -15,7 +15,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.assumed_strain import rest_constants
-from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, STATE, Blocks
+from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, STATE, CellBlocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
     QUADRATIC,
@@ -98,7 +98,7 @@ def _projected_product_lanes(w: Floats) -> None:
 
 
 @njit()
-def add_product(blocks: Blocks, state: Rows, v: Rows, product: Rows) -> None:
+def add_product(blocks: CellBlocks, state: Rows, v: Rows, product: Rows) -> None:
     """Add (Hessian) v [N] to ``product`` (l, 3), with the ``state`` of ``linearise``.
 
     A projected Hessian has a narrow state.
@@ -135,7 +135,7 @@ def _gradient_lanes(w: Floats, h4: float, u: int) -> None:
 
 
 @njit()
-def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
+def add_gradient(blocks: CellBlocks, q: Positions, gradient: Rows) -> None:
     """Add grad E [N] at q (l, 3) [m] to ``gradient`` (l, 3)."""
     w = np.zeros(WORK)
     for b in range(len(blocks.nodes)):
@@ -159,7 +159,7 @@ def _change_lanes(w: Floats, inverse_h4: float) -> None:
 
 
 @njit()
-def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
+def elastic_change(blocks: CellBlocks, q: Positions, base: Positions) -> float:
     """Return E(q) - E(base) [J] of the cells that the rank owns.
 
     The change is computed from the displacement q - base, so a small change keeps its digits.

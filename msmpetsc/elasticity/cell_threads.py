@@ -12,7 +12,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.assumed_strain import rest_constants
-from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, Blocks, CellRows, one_by_one
+from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, CellBlocks, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
     cell_gradient,
@@ -145,17 +145,17 @@ def _add(
     _add_around(around.shape[1], store, around, rows)
 
 
-def add_product(blocks: Blocks, state: Rows, v: Array, product: Array) -> None:
+def add_product(blocks: CellBlocks, state: Rows, v: Array, product: Array) -> None:
     """Add (Hessian) v [N] to the owned rows of ``product`` (l, 3), from a ``linearise`` state."""
     _add(_write_products, v, one_by_one(blocks, state), blocks.around, product)
 
 
-def add_gradient(blocks: Blocks, q: Positions, gradient: Rows) -> None:
+def add_gradient(blocks: CellBlocks, q: Positions, gradient: Rows) -> None:
     """Add grad E [N] at q (l, 3) [m] to the owned rows of ``gradient`` (l, 3)."""
     _add(_write_gradients, q, one_by_one(blocks), blocks.around, gradient)
 
 
-def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> None:
+def linearise(blocks: CellBlocks, q: Positions, projected: bool, state: Rows) -> None:
     """Write the entries of each cell at q (l, 3) [m] into ``state`` (b, width * LANES).
 
     The width is PROJECTED if the Hessian is ``projected``, else STATE (elasticity.cell_blocks).
@@ -163,13 +163,13 @@ def linearise(blocks: Blocks, q: Positions, projected: bool, state: Rows) -> Non
     _write_states(LANES * len(blocks.nodes), q, one_by_one(blocks, state), projected)
 
 
-def cell_changes(blocks: Blocks, count: int, q: Positions, base: Positions) -> Floats:
+def cell_changes(blocks: CellBlocks, count: int, q: Positions, base: Positions) -> Floats:
     """Return E(q) - E(base) [J] of each of the first cells (count,)."""
     parts: Floats = np.empty(count, like=q)
     _write_changes(count, parts, one_by_one(blocks), Displacement.to(q, base))
     return parts
 
 
-def elastic_change(blocks: Blocks, q: Positions, base: Positions) -> float:
+def elastic_change(blocks: CellBlocks, q: Positions, base: Positions) -> float:
     """Return E(q) - E(base) [J] of the cells that the rank owns."""
     return float(cell_changes(blocks, LANES * blocks.owned, q, base).sum())

@@ -33,7 +33,7 @@ from msmpetsc.elasticity.cell_blocks import (
     PROJECTED,
     ROWS,
     STATE,
-    Blocks,
+    CellBlocks,
     CellRows,
     add_corners,
     blocks_of,
@@ -131,7 +131,7 @@ class CellHessians:
     A call adds the product with v (l, 3) [N] to ``product`` (l, 3).
     """
 
-    blocks: Blocks
+    blocks: CellBlocks
     state: Array
 
     def __call__(self, v: Array, product: Array) -> None:
@@ -158,7 +158,7 @@ class CellHessians:
 class NeoHookean:
     """A neo-Hookean solid: the cells around this rank's owned nodes."""
 
-    blocks: Blocks
+    blocks: CellBlocks
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "NeoHookean":

@@ -71,7 +71,7 @@ CUTS = {
 
 
 # kind and cells (c, k) of each block; None for vertices and lines
-Blocks = Sequence[tuple[Kind | None, Indices]]
+MeshBlocks = Sequence[tuple[Kind | None, Indices]]
 
 
 def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
@@ -133,7 +133,7 @@ def _kind(name: str) -> Kind | None:
     return KINDS.get(base)
 
 
-def _sets(mesh: "meshio.Mesh", blocks: Blocks) -> Iterator[tuple[str, list[Indices]]]:
+def _sets(mesh: "meshio.Mesh", blocks: MeshBlocks) -> Iterator[tuple[str, list[Indices]]]:
     """Yield the name of each named or labelled set of cells, and its rows in each block."""
     for name, rows in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
@@ -177,14 +177,14 @@ def labels_of(arrays: Mapping[str, Array]) -> Iterator[tuple[str, int, str]]:
             yield key, label, str(label) if len(whole) == 1 else f"{key}:{label}"
 
 
-def _shell_triangles(blocks: Blocks) -> Indices:
+def _shell_triangles(blocks: MeshBlocks) -> Indices:
     """Return the triangles (f, 3) of triangle and quad cells."""
     shells = [(kind, cells) for kind, cells in blocks if kind and kind.dimension == 2]
     parts = [kind.triangles(cells, kind.faces[0]).reshape(-1, 3) for kind, cells in shells]
     return np.concatenate([np.zeros((0, 3), np.int64), *parts])
 
 
-def boundary(points: Positions, blocks: Blocks) -> Indices:
+def boundary(points: Positions, blocks: MeshBlocks) -> Indices:
     """Return the faces that belong to a single cell as triangles (f, 3), wound outwards.
 
     Faces of an inverted cell are turned.

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
-from msmpetsc.constraints.loads import within
+from msmpetsc.constraints.time_functions import within
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.surface import Surface, compact

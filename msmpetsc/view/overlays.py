@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
-from msmpetsc.constraints.loads import Motion, total_of, within
+from msmpetsc.constraints.time_functions import Motion, total_of, within
 from msmpetsc.geometry.surface import bounds_of
 from msmpetsc.view.camera import Camera, unit
 from msmpetsc.view.drawable import Drawable

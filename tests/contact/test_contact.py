@@ -10,7 +10,7 @@ from block_scene import CELL, DENSITY, GROUND, SIDES, STIFFEST, YOUNG, G, block_
 from mpi4py import MPI
 from obstacles import box, plane, sphere
 
-from msmpetsc.constraints.loads import Motion
+from msmpetsc.constraints.time_functions import Motion
 from msmpetsc.contact.obstacles.penalty import Contact, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
 from msmpetsc.scene.motion import Pose

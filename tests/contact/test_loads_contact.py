@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from msmpetsc.constraints.loads import Load, Timed, shares_by_mass, total_of
+from msmpetsc.constraints.forces import Load, shares_by_mass
+from msmpetsc.constraints.time_functions import Timed, total_of
 from msmpetsc.geometry.inside import inside
 from msmpetsc.scene.body import Region
 

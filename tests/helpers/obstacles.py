@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from msmpetsc.constraints.loads import Motion
+from msmpetsc.constraints.time_functions import Motion
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Planes
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
 from msmpetsc.comm import log, on_root, together
-from msmpetsc.constraints.loads import Motion, Timed
+from msmpetsc.constraints.time_functions import Motion, Timed
 from msmpetsc.contact.obstacles.distance import FunctionSolid, MeshSolid
 from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Planes, Send, Solid, no_sides
 from msmpetsc.elasticity.locate import node_of_greatest

@@ -26,7 +26,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.checkpoint import COUNT, LENGTH, Checkpoint, Range
 from msmpetsc.comm import log
-from msmpetsc.constraints.loads import AT_EVENT
+from msmpetsc.constraints.time_functions import AT_EVENT
 from msmpetsc.errors import StepFailed
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver

@@ -28,7 +28,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint, Range
-from msmpetsc.constraints.acting import ExternalForces
+from msmpetsc.constraints.forces import ExternalForces
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment

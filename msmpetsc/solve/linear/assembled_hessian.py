@@ -24,7 +24,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
 
-class Blocks(NamedTuple):
+class HessianBlocks(NamedTuple):
     """Blocks of this rank that add up to the Hessian over all ranks.
 
     first, second : (k,) global numbers of the nodes of rows and columns, -1 if pinned
@@ -36,11 +36,11 @@ class Blocks(NamedTuple):
     values: Rows
 
 
-def blocks_of(hessian: TrueHessian) -> Blocks:
+def blocks_of(hessian: TrueHessian) -> HessianBlocks:
     """Return the blocks of the Hessian of the last ``linearise`` at free nodes (collective)."""
     whole = [np.concatenate(part) for part in zip(*_parts(hessian), strict=True)]
     is_free = (whole[0] >= 0) & (whole[1] >= 0)
-    blocks = Blocks(*(part[is_free] for part in whole))
+    blocks = HessianBlocks(*(part[is_free] for part in whole))
     unknowns = hessian.unknowns
     node, component = map(to_host, unknowns.held)
     held = 3 * unknowns.numbers[node] + component
@@ -52,7 +52,7 @@ def blocks_of(hessian: TrueHessian) -> Blocks:
     return blocks
 
 
-def assembled(unknowns: Unknowns, blocks: Blocks) -> PETSc.Mat:
+def assembled(unknowns: Unknowns, blocks: HessianBlocks) -> PETSc.Mat:
     """Return the Hessian as an AIJ of block size 3 in CPU memory (collective).
 
     Raises InputError if the nonzeros exceed PETSc's integers.
@@ -61,7 +61,7 @@ def assembled(unknowns: Unknowns, blocks: Blocks) -> PETSc.Mat:
     return _summed(unknowns.comm, (3 * unknowns.size, 3 * unknowns.total), blocks)
 
 
-def subdomain(blocks: Blocks) -> tuple[PETSc.Mat, PETSc.IS]:
+def subdomain(blocks: HessianBlocks) -> tuple[PETSc.Mat, PETSc.IS]:
     """Return the sum of this rank's blocks alone, and the global numbers of its rows.
 
     The sum over the ranks is the Hessian: BDDC needs the summands. A summand has no Dirichlet
@@ -71,11 +71,11 @@ def subdomain(blocks: Blocks) -> tuple[PETSc.Mat, PETSc.IS]:
     nodes, places = np.unique(ends, return_inverse=True)
     first, second = places.reshape(ends.shape)
     size = 3 * len(nodes)
-    matrix = _summed(PETSc.COMM_SELF, (size, size), Blocks(first, second, blocks.values))
+    matrix = _summed(PETSc.COMM_SELF, (size, size), HessianBlocks(first, second, blocks.values))
     return matrix, PETSc.IS().createBlock(3, nodes.astype(PETSc.IntType), PETSc.COMM_SELF)
 
 
-def _summed(comm: MPI.Comm, size: tuple[int, int], blocks: Blocks) -> PETSc.Mat:
+def _summed(comm: MPI.Comm, size: tuple[int, int], blocks: HessianBlocks) -> PETSc.Mat:
     """Return the sum of blocks as a matrix whose rows and columns have this size."""
     row, column = np.arange(3)[:, None], np.arange(3)
     rows, columns = np.broadcast_arrays(
@@ -90,7 +90,7 @@ def _summed(comm: MPI.Comm, size: tuple[int, int], blocks: Blocks) -> PETSc.Mat:
     return matrix
 
 
-def _parts(hessian: TrueHessian) -> Iterator[Blocks]:
+def _parts(hessian: TrueHessian) -> Iterator[HessianBlocks]:
     """Yield the blocks of inertia, springs, cells, pressure and contact.
 
     Blocks of pressure and of the surface's contact, whose nodes may be another rank's, lack held
@@ -99,7 +99,7 @@ def _parts(hessian: TrueHessian) -> Iterator[Blocks]:
     unknowns, t2, numbers = hessian.unknowns, hessian.t2, hessian.unknowns.numbers
     own = numbers[to_host(unknowns.free)]
     inertia = to_host(unknowns.inertia)[to_host(unknowns.free)]
-    yield Blocks(own, own, inertia[:, None, None] * np.eye(3))
+    yield HessianBlocks(own, own, inertia[:, None, None] * np.eye(3))
     if hessian.elasticity.springs:
         yield from _of_springs(hessian)
     for part in hessian.elastic.parts if hessian.elastic else ():
@@ -109,12 +109,12 @@ def _parts(hessian: TrueHessian) -> Iterator[Blocks]:
             yield from _of_pressure(part, unknowns, t2)
     for rows, blocks in hessian.contact.parts if hessian.contact else ():
         at = own[to_host(rows)]
-        yield Blocks(at, at, to_host(blocks))
+        yield HessianBlocks(at, at, to_host(blocks))
     if hessian.surface:
         yield _of_surface(hessian.surface, unknowns, t2)
 
 
-def _of_springs(hessian: TrueHessian) -> Iterator[Blocks]:
+def _of_springs(hessian: TrueHessian) -> Iterator[HessianBlocks]:
     """Yield the blocks t^2 (c I + e e^T) of this rank's springs."""
     lattice = hessian.unknowns.lattice
     given = lattice.springs, lattice.rest_length, lattice.stiffness
@@ -126,10 +126,10 @@ def _of_springs(hessian: TrueHessian) -> Iterator[Blocks]:
     blocks = hessian.t2 * (c * np.eye(3) + e[:, :, None] * e[:, None, :])
     a, b = hessian.unknowns.numbers[springs.ends].T
     for first, second, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
-        yield Blocks(first, second, sign * blocks)
+        yield HessianBlocks(first, second, sign * blocks)
 
 
-def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> Blocks:
+def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> HessianBlocks:
     """Return the blocks of the cells that this rank owns, summed over the cells.
 
     Products with unit vectors give the matrices of all cells at once, because in the copy here
@@ -159,10 +159,10 @@ def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> Blocks:
         forces = np.zeros_like(v)
         alone(v, forces)
         np.add.at(sums[:, :, component], place[:, :, corner], forces.reshape(-1, 8, 3))
-    return Blocks(found // span, found % span, sums)
+    return HessianBlocks(found // span, found % span, sums)
 
 
-def _of_surface(surface: SurfaceHessian, unknowns: Unknowns, t2: float) -> Blocks:
+def _of_surface(surface: SurfaceHessian, unknowns: Unknowns, t2: float) -> HessianBlocks:
     """Return the blocks t^2 W^T H_c W in this rank's rows (collective)."""
     own = unknowns.numbers[unknowns.free]
     weights = _by_component(surface.weights[:, unknowns.free], unknowns.lattice.held[unknowns.free])
@@ -174,10 +174,10 @@ def _of_surface(surface: SurfaceHessian, unknowns: Unknowns, t2: float) -> Block
     # The order of the ranks makes the sum reproducible
     whole = sum(unknowns.comm.allgather(placed))
     first, second, values = _joined(weights, csr_array(surface.points @ whole))
-    return Blocks(own[first], second, t2 * values)
+    return HessianBlocks(own[first], second, t2 * values)
 
 
-def _of_pressure(part: PressureHessian, unknowns: Unknowns, t2: float) -> Iterator[Blocks]:
+def _of_pressure(part: PressureHessian, unknowns: Unknowns, t2: float) -> Iterator[HessianBlocks]:
     """Yield the blocks t^2 W^T H_p W of this rank's triangles under pressure (collective)."""
     for surface, triangles in part.triangles():
         points = surface.points
@@ -191,7 +191,7 @@ def _of_pressure(part: PressureHessian, unknowns: Unknowns, t2: float) -> Iterat
         matrix = csr_array((triangles.ravel(), [of.ravel() for of in places]), (ends.size,) * 2)
         weights = _by_component(points.weights, held)
         first, second, values = _joined(weights, csr_array(matrix @ weights))
-        yield Blocks(numbers[first], numbers[second], t2 * values)
+        yield HessianBlocks(numbers[first], numbers[second], t2 * values)
 
 
 def _by_component(weights: csr_array, held: Mask) -> csr_array:
@@ -199,8 +199,8 @@ def _by_component(weights: csr_array, held: Mask) -> csr_array:
     return csr_array(kron(weights, eye_array(3)) @ diags_array(np.where(held, 0.0, 1.0).ravel()))
 
 
-def _joined(left: csr_array, right: csr_array) -> Blocks:
+def _joined(left: csr_array, right: csr_array) -> HessianBlocks:
     """Return the blocks of left^T right by places of nodes in the columns of both."""
     blocks = csr_array(left.T @ right).tobsr((3, 3))
     first = np.repeat(np.arange(left.shape[1] // 3), np.diff(blocks.indptr))
-    return Blocks(first, blocks.indices.astype(np.int64), blocks.data)
+    return HessianBlocks(first, blocks.indices.astype(np.int64), blocks.data)

@@ -1,15 +1,111 @@
-"""External forces and prescribed displacements that act at a time."""
+"""External forces on nodes: constant, varying in time, by users' functions, and pressures."""
 
 from collections.abc import Callable, Sequence
-from functools import reduce
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, like, to_host
-from msmpetsc.constraints.loads import Anchor, Load, OwnForce, Pressure, Varying
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
+from msmpetsc.constraints.time_functions import Lines, Timed
 from msmpetsc.elasticity.pressure import Pressures
+from msmpetsc.errors import InputError
+from msmpetsc.extensions import ForceFunction
 from msmpetsc.lattice.lattice import Lattice
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from msmpetsc.lattice.embedded_surface import SurfacePart
+
+# the function 1
+ALWAYS = Lines(np.zeros(1), np.ones((1, 1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Varying(Timed):
+    """A load with a total over time."""
+
+    total: Lines
+
+    def state_at(self, time: float) -> Floats:
+        """Return the total at a time [s]; zeros if the load does not act."""
+        return self.acts_at(time) * self.total.value_at(time)
+
+    def mean(self, begin: float, end: float) -> Floats:
+        """Return the mean of the total from begin to end [s]."""
+        return self.total.mean(begin, end, self.start, self.stop)
+
+    @property
+    def events(self) -> list[float]:
+        """Return the times [s] at which the load begins, ends or changes its slope."""
+        return [*super().events, *self.total.times.tolist()]
+
+
+@dataclass(frozen=True)
+class Load(Varying):
+    """A force on nodes, a share of a total.
+
+    share : (owned, 1) share of each node in the total [-]; mass [kg] of gravity, area [m^2] of
+            tractions
+    total : total force [N]; the acceleration [m/s^2] of gravity, a traction [Pa]
+    """
+
+    share: Rows
+
+
+@dataclass(frozen=True)
+class PressureLoad(Varying):
+    """A pressure [Pa] on a part of the surface, positive if it pushes into the body."""
+
+    part: "SurfacePart"
+
+
+@dataclass(frozen=True)
+class OwnForce(Varying):
+    """A force that a user's function defines (extensions.register_force).
+
+    key      : key of its table in the scene, for messages
+    function : from positions (k, 3) [m], velocities (k, 3) [m/s] and time [s] to (k, 3) [N/kg]
+    rows     : (k,) owned nodes in its region
+    mass     : (k,) their masses [kg]
+    total    : factor of the function [-]
+    """
+
+    key: str
+    function: ForceFunction
+    rows: Indices
+    mass: Floats
+    total: Lines = field(default=ALWAYS, kw_only=True)
+
+    def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
+        """Return the force (owned, 3) [N] at positions q and velocities v (owned, 3).
+
+        Raises InputError if the function's result has a wrong shape or is not finite.
+        """
+        force = np.zeros((len(q), 3))
+        if not len(self.rows):
+            return force
+        # A user's function may divide by zero: its result is checked below.
+        with np.errstate(all="warn"):
+            per_mass = np.asarray(self.function(q[self.rows], v[self.rows], time), float)
+        try:
+            force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
+        except ValueError:
+            words = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
+            raise InputError(f"{self.key}.function: {words}") from None
+        if not np.isfinite(force).all():
+            raise InputError(
+                f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)"
+            )
+        return force
+
+
+def shares_by_mass(comm: "MPI.Comm", where: Mask, mass: Floats) -> Rows:
+    """Return each node's share (owned, 1) by mass of a force on ``where`` (owned,) (collective)."""
+    loaded = np.where(where, mass, 0.0)
+    share: Rows = loaded[:, None] / comm.allreduce(loaded.sum())
+    return share
 
 
 class ExternalForces(NamedTuple):
@@ -39,7 +135,7 @@ class ActingForces:
         lattice: Lattice,
         loads: Sequence[Load],
         own_forces: Sequence[OwnForce],
-        pressures: Sequence[Pressure] = (),
+        pressures: Sequence[PressureLoad] = (),
     ):
         self.lattice, self.loads, self.own_forces = lattice, loads, own_forces
         self.pressures = pressures
@@ -99,35 +195,3 @@ class ActingForces:
                 force = force + share * own
         values = [float(total(pressure)[0]) for pressure in self.pressures]
         return ExternalForces(force, Pressures([p.part for p in self.pressures], values))
-
-
-class Anchors:
-    """Anchors, and the nodes that pins and anchors hold. Positions are local, (l, 3) [m]."""
-
-    def __init__(self, lattice: Lattice, anchors: Sequence[Anchor]):
-        self.lattice, self.all = lattice, anchors
-
-    def acting(self, time: float) -> list[Anchor]:
-        """Return the anchors that act at a time [s]."""
-        return [anchor for anchor in self.all if anchor.acts_at(time)]
-
-    def fixed_at(self, time: float) -> Mask:
-        """Return the mask (l, 3) of components that are held at a time [s]: no unknowns."""
-        return reduce(
-            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.held
-        )
-
-    def prescribed(
-        self, q: Positions, time: float, begin: float = 0.0, share: float = 1.0
-    ) -> Positions | None:
-        """Return q with the anchored nodes at their prescribed positions; None without anchors.
-
-        begin, share : the anchors made this share of their motion from ``begin`` [s] to ``time``
-        """
-        anchors = self.acting(time)
-        if not anchors:
-            return None
-        for anchor in anchors:
-            pose = (1 - share) * anchor.path.value_at(begin) + share * anchor.path.value_at(time)
-            q = np.where(anchor.where, anchor.path.moved(self.lattice.nodes, pose), q)
-        return q

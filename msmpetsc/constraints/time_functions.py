@@ -1,24 +1,15 @@
-"""Forces on nodes, anchors, and the prescribed motion of anchors and obstacles."""
+"""Functions of time: totals of loads, rigid motions, and the times at which a load acts."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
-from msmpetsc.errors import InputError
-from msmpetsc.extensions import ForceFunction
+from msmpetsc.backend.arrays import Floats, Positions, Rows, like
 from msmpetsc.scene.motion import ForceTable, Pose
 from msmpetsc.scene.values import Vector
-
-# for type checkers only: pictures need this file, and no MPI or trimesh
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
-    from msmpetsc.lattice.embedded_surface import SurfacePart
 
 # relative tolerance of times [-]; a multiple of the time step may be rounded down
 SAME_TIME = 1e-12
@@ -122,10 +113,6 @@ class Motion(Lines):
         return (x - center) @ rotation.T + center + by
 
 
-# the function 1
-ALWAYS = Lines(np.zeros(1), np.ones((1, 1)))
-
-
 def total_of(total: Vector | ForceTable | float) -> Lines:
     """Return a scene's load over time, [N] or [Pa]; a constant load has a single time."""
     if isinstance(total, ForceTable):
@@ -148,100 +135,3 @@ class Timed:
     def events(self) -> list[float]:
         """Return the times [s] at which the load begins, ends or changes its slope."""
         return [self.start, *([] if self.stop is None else [self.stop])]
-
-
-@dataclass(frozen=True)
-class Anchor(Timed):
-    """Nodes with a prescribed displacement along a path, until the anchor releases them.
-
-    where : (l, 3) bool, the prescribed components of the nodes, ghosts included
-    """
-
-    where: Mask
-    path: Motion
-
-
-@dataclass(frozen=True, kw_only=True)
-class Varying(Timed):
-    """A load with a total over time."""
-
-    total: Lines
-
-    def state_at(self, time: float) -> Floats:
-        """Return the total at a time [s]; zeros if the load does not act."""
-        return self.acts_at(time) * self.total.value_at(time)
-
-    def mean(self, begin: float, end: float) -> Floats:
-        """Return the mean of the total from begin to end [s]."""
-        return self.total.mean(begin, end, self.start, self.stop)
-
-    @property
-    def events(self) -> list[float]:
-        """Return the times [s] at which the load begins, ends or changes its slope."""
-        return [*super().events, *self.total.times.tolist()]
-
-
-@dataclass(frozen=True)
-class Load(Varying):
-    """A force on nodes, a share of a total.
-
-    share : (owned, 1) share of each node in the total [-]; mass [kg] of gravity, area [m^2] of
-            tractions
-    total : total force [N]; the acceleration [m/s^2] of gravity, a traction [Pa]
-    """
-
-    share: Rows
-
-
-@dataclass(frozen=True)
-class Pressure(Varying):
-    """A pressure [Pa] on a part of the surface, positive if it pushes into the body."""
-
-    part: "SurfacePart"
-
-
-@dataclass(frozen=True)
-class OwnForce(Varying):
-    """A force that a user's function defines (extensions.register_force).
-
-    key      : key of its table in the scene, for messages
-    function : from positions (k, 3) [m], velocities (k, 3) [m/s] and time [s] to (k, 3) [N/kg]
-    rows     : (k,) owned nodes in its region
-    mass     : (k,) their masses [kg]
-    total    : factor of the function [-]
-    """
-
-    key: str
-    function: ForceFunction
-    rows: Indices
-    mass: Floats
-    total: Lines = field(default=ALWAYS, kw_only=True)
-
-    def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
-        """Return the force (owned, 3) [N] at positions q and velocities v (owned, 3).
-
-        Raises InputError if the function's result has a wrong shape or is not finite.
-        """
-        force = np.zeros((len(q), 3))
-        if not len(self.rows):
-            return force
-        # A user's function may divide by zero: its result is checked below.
-        with np.errstate(all="warn"):
-            per_mass = np.asarray(self.function(q[self.rows], v[self.rows], time), float)
-        try:
-            force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
-        except ValueError:
-            words = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
-            raise InputError(f"{self.key}.function: {words}") from None
-        if not np.isfinite(force).all():
-            raise InputError(
-                f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)"
-            )
-        return force
-
-
-def shares_by_mass(comm: "MPI.Comm", where: Mask, mass: Floats) -> Rows:
-    """Return each node's share (owned, 1) by mass of a force on ``where`` (owned,) (collective)."""
-    loaded = np.where(where, mass, 0.0)
-    share: Rows = loaded[:, None] / comm.allreduce(loaded.sum())
-    return share

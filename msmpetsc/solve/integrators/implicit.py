@@ -4,19 +4,10 @@ Both integrators solve  M (x - y) + tau^2 (grad E(x) - f_ext) = 0  for x. They d
 positions without forces, and in tau, which is a fixed part of the time step t. In f_ext, loads have
 means over steps, so that their impulse on a free body is their integral over time.
 
-Mass-proportional damping adds -alpha M v to the forces. With v = (x - c) / tau and y = c + tau w,
-
-    M (x - c - tau w) + tau alpha M (x - c) + tau^2 (grad E(x) - f_ext) = 0.
-
-Division by 1 + alpha tau gives an undamped problem with
-
-    y = c + tau w / (1 + alpha tau)    and    tau^2 / (1 + alpha tau) for tau^2.
-
-Damping therefore costs nothing. Without forces, a step divides the velocity by 1 + alpha tau.
-
-For a viscous solid, E contains the dissipation over the step (elasticity.viscosity), with x^ = c.
-The rates of implicit Euler belong to the mid-step rotation, and the rates of BDF2 to the step's
-end.
+The velocity at the end is v = (x - c) / tau, and y = c + tau w. Mass-proportional damping changes y
+and tau (solve.integrators.mass_damping). For a viscous solid, E contains the dissipation over the
+step (elasticity.viscosity), with x^ = c. The rates of implicit Euler belong to the mid-step
+rotation, and the rates of BDF2 to the step's end.
 """
 
 from collections.abc import Callable
@@ -36,6 +27,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators.integrator import Integrator, State
+from msmpetsc.solve.integrators.mass_damping import carried_time, equivalent_tau
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.events import CONTACT
@@ -198,7 +190,7 @@ class ImplicitEuler(Integrator):
     @property
     def damped_tau(self) -> float:
         """Return tau [s] of the damped problem."""
-        return self.tau / float(np.sqrt(1 + self.damping * self.tau))
+        return equivalent_tau(self.tau, self.damping)
 
     def _rates(
         self, q: Positions, y: Positions, q_before: Positions | None
@@ -213,10 +205,6 @@ class ImplicitEuler(Integrator):
             return q, 0.5 * (q + y)
         return (4 * q - q_before) / 3, y
 
-    def _carried(self, duration: float) -> float:
-        """Return the time [s] for which a velocity acts within a damped ``duration`` [s]."""
-        return duration / (1 + self.damping * duration)
-
     def set_up(self) -> None:
         """Build the preconditioner (collective). Raises InputError if PETSc lacks it."""
         self.stepper.set_up()
@@ -227,7 +215,8 @@ class ImplicitEuler(Integrator):
         self.environment.forces.begin_step(q, state.velocity(time_step), time - time_step)
         y = 2 * q - state.q_previous
         if self.damping:
-            y = q + self._carried(time_step) / time_step * (q - state.q_previous)
+            carried = carried_time(time_step, self.damping)
+            y = q + carried / time_step * (q - state.q_previous)
         load = self.environment.forces.mean(time - time_step, time)
         result, sides = self._solve(state, y, load, time, time_step)
         after, before, work = self.environment.obstacles.strike(
@@ -367,7 +356,8 @@ class Bdf2(ImplicitEuler):
         else:
             load = forces.ahead(begin - (state.span or self.time_step), begin, time)
         q_0, v_0 = history
-        y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
+        carried = carried_time(self.tau, self.damping)
+        y = (4 * q - q_0 + carried * (4 * v - v_0)) / 3
         result, sides = self._solve(state, y, load, time, self.time_step, q_0)
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
@@ -401,7 +391,8 @@ class Bdf2(ImplicitEuler):
         nearly tau^2 |a|_M (1 - |a|_M^2 / a_n^T M a).
         """
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
-        result, _ = self._solve(state, q + self._carried(tau) * v, load, time - t + tau, tau)
+        y = q + carried_time(tau, self.damping) * v
+        result, _ = self._solve(state, y, load, time - t + tau, tau)
         a = ((result.position - q) / tau - v) / tau
         history = q - t * v + t**2 / 2 * a, v - t * a
         return history, self._begun_error(result), result.cost

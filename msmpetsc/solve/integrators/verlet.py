@@ -40,6 +40,7 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import OSCILLATION_CREDIT
 from msmpetsc.solve.integrators.integrator import Integrator, State
+from msmpetsc.solve.integrators.mass_damping import decay
 from msmpetsc.solve.linear.ghosts import Ghosted
 from msmpetsc.solve.linear.largest_eigenvalue import HighestMode
 from msmpetsc.solve.nonlinear.step import StepResult
@@ -284,7 +285,7 @@ class Verlet(Integrator):
     def _damp(self, duration: float) -> None:
         """Damp the velocities of the free nodes over a duration [s] by exp(-alpha dt)."""
         if self.damping:
-            self.v[self.free] *= np.exp(-self.damping * duration)
+            self.v[self.free] *= decay(duration, self.damping)
 
     def _drift(self, begin: float, end: float) -> None:
         """Move q to the end of a substep: anchored nodes on their paths, impacts reflected."""

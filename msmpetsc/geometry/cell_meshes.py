@@ -77,7 +77,8 @@ MeshBlocks = Sequence[tuple[Kind | None, Indices]]
 def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
     """Return points (v, 3), triangles (f, 3) and named triangles of a file that meshio reads.
 
-    The triangles are the boundary of the volume cells; if there are none, the triangles and quads.
+    The triangles are the boundary of the volume cells, or the file's triangles and quads if there
+    are no volume cells.
     """
     # imported here because it is slow and few scenes need it
     import meshio

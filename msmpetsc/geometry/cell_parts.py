@@ -4,7 +4,7 @@ A slit narrower than a cell leaves several parts of the body in a cell. They are
 
 1. The triangles in a cell that are joined by mesh edges within the cell are a piece of surface.
    The body along the inner side of a piece is connected. So a cell has at most as many parts as
-   pieces. Triangles that end in a low face of the cell bound the body below: a piece apart.
+   pieces. Triangles that end in a low face of the cell bound the body below: a separate piece.
 2. In a cell of several pieces, LINES x LINES lines run along each axis, and their crossings form a
    grid of points. Neighbouring points, and points and pieces, are joined if the line between them
    is inside the body. Pieces that are joined bound the same part.
@@ -92,22 +92,22 @@ class PartsOfPoints:
 class CellParts:
     """Parts of the body in the cells that a closed surface cuts.
 
-    keys    : (b,) packed grid indices of the cut cells, ascending
-    count   : (b,) number of parts in each cell
-    links   : parts of neighbouring cut cells that meet
-    faces   : (b, 6) parts at the faces of each cell as bit masks, the low faces first; 1 in a cell
-              of a single part
-    apart   : (b,) whether a common face with another cut cell lies outside the body
-    shares  : (s, 2, 2, 2) share of each part of the several in a cell of the fill of the corners
-    spread  : (s, 3) the same of the second moments
-    points  : parts of points on the surface
+    keys      : (b,) packed grid indices of the cut cells, ascending
+    count     : (b,) number of parts in each cell
+    links     : parts of neighbouring cut cells that meet
+    faces     : (b, 6) parts at the faces of each cell as bit masks, the low faces first; 1 in a
+                cell of a single part
+    separated : (b,) whether a common face with another cut cell lies outside the body
+    shares    : (s, 2, 2, 2) shares of the fill at corners, for each part of cells of several parts
+    spread    : (s, 3) shares of the second moments, for the same parts
+    points    : parts of points on the surface
     """
 
     keys: Indices
     count: Indices
     links: Links
     faces: Array
-    apart: Mask
+    separated: Mask
     shares: Rows
     spread: Rows
     points: PartsOfPoints
@@ -153,12 +153,13 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     at_faces[several] = np.arange(split.faces.shape[0] * 6).reshape(-1, 6)
     sides = Sides(at_faces, split.faces.reshape(-1, LINES**2))
     crossing = _crossing_rows(codes, keys, size, flush, ends)
-    links, apart = _links(surface, grid, keys, cell, part, crossing, sides)
+    links, separated = _links(surface, grid, keys, cell, part, crossing, sides)
     own = _rows_of(cell, several)
     own = own[part[own] >= 0]
     of_several = np.searchsorted(several, cell[own])
     points = PartsOfPoints(surface, keys[several], of_several, triangle[own], part[own])
-    return CellParts(keys, count, links, sides.masks(), apart, split.shares, split.spread, points)
+    masks = sides.masks()
+    return CellParts(keys, count, links, masks, separated, split.shares, split.spread, points)
 
 
 def _rows_in_cells(
@@ -244,7 +245,7 @@ def _flush(corners: Rows, triangle: Indices, keys: Indices, cell: Indices) -> Ar
 def _ends_of_edges(
     codes: Indices, size: int, number: Indices, one: Indices, other: Indices
 ) -> Indices:
-    """Return the two rows (2, e) of a cell that mesh edges in the cell join.
+    """Return the two triangles' rows (2, e) of a cell that mesh edges in the cell join.
 
     number     : (e,) number of the cell, -1 if there is none
     one, other : (e,) triangles at the edge
@@ -318,7 +319,7 @@ def _links(
     crossing: list[Indices],
     sides: Sides,
 ) -> tuple[Links, Mask]:
-    """Return the parts of neighbouring cut cells that meet, and the mask (b,) of ``apart``.
+    """Return the parts of neighbouring cut cells that meet, and the mask (b,) of ``separated``.
 
     cell     : (r,) cell of each row
     part     : (r,) part of each row, -1 for a piece that bounds no part of the cell
@@ -337,7 +338,7 @@ def _links(
     middles = ijk[low] + 0.5 + (0.5 - BESIDE) * steps[axes]
     asked[axes, low] = is_inside(surface, grid.node_positions(middles))
     links: list[Indices] = []
-    apart = np.zeros(len(keys), bool)
+    separated = np.zeros(len(keys), bool)
     for axis, (below, above) in enumerate(bounding):
         found = [np.stack([cell[below], part[below], part[above]])]
         low = np.flatnonzero(beyond[axis] >= 0)
@@ -357,9 +358,9 @@ def _links(
         own, p, q = np.unique(np.concatenate(found, axis=1), axis=1)
         links.append(np.stack([own, beyond[axis, own], np.full_like(own, axis), p, q]))
         lonely = np.setdiff1d(low, own)
-        apart[lonely] = apart[beyond[axis, lonely]] = True
+        separated[lonely] = separated[beyond[axis, lonely]] = True
     low, high, axes, p, q = np.concatenate(links, axis=1)
-    return Links(low, high, axes, np.stack([p, q], axis=1)), apart
+    return Links(low, high, axes, np.stack([p, q], axis=1)), separated
 
 
 class Split(NamedTuple):

@@ -104,24 +104,24 @@ def _copies_of_body(
 def _suspects(parts: CellParts) -> Indices:
     """Return the nodes (n, 3) that may have copies.
 
-    They are the corners of cells with several parts, and of cells apart from a neighbour. If the
-    cut cells at a node do not all hang together by faces, the node may have copies, too.
+    They are the corners of cells with several parts, and of cells separated from a neighbour. If
+    the cut cells at a node are not all connected by faces, the node may have copies, too.
     """
     steps = packed(CORNERS)
     nodes = np.unique(parts.keys[:, None] + steps)
     masks = np.zeros(len(nodes), np.uint8)
     suspect = np.zeros(len(nodes), bool)
-    special = (parts.count > 1) | parts.apart
+    special = (parts.count > 1) | parts.separated
     for octant, step in enumerate(steps):
         node = np.searchsorted(nodes, parts.keys + step)
         masks[node] |= 1 << octant
         suspect[node[special]] = True
-    suspect |= _falls_apart()[masks]
+    suspect |= _disconnected()[masks]
     return unpacked(nodes[suspect])
 
 
 @cache
-def _falls_apart() -> Mask:
+def _disconnected() -> Mask:
     """Return for each mask (256,) of octants whether they do not all hang together by faces."""
     joined = [(1 << low, 1 << high) for _, low, high in FACES]
     found = np.zeros(256, bool)

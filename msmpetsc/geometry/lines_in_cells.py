@@ -203,7 +203,7 @@ def _join_unseen(
 
 @njit()
 def _seen_point(triangles: Rows, start: Floats) -> int:
-    """Return a point of the grid, of the 8 around ``start`` (3,), that no triangle hides, or -1."""
+    """Return a grid point among the 8 around ``start`` (3,) that no triangle hides, or -1."""
     for v in range(8):
         number, way = 0, np.empty(3)
         for axis in range(3):

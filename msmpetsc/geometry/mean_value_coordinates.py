@@ -183,7 +183,7 @@ def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> N
 
     corner  : 0..7
     valid   : (27,) bool
-    view    : of p
+    view    : view from p
     weights : (64,) result
 
     The 8 cells around the corner have 36 squares. The squares with a single valid side are the

@@ -114,9 +114,9 @@ def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
         known |= {name for _, name in load_scene(file).named_files()}
     for path, name in scene.named_files():
         keys = tuple(map(str, path))
-        lies_beside = (Path(file).parent / name).resolve().parent == earlier.path.resolve().parent
+        is_in_folder = (Path(file).parent / name).resolve().parent == earlier.path.resolve().parent
         by_user = any(keys[: len(user_keys)] == user_keys for user_keys in given)
-        if not (name in known or lies_beside or by_user):
+        if not (name in known or is_in_folder or by_user):
             raise InputError(
                 f"{earlier.path} names {as_given(name)}, and {as_given(file)} does not: "
                 f"name the SCENE too, or --set {'.'.join(keys)}=PATH"

@@ -78,8 +78,8 @@ class Friction:
             u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick)
         )
 
-    def held(self, q: Positions, stick: float) -> Rows:
-        """Return the elastic slips (a, 3) [m] that the next step begins with at positions q (n, 3).
+    def elastic_slip(self, q: Positions, stick: float) -> Rows:
+        """Return the elastic slips (a, 3) [m] at positions q (n, 3), where the next step starts.
 
         stick : e of the next step [m]
         """

@@ -230,7 +230,7 @@ class TimeLoop:
         self.state.save(
             checkpoint,
             self.model.lattice.owned,
-            self.integrator.looks_back,
+            self.integrator.uses_history,
             self.environment.obstacles.has_sides,
         )
         self.integrator.save(checkpoint)

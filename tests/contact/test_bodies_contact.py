@@ -88,7 +88,7 @@ def test_cubes_side_by_side_in_the_same_plane_of_the_grid_stay_where_they_are(fo
 
 def test_bodies_that_overlap_at_rest_are_named(folder: Path):
     with pytest.raises(
-        InputError, match=r"cut others at rest.* \(of body\.0, body\.1, which must be parted"
+        InputError, match=r"cut others at rest.* \(of body\.0, body\.1, which must be moved apart"
     ):
         play(pile(folder, ["block", "block"], -0.1 * SIDE))
 
@@ -243,10 +243,10 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     energy = contacts.touch(end, 0.01).energy
     for left_out, is_right in ((1.01, True), (0.99, False)):
         assert contacts.narrow(start, 0.0) and contacts.is_left_out
-        assert contacts.after_way(start, end, left_out * energy) == (True, is_right)
+        assert contacts.check_narrow_step(start, end, left_out * energy) == (True, is_right)
         assert contacts.is_narrow != is_right and not contacts.is_left_out
     assert contacts.touch(end, 0.01).energy == pytest.approx(energy)
-    assert contacts.after_way(start, end, 0.0) == (True, True)
+    assert contacts.check_narrow_step(start, end, 0.0) == (True, True)
 
 
 def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(

@@ -116,7 +116,7 @@ def test_the_derivatives_in_a_crease_are_those_of_its_energy():
 def test_walls_are_clear_as_long_as_they_cannot_come_near():
     barrier, points, _ = barrier_of()
     candidates, reach = barrier.candidates(points, 0.0), 0.2
-    clear = barrier.clear_reach(candidates, points, reach)
+    clear = barrier.clear_margin(candidates, points, reach)
     assert 0 < clear < reach
     for seed in range(10):
         way = np.random.default_rng(seed).normal(size=points.shape)

@@ -37,7 +37,7 @@ class NodeFriction(Friction):
         """
         slips = np.zeros_like(q)
         if last:
-            slips[last.nodes] = last.held(q, self.stick)
+            slips[last.nodes] = last.elastic_slip(q, self.stick)
         return replace(self, begin=self._tangential(slips[self.nodes]))
 
     def along(self, moved: Rows) -> Rows:

@@ -25,7 +25,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.friction import STICK
-from msmpetsc.contact.surface.continuous_collision import candidates_on_ways
+from msmpetsc.contact.surface.continuous_collision import candidates_on_paths
 from msmpetsc.contact.surface.creases import creases, neighbours
 from msmpetsc.contact.surface.places import PairSet, Places, without_fading_links
 from msmpetsc.contact.surface.surface_friction import FrictionPairs, SurfaceFriction, friction_pairs
@@ -189,18 +189,18 @@ class Barrier:
                 found.add((int(min(first, second)), int(max(first, second))))
         return sorted(found)
 
-    def candidates(self, points: Positions, reach: float, moved: Rows | None = None) -> PairSets:
+    def candidates(self, points: Positions, margin: float, moved: Rows | None = None) -> PairSets:
         """Return the pairs that may come closer than dhat, and all pairs of creases.
 
-        Each point may move by ``reach`` [m], from its place or from its straight way ``moved``.
+        Each point may move by ``margin`` [m] from its place, or from its path by ``moved``.
 
         points : (p, 3) [m]
         moved  : (p, 3) [m]; None if points stay
         """
-        near = self.law.distance + 2 * reach
-        pairs = PairSet(candidates_on_ways(self.mesh, points, near, moved))
+        near = self.law.distance + 2 * margin
+        pairs = PairSet(candidates_on_paths(self.mesh, points, near, moved))
         cushions = (
-            self._cushion(points, distance + 2 * reach)
+            self._cushion(points, distance + 2 * margin)
             for distance in self.distances[len(self.creases) :]
         )
         return pairs, *self.creases[1:], *cushions
@@ -228,10 +228,10 @@ class Barrier:
         mesh.can_collide = usual
         return PairSet(pairs)
 
-    def around(self, touched: Mask, points: Positions, reach: float) -> PairSets:
+    def around(self, touched: Mask, points: Positions, margin: float) -> PairSets:
         """Return the pairs of parts that have a point in ``touched`` (p,) or next to one.
 
-        The pairs hold while points move by ``reach`` [m] from S (p, 3) [m].
+        The pairs hold while points move by ``margin`` [m] from S (p, 3) [m].
         """
         ipctk, corners, near = self.ipctk, (self.mesh.edges, self.mesh.faces), touched.copy()
         near[corners[0][touched[corners[0]].any(axis=1)]] = True
@@ -242,7 +242,7 @@ class Barrier:
             np.asfortranarray(of[chosen])
             for of, chosen in zip(corners, (edges, faces), strict=True)
         )
-        phase.build(np.asfortranarray(points), *parts, 0.5 * self.law.distance + reach)
+        phase.build(np.asfortranarray(points), *parts, 0.5 * self.law.distance + margin)
         ends = [(pair.edge0_id, pair.edge1_id) for pair in phase.detect_edge_edge_candidates()]
         found.ee_candidates = [ipctk.EdgeEdgeCandidate(edges[i], edges[j]) for i, j in ends]
         met = [(pair.face_id, pair.vertex_id) for pair in phase.detect_face_vertex_candidates()]
@@ -255,17 +255,18 @@ class Barrier:
             )
         return tuple(map(PairSet, sets))
 
-    def clear_reach(self, sets: PairSets, points: Positions, reach: float) -> float:
-        """Return the displacement [m] of points, at most ``reach``, below which no pair pushes.
+    def clear_margin(self, sets: PairSets, points: Positions, margin: float) -> float:
+        """Return the displacement [m] of points, at most ``margin``, below which no pair pushes.
 
         Return 0 if a pair pushes already.
         """
         for pairs, distance in zip(sets, self.distances, strict=True):
             near = self.ipctk.NormalCollisions()
-            near.build(pairs.candidates, self.mesh, np.asfortranarray(points), distance + 2 * reach)
+            limit = distance + 2 * margin
+            near.build(pairs.candidates, self.mesh, np.asfortranarray(points), limit)
             if not near.empty():
-                reach = min(reach, max(0.5 * (self._least(near, points) - distance), 0.0))
-        return reach
+                margin = min(margin, max(0.5 * (self._least(near, points) - distance), 0.0))
+        return margin
 
     def contacts(self, sets: PairSets, points: Positions) -> ContactSets:
         """Return the pairs that push at points (p, 3) [m]."""
@@ -313,8 +314,7 @@ class Barrier:
     def friction(
         self, contacts: ContactSets, points: Positions, start: Positions, stick: float
     ) -> SurfaceFriction | None:
-        """Return Coulomb's friction with the normal forces at points (p, 3) [m]; None without
-        contact.
+        """Return Coulomb's friction by the normal forces at points (p, 3) [m], or None.
 
         start : (p, 3) positions of points without slip [m]
         stick : slip below which friction fades [m]
@@ -363,7 +363,7 @@ class Barrier:
         return np.array(numbers, np.int64)
 
     def clearance(self, contacts: ContactSets, sets: PairSets, points: Positions) -> float:
-        """Return a lower bound of the candidates' distances [m], by their contacts at S (p, 3)."""
+        """Return a lower bound [m] of candidate pairs' distances, by their contacts at S (p, 3)."""
         # A larger distance of obstacles has the same pairs
         known = zip(contacts, sets, self.distances, strict=False)
         least = (

@@ -109,7 +109,7 @@ def _prepared(
         # Points within ON_PLANE of a plane of the grid snap to it, which would close a
         # smaller gap
         gap = max(NEAREST * (table.distance or NEAR * longest), 2 * ON_PLANE * longest)
-        bodies = _without_cut(_parted(bodies, gap))
+        bodies = _without_crossing_triangles(_parted(bodies, gap))
     ends = np.concatenate(
         [b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies]
     )
@@ -185,7 +185,7 @@ def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
     return [Surface(body.points - gap * outward(body), body.triangles) for body in bodies]
 
 
-def _without_cut(bodies: list[Surface]) -> list[Surface]:
+def _without_crossing_triangles(bodies: list[Surface]) -> list[Surface]:
     """Return surfaces without crossing triangles. Raises InputError if too many cross."""
     whole = joined(bodies)
     assert whole is not None
@@ -197,7 +197,7 @@ def _without_cut(bodies: list[Surface]) -> list[Surface]:
     ends = np.cumsum([len(body.triangles) for body in bodies])[:-1]
     if len(of := np.unique(np.searchsorted(ends, cut, side="right"))) > 1:
         names = ", ".join(f"body.{number}" for number in of)
-        fault += f" (of {names}, which must be parted if they overlap)"
+        fault += f" (of {names}, which must be moved apart if they overlap)"
     if len(cut) > MOST_CUT * len(whole.triangles):
         raise InputError(
             f"{fault}, too many to leave out: "
@@ -211,7 +211,7 @@ def _without_cut(bodies: list[Surface]) -> list[Surface]:
 def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:
     """Return the median distance [m] of the bodies' points from the coarser surfaces.
 
-    Warn of the greatest distance, which shows a part that was lost.
+    Warn if the greatest distance shows that a part was lost.
     """
     import igl
 

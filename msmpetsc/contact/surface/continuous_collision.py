@@ -1,9 +1,9 @@
-"""Continuous collision detection (CCD): the share of straight ways on which no triangles cross.
+"""Continuous collision detection (CCD): the share of straight paths on which no triangles cross.
 
-The broad phase finds the pairs that may meet on the ways. The narrow phase is ipctk's additive CCD
+The broad phase finds the pairs that may meet on the paths. The narrow phase is ipctk's additive CCD
 (Li, Kaufman and Jiang 2021, Codimensional Incremental Potential Contact). A translation that all
-points have in common is left out. The function ``free_share`` takes ways with known candidates,
-``sweep`` takes long ways piece by piece.
+points have in common is left out. The function ``free_share`` takes paths with known candidates,
+``sweep`` takes long paths piece by piece.
 """
 
 from typing import TYPE_CHECKING
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
 
     from msmpetsc.contact.surface.barrier import Barrier, PairSets
 
-# Share of the way to a crossing that a step takes
+# Share of the path to a crossing that a step takes
 TAKEN = 0.9
-# Edges that points move in a piece of a long way
+# Edges that points move in a piece of a long path
 PIECE = 2.0
-# Most pieces of a way; a longer way is shortened
+# Most pieces of a path; a longer path is shortened
 PIECES = 200
-# Greatest linear part of a way that boxes leave out; beyond, its allowance makes boxes
-# larger
+# Greatest linear part of displacements that boxes leave out; the allowance for a larger
+# part would enlarge the boxes
 STRETCHED = 0.2
 
 
-def candidates_on_ways(
+def candidates_on_paths(
     mesh: "ipctk.CollisionMesh", points: Positions, near: float, moved: Rows | None
 ) -> "ipctk.Candidates":
-    """Return the pairs that may come closer than ``near`` on the ways of points by ``moved``.
+    """Return the pairs that may come closer than ``near`` on the paths of points by ``moved``.
 
-    The linear part of the ways, m = c + G x + r, would enlarge the boxes around them. If a pair
-    is closer than d on its way, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
+    The linear part of the displacements, m = c + G x + r, would enlarge the boxes around paths. If
+    a pair is closer than d on its path, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
     ``|x - x'| < (d + 2 max |r|) / (1 - |G|)``, and boxes around r suffice.
 
     points : (p, 3) [m]
@@ -64,16 +64,16 @@ def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
 
 
 def free_share(barrier: "Barrier", start: Positions, moved: Rows, sets: "PairSets") -> float:
-    """Return the free share of the ways from start (p, 3) by ``moved`` (p, 3) [m].
+    """Return the free share of the paths from start (p, 3) by ``moved`` (p, 3) [m].
 
-    sets : candidate pairs of the ways
+    sets : candidate pairs of the paths
     """
     share = _share_to_crossing(barrier, start, start + moved - moved.mean(axis=0), sets)
     return share if share >= 1 else TAKEN * share
 
 
 def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
-    """Return the free share of ways of any length, with candidates of each piece."""
+    """Return the free share of paths of any length, with new candidates for each piece."""
     moved = moved - moved.mean(axis=0)
     whole = max(
         int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * barrier.edge))), 1
@@ -90,10 +90,10 @@ def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
 def _share_to_crossing(
     barrier: "Barrier", start: Positions, end: Positions, sets: "PairSets"
 ) -> float:
-    """Return the share of ways up to the first crossing of candidates."""
-    ways = barrier.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, barrier.ccd
+    """Return the share of paths before the first crossing of candidate pairs."""
+    paths = barrier.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, barrier.ccd
     shares = (
-        pairs.candidates.compute_collision_free_stepsize(*ways)
+        pairs.candidates.compute_collision_free_stepsize(*paths)
         for pairs in sets[: len(barrier.creases)]
         if len(pairs)
     )

@@ -75,9 +75,9 @@ class Parts(NamedTuple):
 
 
 @njit(inline="always")
-def _number(mesh: Mesh, kind: int, first: int, second: int, way: int) -> int:
+def _number(mesh: Mesh, kind: int, first: int, second: int, case: int) -> int:
     """Return the number of a place."""
-    return ((kind * mesh.size + first) * mesh.size + second) * (CROSSING + 1) + way
+    return ((kind * mesh.size + first) * mesh.size + second) * (CROSSING + 1) + case
 
 
 @njit(inline="always")
@@ -155,7 +155,7 @@ def _crossing(first: Vector, second: Vector, offset: Vector) -> tuple[float, flo
 def add_faces(pairs: Indices, mesh: Mesh, points: Positions, limit: float, parts: Parts) -> int:
     """Write the parts of pairs (2, k) of a triangle and a vertex. Return the number of parts.
 
-    limit : squared distance [m^2] from which on a pair has no parts
+    limit : squared distance [m^2]; pairs at it or beyond have no parts
     """
     n = 0
     for i in range(pairs.shape[1]):
@@ -185,7 +185,7 @@ def add_edges(
 ) -> int:
     """Write the parts of pairs (2, k) of edges, from part n on. Return the number of all parts.
 
-    limit : squared distance [m^2] from which on a pair has no parts
+    limit : squared distance [m^2]; pairs at it or beyond have no parts
     """
     for i in range(pairs.shape[1]):
         one, other, pair = pairs[0, i], pairs[1, i], n

@@ -20,8 +20,8 @@ LONGEST_EDGE = 4.0
 MOST_TRIANGLES = 10_000
 # Subdivisions of an icosahedron; it is then 5e-4 of its radius off the ball
 ROUND = 4
-# Distance from an obstacle beyond which nodes change to their own way [cells, or longer
-# ways]
+# Distance from an obstacle beyond which nodes move on their own [cells, or longer
+# displacements]
 NEARBY = 4.0
 # Least distance of inverse distances [cells]
 TOUCHING = 1e-9
@@ -65,7 +65,7 @@ class ObstacleSurfaces:
             [path.moved(solid.points, path.value_at(time)) for path, solid in paths]
         )
 
-    def way(self, begin: float, end: float) -> Rows:
+    def displacements(self, begin: float, end: float) -> Rows:
         """Return displacements (o, 3) [m] of the points between two times [s].
 
         Return zeros (1, 3) if all are at rest.
@@ -98,17 +98,17 @@ class ObstacleSurfaces:
         distances : of each node from each obstacle (n, k) [m]
         """
         weights, near = np.zeros((len(q), 1)), np.zeros((len(q), 1))
-        way = np.zeros_like(q)
+        carried = np.zeros_like(q)
         begin, end = times
         for path, distance in zip(
             (o.path for o in self.obstacles), distances.T[:, :, None], strict=True
         ):
             of_obstacle = path.moved(path.unmoved(q, path.value_at(begin)), path.value_at(end)) - q
             weight = 1 / np.maximum(distance, TOUCHING * cell)
-            way, weights = way + weight * of_obstacle, weights + weight
+            carried, weights = carried + weight * of_obstacle, weights + weight
             length = np.maximum(np.linalg.norm(of_obstacle, axis=1), cell)[:, None]
             near = np.maximum(near, (1 + (NEARBY * cell - distance) / (NEARBY * length)).clip(0, 1))
-        return moved + near * (way / weights - moved)
+        return moved + near * (carried / weights - moved)
 
 
 def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> ObstacleSurfaces:

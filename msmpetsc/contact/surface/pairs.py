@@ -1,9 +1,9 @@
 """Contacts of a surface with itself and with obstacles, with candidate pairs cached.
 
-The broad phase finds candidate pairs around given positions. They serve until a point leaves the
-region around its place there; a common translation does not count. If no candidate can come near,
-displacements of nodes tell, and no point is computed. Otherwise points tell, since light nodes
-around a body swing much farther than its points.
+The broad phase finds candidate pairs at given positions. The pairs are valid until a point has
+moved by more than a margin; a common translation does not count. A bound by displacements of nodes
+comes first: if no candidate pair can come near, no point is computed. Otherwise the points decide,
+since light nodes around a body swing much farther than its points.
 
 Candidate pairs outlive a step (``NearPairs``). Contacts at positions are kept during a step
 (``Contacts``). If few points touch, a step is narrow: it uses the candidates around these points,
@@ -74,34 +74,34 @@ class Touch:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Candidate pairs that serve while points stay within ``reach`` of their places or ways.
+    """Candidate pairs that are valid while points stay within a margin of their places or paths.
 
     A common translation of all points does not count.
 
     q      : positions (owned, 3) [m] of the broad phase
     time   : of the places of obstacles [s]
-    reach  : [m]
-    clear  : displacement [m], at most reach, below which no pair comes near enough to push
+    margin : [m]
+    clear  : displacement [m], at most the margin, below which no pair pushes
     points : S (p, 3) [m] at q, on rank 0
     sets   : candidate pairs, on rank 0
-    moved  : straight ways (p, 3) [m] of the points, on rank 0; None without ways
+    moved  : straight paths (p, 3) [m] of the points, on rank 0; None if points stay
     """
 
     q: Positions
     time: float
-    reach: float
+    margin: float
     clear: float
     points: Positions
     sets: PairSets
     moved: Rows | None = None
 
     def serve(self, points: Positions) -> bool:
-        """Return whether points S (p, 3) [m] are within reach, on rank 0."""
+        """Return whether points S (p, 3) [m] are within the margin, on rank 0."""
         gone = points - self.points
         if self.moved is not None:
-            gone, way = gone - gone.mean(axis=0), self.moved - self.moved.mean(axis=0)
-            gone -= np.clip(np.vdot(gone, way) / (np.vdot(way, way) + TINY), 0.0, 1.0) * way
-        return farthest(gone) <= self.reach
+            gone, path = gone - gone.mean(axis=0), self.moved - self.moved.mean(axis=0)
+            gone -= np.clip(np.vdot(gone, path) / (np.vdot(path, path) + TINY), 0.0, 1.0) * path
+        return farthest(gone) <= self.margin
 
 
 @dataclass(frozen=True)
@@ -161,20 +161,20 @@ class NearPairs:
         return self._known[0]
 
     def broad_phase(
-        self, q: Positions, time: float, reach: float, moved: Rows | None = None
+        self, q: Positions, time: float, margin: float, moved: Rows | None = None
     ) -> Pairs:
-        """Find candidates at q, or on the ways of points from there by ``moved`` (p, 3) [m]."""
-        points, reach = (
+        """Find candidate pairs at q, or on the paths from there by ``moved`` (p, 3) [m]."""
+        points, margin = (
             self.points(q, time),
-            min(max(reach, LEAST * self.edge), FARTHEST * self.edge),
+            min(max(margin, LEAST * self.edge), FARTHEST * self.edge),
         )
         sets: PairSets = ()
         clear = 0.0
         if self.barrier:
-            sets = self.barrier.candidates(points, reach, moved)
-            clear = self.barrier.clear_reach(sets, points, reach) if moved is None else 0.0
+            sets = self.barrier.candidates(points, margin, moved)
+            clear = self.barrier.clear_margin(sets, points, margin) if moved is None else 0.0
         newest = Pairs(
-            q[: self.owned].copy(), time, reach, self.comm.bcast(clear), points, sets, moved
+            q[: self.owned].copy(), time, margin, self.comm.bcast(clear), points, sets, moved
         )
         self._known = [newest, *self._known[: REMEMBERED - 1]]
         return newest
@@ -183,7 +183,7 @@ class NearPairs:
         """Return a bound [m] of points' displacements from start to end, without a translation."""
         moved = end[: self.owned] - start[: self.owned]
         if self.points.obstacles.total:
-            moved = np.vstack([moved, self.points.obstacles.way(begin, time)])
+            moved = np.vstack([moved, self.points.obstacles.displacements(begin, time)])
         # numpy reduces along the last axis twenty times as fast
         along = np.ascontiguousarray(moved.T)
         ends = [
@@ -239,7 +239,7 @@ class Contacts:
 
         time        : of obstacles [s]; None for the end of the step
         with_points : compute the points even if nothing is near
-        base        : start of a way to q whose free share will be asked for next
+        base        : start of a path to q whose free share is computed next
         """
         q, time = q[: self.owned], self.time if time is None else time
         for moment in self._moments:
@@ -250,7 +250,7 @@ class Contacts:
         if bound < pairs.clear and not with_points:
             return ContactsAt(q, time, 0, np.empty((0, 3)), ())
         points = self.points_at(q, time)
-        if bound > pairs.reach and not self.is_narrow:
+        if bound > pairs.margin and not self.is_narrow:
             pairs = self.near.serving(points) or self._broad_phase(q, time, points, base)
         sets = self._around if self.is_narrow else pairs.sets
         contacts = self.barrier.contacts(sets, points) if self.barrier else ()
@@ -262,8 +262,7 @@ class Contacts:
         return self._moments[0]
 
     def narrow(self, q: Positions, time: float) -> bool:
-        """Use candidates around the contacts at q and a time [s], and around earlier contacts,
-        alone.
+        """Use only candidates around the contacts at q and a time [s], and around earlier contacts.
 
         If too many points touch, use all candidates. Return whether the step is narrow.
         """
@@ -301,19 +300,19 @@ class Contacts:
         self.widen()
         self.near.forget()
 
-    def after_way(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
-        """Return whether the way of a narrow step from q to x is free, and whether x is right.
+    def check_narrow_step(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
+        """Return whether the path of a narrow step from q to x is free, and whether x is right.
 
-        At a right x the energy of all pairs is within ``left_out`` [J] of the known pairs' energy.
-        From then on all candidates are used. If the way is free and x is not right, the step stays
-        narrow, with the candidates around all contacts at x.
+        The solution x is right if the contact energy of all pairs is within ``left_out`` [J] of the
+        energy of the pairs used. From then on all candidates are used. If the path is free and x is
+        not right, the step stays narrow, with the candidates around all contacts at x.
         """
         known = Touch() if self.is_left_out else self.touch(x, self.time)
         self.widen()
         pairs, bound = self._bound(q, self.begin, x)
         ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
         # The next steps then need no broad phase
-        if bound > pairs.reach and ahead <= FARTHEST * self.near.edge:
+        if bound > pairs.margin and ahead <= FARTHEST * self.near.edge:
             self.near.broad_phase(x, self.time, ahead)
         self.find(x, base=q)
         found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
@@ -327,7 +326,7 @@ class Contacts:
     def _broad_phase(
         self, q: Positions, time: float, points: Positions, base: Positions | None
     ) -> Pairs:
-        """Find candidates at q, with points S (p, 3) [m], and on a short way there from base."""
+        """Find candidates at q, with points S (p, 3) [m], and on a short path there from base."""
         moved = None if base is None else self.points_at(base, time) - points
         if self.comm.bcast(
             moved is not None and len(moved) > 0 and farthest(moved) > PIECE * self.near.edge
@@ -380,14 +379,14 @@ class Contacts:
     def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[Pairs, float]:
         """Return the newest candidates and a bound [m] of points' distances from their places.
 
-        The bound holds on the way from q at ``begin`` [s] to ``end``.
+        The bound holds on the path from q at ``begin`` [s] to ``end``.
         """
         pairs = self.near.around(q, begin)
         places = (q, begin), (end, self.time)
         return pairs, max(self.near.farthest(at, pairs.q, time, pairs.time) for at, time in places)
 
     def free_share(self, q: Positions, end: Positions, begin: float | None = None) -> float:
-        """Return the share of the straight way from q to ``end`` on which no two triangles meet.
+        """Return the share of the straight path from q to ``end`` on which no two triangles meet.
 
         begin : time [s] from which obstacles move to their present places; None if they stay
         """
@@ -397,14 +396,14 @@ class Contacts:
             return 1.0
         start = self.points_at(q, begin)
         moved = self.points_at(end, self.time) - start
-        way = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
-        if 2 * way < self.law.distance and 2 * way < self._clearance(q, begin):
+        length = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
+        if 2 * length < self.law.distance and 2 * length < self._clearance(q, begin):
             return 1.0
         sets = self._around
         if not self.is_narrow:
-            # Candidates must serve at both ends of the way
+            # Candidates must be valid at both ends of the path
             serving = self.near.serving(start, start + moved)
-            if not serving and way > PIECE * self.near.edge:
+            if not serving and length > PIECE * self.near.edge:
                 return float(
                     self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
                 )

@@ -123,11 +123,11 @@ class Places:
         """Return a place by its number, in ipctk's form."""
         import ipctk
 
-        kind, first, second, way = map(int, np.unravel_index(place, self._shape))
+        kind, first, second, case = map(int, np.unravel_index(place, self._shape))
         if kind == EDGES:
             fades = PARALLEL * self.mesh.squares[first] * self.mesh.squares[second]
             types = ipctk.EdgeEdgeDistanceType
-            pair = ipctk.EdgeEdgeNormalCollision(first, second, fades, types(way))
+            pair = ipctk.EdgeEdgeNormalCollision(first, second, fades, types(case))
         elif kind == FACE_VERTEX:
             pair = ipctk.FaceVertexNormalCollision(first, second)
         elif kind == EDGE_VERTEX:

@@ -67,7 +67,7 @@ class SurfaceFriction(Friction):
     def after(self, last: "SurfaceFriction | None", points: Positions) -> "SurfaceFriction":
         """Return friction that goes on from ``last``, of the last step, at points (p, 3) [m]."""
         return (
-            replace(self, begin=self.values_of(last.pairs, last.held(points, self.stick)))
+            replace(self, begin=self.values_of(last.pairs, last.elastic_slip(points, self.stick)))
             if last
             else self
         )

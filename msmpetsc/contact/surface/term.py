@@ -147,7 +147,8 @@ class SurfaceContact:
             return None
         if came is None:
             return barrier.friction(moment.contacts, moment.points, points, stick)
-        came[contacts.points.bodies :] = contacts.obstacles.way(contacts.begin, contacts.time)
+        moved = contacts.obstacles.displacements(contacts.begin, contacts.time)
+        came[contacts.points.bodies :] = moved
         friction = barrier.friction(
             moment.contacts, moment.points, points + came / 3, 2 / 3 * stick
         )
@@ -167,7 +168,7 @@ class SurfaceContact:
     def _acting(self, q: Positions, base: Positions | None = None) -> ContactsAt | None:
         """Return the contacts at q, with points for friction; None if nothing acts.
 
-        base : start of a way to q
+        base : start of a path to q
         """
         moment = self.contacts.find(q, with_points=self.has_friction, base=base)
         return moment if moment.count or self.has_friction else None
@@ -220,18 +221,18 @@ class SurfaceContact:
         weights = points.carried(touched)
         gradient[: weights.shape[1]] += weights.T @ forces
 
-    def add_change_of_gradient(self, q: Positions, way: Rows, gradient: Rows) -> None:
+    def add_change_of_gradient(self, q: Positions, displacements: Rows, gradient: Rows) -> None:
         """Add the first-order change of the gradient [N] at q as obstacles move.
 
         The Hessian is projected pair by pair.
 
-        way : (o, 3) displacements of the obstacles' points [m]
+        displacements : (o, 3) of the obstacles' points [m]
         """
         moment = self._acting(q)
         if moment is None:
             return
         moved = np.zeros_like(moment.points)
-        moved[self.contacts.points.bodies :] = way
+        moved[self.contacts.points.bodies :] = displacements
         whole = self._whole_hessian(moment, True, None)
         self._add_to_nodes(
             moved if whole is None else (whole @ moved.ravel()).reshape(-1, 3), gradient
@@ -264,8 +265,8 @@ class SurfaceContact:
         if obstacles.total and moment is not None:
             if len(moment.points):
                 forces = self._gradient(moment)[points.bodies :]
-                way = obstacles.way(self.contacts.begin, self.contacts.time) - frame
-                found = obstacles.sums(forces), float((forces * way).sum())
+                moved = obstacles.displacements(self.contacts.begin, self.contacts.time) - frame
+                found = obstacles.sums(forces), float((forces * moved).sum())
             found = self.comm.bcast(found)
         return found
 

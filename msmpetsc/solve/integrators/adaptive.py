@@ -217,7 +217,7 @@ class Adaptive(Integrator):
     last        : level of the last step
     """
 
-    looks_back = True
+    uses_history = True
 
     def __init__(
         self, scene: Scene, make: Callable[[Time, Solver], Integrator], balance: EnergyBalance

@@ -139,7 +139,7 @@ class ContactFaces:
         narrow = contacts if contacts and contacts.is_narrow else None
         if narrow:
             with CONTACT:
-                is_free, self.is_settled = narrow.after_way(self.q, x, left_out)
+                is_free, self.is_settled = narrow.check_narrow_step(self.q, x, left_out)
             if not self.is_settled:
                 self.start = x if is_free else None
                 if self.solves >= MOST_SOLVES:
@@ -336,7 +336,7 @@ class Bdf2(ImplicitEuler):
     """
 
     TAU_PER_STEP = 2 / 3
-    looks_back = True
+    uses_history = True
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.

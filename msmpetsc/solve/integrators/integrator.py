@@ -67,14 +67,14 @@ class State:
             self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None
         )
 
-    def save(self, checkpoint: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
+    def save(self, checkpoint: Checkpoint, owned: int, uses_history: bool, has_sides: bool) -> None:
         """Store the state in a checkpoint.
 
-        looks_back : whether the integrator reads the history
+        uses_history : whether the integrator reads the history
         has_sides  : whether contact reads the sides
         """
         rows = {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
-        if looks_back:
+        if uses_history:
             history = self.history or (np.zeros((owned, 3)),) * 2
             rows |= {name: part[:owned] for name, part in zip(HISTORY, history, strict=True)}
             checkpoint.keep(numbers={"history": self.history is not None})
@@ -105,11 +105,11 @@ class Integrator(Protocol):
     """Method that takes steps of a fixed length. All methods are collective.
 
     time_step  : [s]
-    looks_back : whether the method reads State.history
+    uses_history : whether the method reads State.history
     """
 
     time_step: float
-    looks_back: bool = False
+    uses_history: bool = False
 
     def set_up(self) -> None:
         """Prepare the first step. Raises InputError for options that cannot be used."""

@@ -1,7 +1,7 @@
-"""Start of a step with moving anchors or obstacles: a way to their places that crosses nothing.
+"""Start of a step with moving anchors or obstacles: a path to their places that crosses nothing.
 
-The share s of the way of anchors and obstacles is an unknown beside x: s = 0 at the beginning of
-the step, and s = 1 is the target. Newton's direction towards the minimum of g at s = 1 moves both,
+The share s of the path of anchors and obstacles is a further unknown: s = 0 at the beginning of the
+step, and s = 1 is the target. Newton's direction towards the minimum of g at s = 1 moves both,
 
     H(x, s) dx = -F(x, s) - (1 - s) dF/ds(x, s),      ds = 1 - s,
 
@@ -9,7 +9,7 @@ until two triangles would cross. So bodies give way to the obstacles that press 
 moving boundaries of Li et al. (2020, Incremental Potential Contact). Meanwhile obstacles push from
 a larger distance (Barrier.cushioned), which keeps gaps wide and contact soft. The minimisation
 begins at s = 1 with the usual barrier. H is projected, and no line search evaluates g, since the
-way only has to arrive.
+path only has to arrive.
 
 A start without a linear solve is tried first: nodes move with the obstacles near them.
 """
@@ -74,10 +74,10 @@ class CarriedStart:
         if problem.prescribed is None and contacts.same(contacts.begin, end):
             still = 0.0 if obstacles.total else drift(moved)
             return problem.q + share * moved + (1 - share) * still
-        for way in (moved, 0 * moved):
+        for displacement in (moved, 0 * moved):
             if obstacles.total:
-                way = self._moved_with_obstacles(contacts, way)
-            carried = np.where(functional.lattice.held, problem.fixed, problem.q + way)
+                displacement = self._moved_with_obstacles(contacts, displacement)
+            carried = np.where(functional.lattice.held, problem.fixed, problem.q + displacement)
             if functional.free_share(problem.q, carried, contacts.begin) == 1.0:
                 return carried
         obstacles.straight = contacts.begin, end
@@ -99,10 +99,10 @@ class CarriedStart:
         return contacts.obstacles.carried(q, moved, times, distances, functional.lattice.cell_size)
 
     def _cushion(self, contacts: Contacts) -> float:
-        """Return the distance [m] from which obstacles push: the longest way of a moving part."""
+        """Return the distance [m] from which obstacles push: the longest move of a moving part."""
         problem, obstacles = (
             self.functional.problem,
-            contacts.obstacles.way(contacts.begin, contacts.time),
+            contacts.obstacles.displacements(contacts.begin, contacts.time),
         )
         fixed = self.functional.comm.allreduce(greatest(np.abs(problem.fixed - problem.q)), MPI.MAX)
         return float(max(fixed, greatest(np.abs(obstacles)), contacts.law.distance))
@@ -122,14 +122,14 @@ class CarriedStart:
                     replace(problem, prescribed=problem.fixed - left),
                 )
                 for _ in range(CORRECTIONS):
-                    way = self._direction(q, np.zeros_like(left), still)
-                    q = q + functional.free_share(q, q + way) * way
-                way = self._direction(q, left, contacts.obstacles.way(now, end))
+                    direction = self._direction(q, np.zeros_like(left), still)
+                    q = q + functional.free_share(q, q + direction) * direction
+                direction = self._direction(q, left, contacts.obstacles.displacements(now, end))
                 contacts.time = end
-                share = functional.free_share(q, q + way, now)
+                share = functional.free_share(q, q + direction, now)
                 if share == 1.0:
-                    return q + way
-                q, s = q + share * way, s + share * (1 - s)
+                    return q + direction
+                q, s = q + share * direction, s + share * (1 - s)
             gained = s - begun
         contacts.time = begin + s * (end - begin)
         raise StepFailed(
@@ -166,6 +166,6 @@ class CarriedStart:
         self.ksp.solve(f, x)
         self.ksp.setTolerances(*tolerances)
         x.scale(-1.0)
-        way = fixed.copy()
-        unknowns.to_nodes(x, way)
-        return way
+        direction = fixed.copy()
+        unknowns.to_nodes(x, direction)
+        return direction

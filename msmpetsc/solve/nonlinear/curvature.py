@@ -159,9 +159,7 @@ class LowestCurvature:
             # After an alarm the next step makes a long search, too
             self.searched = NONE if alarm else compression
             with self.preconditioner.searching(q, self.functional.contact_at(q)):
-                found = self._search_at_length(
-                    q, hint, EFFORT if alarm is Alarm.HERE else self.effort
-                )
+                found = self._long_search(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
         return found
 
     def _followed(self) -> tuple[Floats, Rows] | None:
@@ -181,14 +179,15 @@ class LowestCurvature:
         values, modes = self.search.lowest(start, 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)
 
-    def _search_at_length(
+    def _long_search(
         self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort
     ) -> tuple[Floats, Rows]:
-        """Return the lowest curvatures and their modes by a long search from noise.
+        """Return the lowest curvatures and their modes by a long search.
 
-        Near a known mode a lower mode converges late, so the search begins with parts of all
-        modes. Rigid motions have a curvature of about 1 and would hide a lower mode as long, so
-        they are left out at first. A second search begins with the best of all directions.
+        A search from a known mode finds a lower mode late, so this search starts from random
+        vectors, which have parts of all modes. Rigid motions have a curvature of about 1 and would
+        delay a lower mode in the same way, so they are left out at first. A second search starts
+        from these modes, the known mode and the rigid motions.
         """
         is_uniform = effort is UNIFORM_EFFORT
         search, block, least = self.search, effort.block, effort.least
@@ -197,7 +196,7 @@ class LowestCurvature:
             start[0] += search.unit(self.functional.memory.read(hint)[None])[0]
         known = [] if self.mode is None else [self.mode[None]]
         rigid = self._rigid_motions(q)
-        # Nothing hides a mode, and all modes converge fast
+        # No rigid motion delays a mode, and all modes converge fast
         if rigid is None and is_uniform:
             return search.lowest(np.concatenate([start, *known]), block, LONGEST_SEARCH, least)
         start = search.without(rigid, start)

@@ -198,7 +198,7 @@ class StepFunctional:
         return self.problem.contact.surface if self.problem.contact else None
 
     def free_share(self, base: Positions, q: Positions, begin: float | None = None) -> float:
-        """Return the share of the straight way from base to q (l, 3) [m] without a crossing.
+        """Return the share of the straight path from base to q (l, 3) [m] without a crossing.
 
         begin : time [s] from which obstacles move to their present places; None if they stay
         """

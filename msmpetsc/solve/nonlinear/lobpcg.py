@@ -134,8 +134,8 @@ class Lobpcg:
     ) -> Iterator[tuple[Floats, Rows, Floats]]:
         """Yield the lowest eigenvalues (k,), their modes (k, n) and errors (k,), without end.
 
-        The errors r^T P^-1 r of the eigenvalues are those before the last iteration, with the
-        residuals r and the preconditioner P. The next iteration overwrites the modes. Arguments
+        The errors r^T P^-1 r, with residuals r and the preconditioner P, belong to the eigenvalues
+        before the last iteration. The next iteration overwrites the modes. Arguments
         are those of ``lowest``.
         """
         space = self._space(start, block)

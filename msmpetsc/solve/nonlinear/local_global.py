@@ -101,7 +101,7 @@ class LocalGlobal(StepMethod):
         """Return PETSc's reason to end, or 0 to go on (SNESConvergenceTest)."""
         if its > 0 or not self.has_npc:
             x = snes.getSolution()
-            # With an NPC, ``f`` is of another x
+            # With an NPC, ``f`` belongs to another x
             q = self.functional.positions(x)
             if self.has_npc:
                 iterate = self.functional.evaluate(x, self.own, q)

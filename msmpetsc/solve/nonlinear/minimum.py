@@ -68,11 +68,12 @@ class Minimum:
         )
         self.memory, self.first = functional.memory, functional.vectors.take()
 
-    def examine(self, at: Iterate, outcome: Outcome, enough: float) -> Verdict:
-        """Return the verdict on an iterate, by the point x - e or by x without a correction.
+    def examine(self, at: Iterate, outcome: Outcome, acceptable: float) -> Verdict:
+        """Examine g at x - e, or at x if the iterate has no correction e; return the verdict.
 
-        outcome : of the iterate, with its compression; ``corrected`` if estimate.correction is e
-        enough  : acceptable error |e|_M [m sqrt(kg)]
+        outcome    : of the iterate, with its compression; ``corrected`` if estimate.correction
+                     is e
+        acceptable : acceptable error |e|_M [m sqrt(kg)]
         """
         functional, estimate, compression = self.functional, self.estimate, outcome.compression
         assert compression is not None
@@ -96,23 +97,23 @@ class Minimum:
         estimate.convexity = min(estimate.convexity, value)
         length, rest = functional.norm(first), functional.dual_norm(examined.f) / value
         # An upper bound if g stays as convex
-        if value > CONVEX and length + rest <= enough:
+        if value > CONVEX and length + rest <= acceptable:
             return Verdict(
                 self.rounding.relative(length + rest, functional.distance(examined.q)), examined
             )
         if corrected and value <= CONVEX < estimate.lowest:
-            # The estimate has taken the missing part for too small
+            # The estimate took the missing part of the error for too small
             again = bool(np.isfinite(estimate(at)))
-            return self.examine(at, replace(outcome, corrected=again), enough)
+            return self.examine(at, replace(outcome, corrected=again), acceptable)
         estimated = estimate.found + estimate.missing
         if corrected and bent <= SMALL * estimated and value > CONVEX:
             return Verdict(
                 self.rounding.relative(estimated, functional.distance(examined.q)), examined
             )
-        return Verdict(self._second_estimate(examined, length, rest, enough, value), examined)
+        return Verdict(self._second_estimate(examined, length, rest, acceptable, value), examined)
 
     def _corrected_iterate(self, at: Iterate) -> Iterate | None:
-        """Return the iterate x - e; None if the surface crosses itself on the way."""
+        """Return the iterate x - e; None if the surface crosses itself on the path."""
         x, q, is_free = self._corrected(at)
         if not is_free:
             self.functional.vectors.give_back(x)
@@ -120,7 +121,7 @@ class Minimum:
         return self.functional.iterate(x, q)
 
     def _corrected(self, at: Iterate) -> tuple[PETSc.Vec, Positions, bool]:
-        """Return the unknowns x - e, their positions (l, 3) [m], and whether the way is free.
+        """Return the unknowns x - e, their positions (l, 3) [m], and whether the path is free.
 
         The caller gives the vector of unknowns back.
         """
@@ -130,7 +131,7 @@ class Minimum:
         return x, q, functional.free_share(at.q, q) == 1.0
 
     def _second_estimate(
-        self, examined: Iterate, first: float, bound: float, enough: float, lowest: float
+        self, examined: Iterate, first: float, bound: float, acceptable: float, lowest: float
     ) -> float:
         """Return the relative error of the iterate by two corrections, the first of norm ``first``.
 
@@ -140,7 +141,7 @@ class Minimum:
         """
         functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
         distance = functional.distance(examined.q)
-        second = estimate(examined, max(enough - first, 0.0) if lowest > CONVEX else 0.0)
+        second = estimate(examined, max(acceptable - first, 0.0) if lowest > CONVEX else 0.0)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
         if functional.surface is not None:
@@ -172,8 +173,8 @@ class Minimum:
         slope = functional.comm.allreduce(float(self.memory.read(at.f) @ direction))
         longest = float(functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
-        # A smaller slope may be rounding: both signs lead down, and all ranks take one
-        # sign
+        # A smaller slope may be rounding: then g falls in both directions, and all
+        # ranks take the same
         if slope > SLOPE * abs(curvature) * move:
             move = -move
         x, best, lowest = functional.vectors.take(), 0.0, 0.0

@@ -34,10 +34,10 @@ LONG = 40
 # Usual ksp_rtol
 USUAL = 0.1
 # Iterations per digit with a hierarchy of the present positions
-USUAL_PACE = 2.5
+USUAL_RATE = 2.5
 # Iterations that cost as much as a new hierarchy
 WORTH = 10.0
-# Iterations beyond its pace that a solve with an old hierarchy is given
+# Iterations beyond the usual number that a solve with an old hierarchy may take
 PATIENCE = 15.0
 # t^2 k / m beyond which rounding hides the mass, which alone tells where a free body
 # moves
@@ -109,13 +109,13 @@ class Preconditioner:
 
 
 class LatticePreconditioner:
-    """Multigrid of the Hessian, whose hierarchy is kept while it pays. All methods are collective.
+    """Multigrid of the Hessian, its hierarchy kept while it saves time. All methods are collective.
 
     matrix, pc   : projected Hessian, and PETSc's PCMG of it
     translations : of bodies without fixed nodes, exact while ``is_free``; None if all are fixed
     is_first     : whether there is no hierarchy yet
-    pace         : iterations per digit of the first solve with the hierarchy; None before it
-    excess       : iterations above the pace since then
+    rate         : iterations per digit of the first solve with the hierarchy; None before it
+    excess       : iterations above this rate since then
     is_stale     : whether a new hierarchy is due
     is_new       : whether the hierarchy was built at the positions of the next linear solve
     """
@@ -128,7 +128,7 @@ class LatticePreconditioner:
         bodies = self.multigrid.bodies
         self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
         self.is_first = True
-        self.pace: float | None = None
+        self.rate: float | None = None
         self.excess = 0.0
         self.is_stale, self.is_new, self.is_free = True, False, False
 
@@ -148,8 +148,8 @@ class LatticePreconditioner:
         """
         return (
             None
-            if self.is_new or self.pace is None
-            else int(self.pace * _digits(rtol) + PATIENCE - self.excess)
+            if self.is_new or self.rate is None
+            else int(self.rate * _digits(rtol) + PATIENCE - self.excess)
         )
 
     def learn(self, its: int, rtol: float) -> None:
@@ -161,17 +161,17 @@ class LatticePreconditioner:
         if its == 0:
             return
         digits = _digits(rtol)
-        if self.pace is None:
-            self.pace = its / digits
-        self.excess += max(its - self.pace * digits, 0.0)
+        if self.rate is None:
+            self.rate = its / digits
+        self.excess += max(its - self.rate * digits, 0.0)
         self.is_stale |= self.excess > WORTH
 
     def _build(self, q: Positions, contact: Rows, surface: SurfaceHessian | None) -> None:
         with HIERARCHY:
             self.multigrid.update(q, contact, surface)
-        self.pace = None
+        self.rate = None
         if self.is_first:
-            self.pace = USUAL_PACE
+            self.rate = USUAL_RATE
         self.excess = 0.0
         self.is_first = self.is_stale = False
 
@@ -304,8 +304,8 @@ class StepPreconditioner:
     def searching(self, q: Positions, contact: ContactAt | None) -> Iterator[None]:
         """Switch to multigrid, built at positions q (l, 3) [m], for a long search.
 
-        Smooth modes, which converge last with Jacobi's, then converge at once. The hierarchy is
-        not that of the steps.
+        Smooth modes converge last with Jacobi's preconditioner, and at once with multigrid. This
+        hierarchy is separate from the hierarchy of steps.
         """
         if self.is_chosen or not self.chooses:
             yield

@@ -386,9 +386,11 @@ class Forces:
             sums["surface_load"] = np.array([*dead, *loads.pressures.resultants(q)])
         if "reaction" in self.rows:
             fixed = environment.anchors.fixed_at(time)[:owned]
-            held = (self._holding_forces(q, contact, step) - load) * fixed
-            sums["reaction"] = self.model.holders.totals(held)
-            sums["torque"] = self.model.holders.torques(q[:owned], held, self._torque_points(time))
+            reaction = (self._holding_forces(q, contact, step) - load) * fixed
+            sums["reaction"] = self.model.holders.totals(reaction)
+            sums["torque"] = self.model.holders.torques(
+                q[:owned], reaction, self._torque_points(time)
+            )
         return {
             name: self.comm.allreduce(sums[name])
             for name in sums
@@ -406,20 +408,20 @@ class Forces:
         self, q: Positions, contact: ContactAt | None, step: StepResult | None
     ) -> Rows:
         """Return the forces (owned, 3) [N] that hold the nodes in place, without the loads."""
-        held, owned = np.zeros_like(q), self.model.lattice.owned
-        self.elasticity.add_gradient(q, held)
+        forces, owned = np.zeros_like(q), self.model.lattice.owned
+        self.elasticity.add_gradient(q, forces)
         if contact:
-            contact.add_gradient(held)
-        held = held[:owned]
+            contact.add_gradient(forces)
+        forces = forces[:owned]
         if step and step.viscous is not None:
-            held += step.viscous
+            forces += step.viscous
         if step and step.problem:
-            held += (
+            forces += (
                 self.model.lattice.mass[:, None]
                 * (q[:owned] - step.problem.y[:owned])
                 / step.tau**2
             )
-        return held
+        return forces
 
     def _pushes(self, q: Positions, contact: ContactAt | None) -> dict[str, Any]:
         """Return the contact forces [N] of obstacles (o, 3) and on bodies (b, 3) of this rank."""

@@ -88,7 +88,7 @@ def trilinear(
 ) -> csr_array:
     """Return the matrix (p, n) of trilinear weights of nodes at points (p, 3) of bodies (p,).
 
-    carried : surface points (p, k) beside each point, and the embedding of the surface points; of
+    carried : surface points (p, k) next to each point, and the embedding of the surface points; of
               several copies of a cell, the copy counts that shares the most nodes with theirs
     """
     cells = rest.cells_around(points, body)
@@ -104,9 +104,9 @@ def trilinear(
 
 
 def _choose_copies(
-    rest: BodiesAtRest, cells: Indices, beside: Indices, embedding: csr_array
+    rest: BodiesAtRest, cells: Indices, neighbours: Indices, embedding: csr_array
 ) -> None:
-    """Replace cells (p,) by the copies at their places that carry the points ``beside`` (p, k)."""
+    """Replace cells (p,) by the copies at their places that carry ``neighbours`` (p, k)."""
     order = np.lexsort(rest.middles.T)
     is_copy = (np.diff(rest.middles[order], axis=0) == 0).all(axis=1)
     place = np.empty(len(order), int)
@@ -114,7 +114,7 @@ def _choose_copies(
     copies = np.bincount(place)[place] > 1
     for row in np.flatnonzero(copies[cells]):
         found = np.flatnonzero(place == place[cells[row]])
-        nodes = embedding[beside[row]].indices
+        nodes = embedding[neighbours[row]].indices
         cells[row] = found[np.isin(rest.cells[found], nodes).sum(axis=1).argmax()]
 
 

@@ -33,12 +33,12 @@ def place(path: list[dict], time: float) -> np.ndarray:
     )
 
 
-def led_scene(folder: Path, steps: int, anchors: list[dict], **tables) -> Path:
+def anchored_scene(folder: Path, steps: int, anchors: list[dict], **tables) -> Path:
     return block_scene(folder, time={"step": T, "duration": steps * T}, anchor=anchors, **tables)
 
 
 def test_anchored_nodes_are_on_their_path_and_the_others_follow(tmp_path: Path):
-    model, frames = play(led_scene(tmp_path, 14, [{"region": LEFT, "path": UP}]))
+    model, frames = play(anchored_scene(tmp_path, 14, [{"region": LEFT, "path": UP}]))
     rest, mass = model.lattice.nodes, model.lattice.mass
     prescribed = rest[:, 0] == 0
     assert prescribed.sum() == 15
@@ -59,7 +59,7 @@ def test_of_two_anchors_on_a_node_the_first_leads_it_and_a_pin_is_stronger_than_
     sideways = [{"time": 0.05, "by": [0.01, 0, 0]}]
     anchors = [{"region": LEFT, "path": UP}, {"region": low, "path": sideways}]
     pin = [{"region": {"box": [[0, 0, 0], [0.5, 0.01, 0.25]]}}]
-    model, frames = play(led_scene(tmp_path, 5, anchors, pin=pin))
+    model, frames = play(anchored_scene(tmp_path, 5, anchors, pin=pin))
     rest, moved = model.lattice.nodes, frames[-1].position - model.lattice.nodes
     pinned = rest[:, 1] == 0
     first = (rest[:, 0] == 0) & ~pinned
@@ -74,7 +74,7 @@ def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
     """Led nodes leave with the path's velocity; without loads nothing changes the momentum from
     then on."""
     stop = 0.06 + 0.5 * T
-    model, frames = play(led_scene(tmp_path, 15, [{"region": LEFT, "path": UP, "stop": stop}]))
+    model, frames = play(anchored_scene(tmp_path, 15, [{"region": LEFT, "path": UP, "stop": stop}]))
     rest, mass = model.lattice.nodes, model.lattice.mass
     prescribed = rest[:, 0] == 0
     held, free = frames[6], frames[7]
@@ -97,12 +97,12 @@ def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
     with pytest.raises(
         InputError, match="every node of the lattice is held, nothing is left to move"
     ):
-        play(led_scene(tmp_path, 1, anchors[:1]))
+        play(anchored_scene(tmp_path, 1, anchors[:1]))
     low = {"region": {"box": [[-1, -1, -1], [1, 1, 0.05]]}}
     high = {"region": {"box": [[-1, -1, 0.1], [1, 1, 1]]}, "path": UP}
     with pytest.raises(InputError, match="pin or anchor: every node"):
-        play(led_scene(tmp_path, 1, [high], pin=[low]))
-    play(led_scene(tmp_path, 1, anchors[1:]))
+        play(anchored_scene(tmp_path, 1, [high], pin=[low]))
+    play(anchored_scene(tmp_path, 1, anchors[1:]))
 
 
 def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(
@@ -110,7 +110,7 @@ def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(
 ):
     """And one of the user's that the first solver used is not called unused, nor taken out with our
     defaults."""
-    scene = load_scene(led_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
+    scene = load_scene(anchored_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
     petsc_options(ksp_rtol="1e-8")
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         first = simulation.integrator.stepper
@@ -220,7 +220,7 @@ def runs(balls: Path) -> dict[int, tuple[Path, list]]:
         {"region": half, "path": UP, "stop": 0.025},
         {"region": most_of_it, "path": UP, "stop": 0.045},
     ]
-    prescribed = led_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
+    prescribed = anchored_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
     found = {}
     for ranks in (1, 2):
         out = balls / f"ranks{ranks}"

@@ -30,17 +30,19 @@ def test_nodes_turn_about_an_axis_at_a_steady_speed_and_go_on_as_they_were_let_g
     handle = {"region": RIGHT, "path": path, "center": center, "stop": 3.5 * T}
     model, frames = play(block_scene(tmp_path, time=time, material=SOLID, anchor=[handle]))
     rest = model.lattice.nodes
-    led = rest[:, 0] > 0.49
+    anchored = rest[:, 0] > 0.49
     for frame in frames[:4]:
         share = frame.time / 0.05
-        expected = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array(
+        expected = turned(rest[anchored], axis, share * 2.5 * np.pi, center) + share * np.array(
             [0.05, 0, 0]
         )
-        np.testing.assert_allclose(frame.position[led], expected, atol=1e-14)
+        np.testing.assert_allclose(frame.position[anchored], expected, atol=1e-14)
     share = frames[4].time / 0.05
-    gone_on = turned(rest[led], axis, share * 2.5 * np.pi, center) + share * np.array([0.05, 0, 0])
+    gone_on = turned(rest[anchored], axis, share * 2.5 * np.pi, center) + share * np.array(
+        [0.05, 0, 0]
+    )
     # the released nodes leave the path
-    assert np.linalg.norm(frames[4].position[led] - gone_on, axis=1).min() > 1e-4
+    assert np.linalg.norm(frames[4].position[anchored] - gone_on, axis=1).min() > 1e-4
 
 
 def test_without_a_center_nodes_turn_about_their_centre_of_mass(tmp_path: Path):
@@ -48,12 +50,14 @@ def test_without_a_center_nodes_turn_about_their_centre_of_mass(tmp_path: Path):
     anchors = [{"region": RIGHT, "path": path}]
     model, frames = play(block_scene(tmp_path, time={"step": T, "duration": 2 * T}, anchor=anchors))
     rest = model.lattice.nodes
-    led = rest[:, 0] > 0.49
-    center = np.average(rest[led], axis=0, weights=model.lattice.mass[led])
+    anchored = rest[:, 0] > 0.49
+    center = np.average(rest[anchored], axis=0, weights=model.lattice.mass[anchored])
     assert center == pytest.approx([0.5, *SIDES[1:] / 2])
     for frame in frames[1:]:
         np.testing.assert_allclose(
-            frame.position[led], turned(rest[led], [1, 0, 0], np.pi / 2, center), atol=1e-15
+            frame.position[anchored],
+            turned(rest[anchored], [1, 0, 0], np.pi / 2, center),
+            atol=1e-15,
         )
 
 

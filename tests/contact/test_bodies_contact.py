@@ -57,10 +57,10 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
     return path
 
 
-def pile(folder: Path, meshes: list[str], apart: float) -> Path:
+def pile(folder: Path, meshes: list[str], gap: float) -> Path:
     """Scene of a block on another, which is pinned, with such a distance [m] between the two."""
     pin = [{"region": {"box": [[0, 0, 0], [1, 1, 0.1]], "relative": True}}]
-    bodies = [body(meshes[0], [0, 0, 0], pin=pin), body(meshes[1], [0, 0, SIDE + apart])]
+    bodies = [body(meshes[0], [0, 0, 0], pin=pin), body(meshes[1], [0, 0, SIDE + gap])]
     time, gravity = {"step": 0.01, "duration": 0.1}, {"acceleration": [0, 0, -G]}
     return write(folder, "pile", body=bodies, time=time, gravity=gravity)
 

@@ -180,8 +180,8 @@ def test_duals_of_friction_follow_its_forces(name: str):
     forces, off = friction.force(q) / friction.limit[:, None], []
     for reach in (1e-4, 1e-5):
         end = q + reach * v
-        led = friction.duals_after(end, q, None)
-        off.append(np.abs(led - friction.force(end) / friction.limit[:, None]).max())
+        later = friction.duals_after(end, q, None)
+        off.append(np.abs(later - friction.force(end) / friction.limit[:, None]).max())
     assert off[1] < 0.02 * off[0] and off[0] > 0
     away = friction.along(np.random.default_rng(3).uniform(-1, 1, q.shape))
     np.testing.assert_allclose(friction.duals_after(q, q, away), forces, atol=1e-12)

@@ -168,12 +168,12 @@ def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
 
 def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     term, q = contact(model)
-    through, apart, carried = q.copy(), q.copy(), q + np.array([5.0, 0, 0])
+    through, opened, carried = q.copy(), q.copy(), q + np.array([5.0, 0, 0])
     through[q[:, 0] < 0, 0] += 2 * GAP
-    apart[q[:, 0] < 0, 0] -= 2 * GAP
+    opened[q[:, 0] < 0, 0] -= 2 * GAP
     # the arms meet halfway
     assert 0.3 < term.contacts.free_share(q, through) < 0.5
-    assert term.contacts.free_share(q, apart) == term.contacts.free_share(q, carried) == 1.0
+    assert term.contacts.free_share(q, opened) == term.contacts.free_share(q, carried) == 1.0
     far = q.copy()
     # a way of many edge lengths, whose end is free again
     far[q[:, 0] < 0, 0] += 500 * GAP

@@ -70,8 +70,8 @@ def boxes_touched(triangle: np.ndarray, gap: int) -> set[tuple[int, ...]]:
     at = axes @ (triangle.T * FINE)
     nearest = np.minimum(axes * low[:, None], axes * high[:, None]).sum(-1)
     farthest = np.maximum(axes * low[:, None], axes * high[:, None]).sum(-1)
-    apart = (at.max(1) < nearest) | (at.min(1) > farthest)
-    return set(map(tuple, cells[~apart.any(1)].tolist()))
+    misses = (at.max(1) < nearest) | (at.min(1) > farthest)
+    return set(map(tuple, cells[~misses.any(1)].tolist()))
 
 
 off_planes = st.integers(0, SIDE * UNIT // 2 - 1).map(lambda x: 2 * x + 1)

@@ -183,8 +183,8 @@ def test_the_surface_follows_its_own_part(tmp_path: Path):
         ijk = decode_morton(net.keys)
         side = np.zeros(len(net.ijk))
         for low in (True, False):
-            beside = ijk[:, 1] < WIDTH // 2 if low else ijk[:, 1] > WIDTH // 2
-            reached = net.cells[beside & (ijk[:, 0] > BASE + 1)].ravel()
+            on_side = ijk[:, 1] < WIDTH // 2 if low else ijk[:, 1] > WIDTH // 2
+            reached = net.cells[on_side & (ijk[:, 0] > BASE + 1)].ravel()
             for _ in range(2):
                 touching = np.isin(net.cells, reached).any(axis=1)
                 touching &= (ijk[:, 0] > BASE + 1) & (fills > 0.01)
@@ -232,9 +232,9 @@ def opening(path: Path, *overrides: str) -> tuple[float, int]:
     q = frames[-1].surface
     points = model.surface.points
     tip = points[:, 0] > LENGTH * H - 1e-6
-    apart = (q - points)[:, 1]
+    across = (q - points)[:, 1]
     high = points[:, 1] > WIDTH * H / 2
-    return float(apart[tip & high].mean() - apart[tip & ~high].mean()), frames[-1].ksp_its
+    return float(across[tip & high].mean() - across[tip & ~high].mean()), frames[-1].ksp_its
 
 
 @pytest.mark.parametrize("slit", [0.2, 0.4, 0.8, 1.6])

@@ -51,10 +51,10 @@ def _count(points, edges, triangles):
         first = np.searchsorted(begins, min(p[0], q[0]) - widest)
         for f in order[first : np.searchsorted(begins, max(p[0], q[0]), side="right")]:
             i, j, k = triangles[f]
-            apart = a in (i, j, k) or b in (i, j, k)
+            separate = a in (i, j, k) or b in (i, j, k)
             for c in range(3):
-                apart = apart or max(p[c], q[c]) < low[f, c] or min(p[c], q[c]) > high[f, c]
-            if apart:
+                separate = separate or max(p[c], q[c]) < low[f, c] or min(p[c], q[c]) > high[f, c]
+            if separate:
                 continue
             r, s, t = points[i], points[j], points[k]
             above, below = _volume(r, s, t, p), _volume(r, s, t, q)

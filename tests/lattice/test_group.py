@@ -241,11 +241,15 @@ def test_a_probe_of_a_group_is_at_its_middle(tmp_path: Path):
 
 
 def test_pins_forces_anchors_and_probes_take_groups_on_any_ranks(tmp_path: Path, msmpetsc):
-    led = {"region": {"group": "right"}, "path": [{"time": 0.01, "by": [0.01, 0.0, 0.0]}]}
+    anchored = {"region": {"group": "right"}, "path": [{"time": 0.01, "by": [0.01, 0.0, 0.0]}]}
     pull = {"region": {"group": "side"}, "total": [0.0, 1.0, 0.0]}
     output = {"surface": False, "probe": [{"name": "end", "group": "right"}]}
     scene = grouped(
-        tmp_path, pin=[{"region": {"group": "left"}}], anchor=[led], force=[pull], output=output
+        tmp_path,
+        pin=[{"region": {"group": "left"}}],
+        anchor=[anchored],
+        force=[pull],
+        output=output,
     )
     for ranks in (1, 3):
         run(ranks, "-m", "msmpetsc", "run", scene, "-o", tmp_path / f"{ranks}.h5", status=0)

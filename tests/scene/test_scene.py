@@ -283,7 +283,7 @@ def test_no_file_a_folder_and_no_utf8(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("override", "look", "value"),
+    ("override", "value_in", "value"),
     [
         ("time.step=1e-2", lambda s: s.time.steps, 200),
         ("mesh.source=models/my bunny.obj", lambda s: s.mesh.source, "models/my bunny.obj"),
@@ -298,9 +298,9 @@ def test_no_file_a_folder_and_no_utf8(tmp_path):
         ("pin=[]", lambda s: s.pin, ()),
     ],
 )
-def test_override(tmp_path, override, look, value):
-    assert look(load(tmp_path)) != value
-    assert look(load(tmp_path, EXAMPLE, override)) == value
+def test_override(tmp_path, override, value_in, value):
+    assert value_in(load(tmp_path)) != value
+    assert value_in(load(tmp_path, EXAMPLE, override)) == value
 
 
 def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):

@@ -171,10 +171,10 @@ def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float)
     """At that time the nodes are still where they were led; a step of one length lets them go as it
     begins."""
     end = {"region": {"half_space": {"point": [0.99, 0, 0], "normal": [1, 0, 0]}}}
-    led = [end | {"path": [{"time": stop, "by": [0, 0, 0.02]}], "stop": stop}]
+    anchor = [end | {"path": [{"time": stop, "by": [0, 0, 0.02]}], "stop": stop}]
     time = {"step": 0.005, "duration": 0.16}
     model, frames = play(
-        beam(tmp_path, **time, error=0.1, anchor=led, gravity={"acceleration": [0, 0, 0]})
+        beam(tmp_path, **time, error=0.1, anchor=anchor, gravity={"acceleration": [0, 0, 0]})
     )
     last = next(frame for frame in frames if frame.time == pytest.approx(stop))
     tip = model.lattice.nodes[:, 0] > 0.99

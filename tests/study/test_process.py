@@ -60,8 +60,8 @@ def test_a_process_alone_takes_no_folder_from_others(
     leaves them."""
     (tmp_path / "shared").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "shared"))
-    look = "import os; from mpi4py import MPI; print(*os.listdir(os.environ['TMPDIR']))"
-    assert processes.run([sys.executable, "-c", look], tmp_path / "log", 30).status == 0
+    code = "import os; from mpi4py import MPI; print(*os.listdir(os.environ['TMPDIR']))"
+    assert processes.run([sys.executable, "-c", code], tmp_path / "log", 30).status == 0
     assert (tmp_path / "log").read_text().split() == os.listdir(tmp_path / "shared")
 
 

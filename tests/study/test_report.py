@@ -186,12 +186,12 @@ def test_no_winner_is_told_within_its_noise():
 
 def test_twenty_options_are_told_apart_by_colour_mark_and_dashes():
     styles = curve_styles(f"option {number}" for number in range(20))
-    looks = list(styles.values())
-    assert len({(look.color, *look.dash) for look in looks}) == 20, (
+    drawn = list(styles.values())
+    assert len({(style.color, *style.dash) for style in drawn}) == 20, (
         "lines alone, between their marks"
     )
     triangles = {"triangle-up", "triangle-down", "triangle-left", "triangle-right"}
-    for one, other in zip(looks, looks[11:], strict=False):
+    for one, other in zip(drawn, drawn[11:], strict=False):
         assert (
             one.color == other.color
             and one.shape != other.shape
@@ -202,7 +202,7 @@ def test_twenty_options_are_told_apart_by_colour_mark_and_dashes():
         for label in styles for error in (1e-1, 1e-2, 1e-3, 1e-4) for cells in (1000, 2000)
     )  # fmt: skip
     (chart,) = growth_charts(rows, styles)
-    assert len({(look.color, look.shape, *look.dash) for look in chart.styles.values()}) == 80
+    assert len({(style.color, style.shape, *style.dash) for style in chart.styles.values()}) == 80
     lines = [layer for layer in chart.panels[0].layers if layer["mark"]["type"] == "line"]
     assert all(layer["encoding"]["strokeDash"]["scale"]["range"][-1] == (6, 3) for layer in lines)
 

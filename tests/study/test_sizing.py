@@ -279,13 +279,13 @@ def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
     """What parts two runs is at right angles to the finer one's error, of order 1; added up it was
     twice as much."""
 
-    def apart(a: Path, b: Path) -> float:
+    def distance_between(a: Path, b: Path) -> float:
         return math.sqrt(abs(bench.errors[a] ** 2 - bench.errors[b] ** 2))
 
     (tmp_path / "scene.toml").write_text(SCENE)
     bench = Bodies(explicit=False)
     monkeypatch.setattr(Bodies, "error_of", lambda self, case, cells: 1.4 * cells ** (-1 / 3))
-    monkeypatch.setattr(trials, "surface_error", apart)
+    monkeypatch.setattr(trials, "surface_error", distance_between)
     plan = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000),
     print).plan()  # fmt: skip
     assert plan.met and 0.6 * target < 1.4 * plan.choice.cells ** (-1 / 3) < 1.1 * target

@@ -109,12 +109,12 @@ def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, ca
 
 
 def test_anchored_points_are_free_after_their_stop(tmp_path):
-    led = (
+    anchor = (
         "[[anchor]]\nregion = { half_space = { point = [0, 0, 0.48], normal = [0, 0, -1] } }\n"
         "stop = 0.5\n"
     )
-    led += "path = [{ time = 1.0, by = [0, 0, 1] }]\n"
-    data = data_of(written_page(tmp_path, scene=BARE + led))
+    anchor += "path = [{ time = 1.0, by = [0, 0, 1] }]\n"
+    data = data_of(written_page(tmp_path, scene=BARE + anchor))
     assert data["fixed"] == [0] * 5 + [1] * 6
     first, second = stream(data, "fixed").reshape(2, -1)
     assert set(first) == {0, 255} and not second.any()

@@ -146,18 +146,18 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: 
 
 
 def describe_overlap(
-    comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, held: Mask, time: float
+    comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, fixed: Mask, time: float
 ) -> str | None:
     """Return a description of the free nodes inside an obstacle; None without nodes (collective).
 
     Such an overlap is seldom intended, and an obstacle that reflects does not remove it.
 
-    q    : (l, 3) positions [m]
-    held : (l,) bool, the nodes that are not free
+    q     : (l, 3) positions [m]
+    fixed : (l,) bool, the nodes that are not free
     """
     owned = slice(lattice.owned)
     inside, _ = obstacle.depths(q[owned], time)
-    rows = np.flatnonzero((inside > TOUCHING * lattice.cell_size) & ~held[owned])
+    rows = np.flatnonzero((inside > TOUCHING * lattice.cell_size) & ~fixed[owned])
     count = comm.allreduce(len(rows))
     if not count:
         return None

@@ -45,20 +45,22 @@ class NodeObstacles:
         time: float,
         time_step: float,
         before: Indices | None,
-        held: Mask,
+        fixed: Mask,
     ) -> Indices:
         """Return the sides (o, n) of nodes on straight paths from q to ``end`` (n, 3) in a step.
 
         A plane has a single face, so its row is zero.
 
         before : (o, n) the sides at the beginning of the step
-        held   : (n,) bool, the nodes that are not free; their side is 0
+        fixed  : (n,) bool, the nodes that are not free; their side is 0
         """
         sides = np.zeros((len(self.all), len(q)), np.int8, like=q)
         for row, obstacle in enumerate(self.all):
             if obstacle.solid.has_sides:
                 side_before = None if before is None else before[row]
-                sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, side_before))
+                sides[row] = np.where(
+                    fixed, 0, obstacle.sides(q, end, time, time_step, side_before)
+                )
         return sides
 
     def same_push(self, q: Positions, time: float, a: Indices, b: Indices) -> bool:
@@ -192,16 +194,16 @@ class NodeObstacles:
         ]
 
     def strike(
-        self, q: Positions, q_previous: Positions, step: StepTaken, held: Mask
+        self, q: Positions, q_previous: Positions, step: StepTaken, fixed: Mask
     ) -> tuple[Positions, Positions, float]:
         """Return q_n and q_(n-1) after impacts on obstacles, and the work [J] on this rank's nodes.
 
         The arrays are the same objects if no node strikes.
 
-        step : the completed step, with the sides (o, l) for all obstacles
-        held : (l, 3) bool, the components that are not free
+        step  : the completed step, with the sides (o, l) for all obstacles
+        fixed : (l, 3) bool, the components that are not free
         """
-        free = ~held
+        free = ~fixed
         work = 0.0
         sides = self.no_sides if step.sides is None else step.sides
         for exchange, side in zip(self.exchanges, sides[self.exchanging], strict=True):

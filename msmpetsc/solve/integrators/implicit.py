@@ -87,9 +87,8 @@ class ContactFaces:
     def _crossed(self, end: Positions) -> Indices:
         """Return the sides (o, l) of nodes that move straight from q to ``end`` (l, 3) [m]."""
         with CONTACT:
-            obstacles, held = self.environment.obstacles, self.fixed
-            return obstacles.contact_faces(
-                self.q, end, self.time, self.time_step, self.before, held
+            return self.environment.obstacles.contact_faces(
+                self.q, end, self.time, self.time_step, self.before, self.fixed
             )
 
     def problem(self) -> StepProblem:

@@ -180,10 +180,10 @@ class Verlet(Integrator):
         duration = 0.5 * (times[1] - start)
         for begin, end in pairwise(times):
             self._kick(begin, duration, begin, end)
-            before, held = self.q.copy(), self.fixed
+            before, fixed = self.q.copy(), self.fixed
             self._drift(begin, end)
-            moved, held = self.q - before, held | self.fixed
-            self._count_work(moved, held)
+            moved, fixed = self.q - before, fixed | self.fixed
+            self._count_work(moved, fixed)
             self.work += self.environment.obstacles.energy_of_new_obstacles(
                 self.q, begin, end, self.sides
             )
@@ -191,17 +191,17 @@ class Verlet(Integrator):
             duration = end - begin
             kicked = min(end + 0.5 * duration, time)
             self.load = self._mean_load(end - 0.5 * duration, kicked)
-            self._count_work(moved, held)
+            self._count_work(moved, fixed)
         self._kick(time, 0.5 * duration, begin, time)
 
-    def _count_work(self, moved: Rows, held: Mask) -> None:
+    def _count_work(self, moved: Rows, fixed: Mask) -> None:
         """Add half the work [J] of the present forces to the work of springs, loads and anchors.
 
         moved : (owned, 3) [m] displacements of the substep
-        held  : (owned, 3) bool, components that anchors move against all forces
+        fixed : (owned, 3) bool, components that anchors move against all forces
         """
         self.springs_work += 0.5 * np.vdot(self.elastic, moved)
-        forces = np.where(held, self.gradient[: self.lattice.owned], self.load)
+        forces = np.where(fixed, self.gradient[: self.lattice.owned], self.load)
         self.work += 0.5 * float(np.vdot(forces, moved))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:

@@ -12,7 +12,7 @@ from msmpetsc.constraints.forces import ActingForces
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
 from msmpetsc.contact.obstacles.penalty import Contact
-from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
+from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch, ContactSummary
 from msmpetsc.contact.surface.term import SurfaceContact
 
 # ratio of the normal force at a step's end to the force that limited friction; beyond
@@ -43,9 +43,9 @@ class Environment:
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
         self.self_contact = (
-            NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
+            CandidateCache(self.lattice.table.comm, model.collision) if model.collision else None
         )
-        self.contacts = Contacts(self.self_contact, 0.0, 0.0) if self.self_contact else None
+        self.contacts = ContactSearch(self.self_contact, 0.0, 0.0) if self.self_contact else None
         self.has_friction = self.obstacles.has_friction or bool(
             self.self_contact and self.self_contact.law.friction > 0
         )
@@ -101,7 +101,7 @@ class Environment:
         """
         if self.self_contact:
             begin = max(time - time_step, 0.0)
-            self.contacts = Contacts(self.self_contact, begin, time, self.contacts)
+            self.contacts = ContactSearch(self.self_contact, begin, time, self.contacts)
             self.contacts.narrow(q, begin)
 
     def _previous_contact(self, q: Positions) -> Contact | None:
@@ -130,8 +130,8 @@ class Environment:
         self._ended = None
         if self.self_contact:
             self.self_contact.forget()
-            self.contacts = Contacts(self.self_contact, 0.0, 0.0)
+            self.contacts = ContactSearch(self.self_contact, 0.0, 0.0)
 
-    def touch(self, q: Positions, time: float) -> Touch:
+    def touch(self, q: Positions, time: float) -> ContactSummary:
         """Return count and distance of surface contacts at q and a time [s] (collective)."""
-        return self.contacts.touch(q, time) if self.contacts else Touch()
+        return self.contacts.touch(q, time) if self.contacts else ContactSummary()

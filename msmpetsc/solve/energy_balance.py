@@ -33,7 +33,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
-from msmpetsc.contact.surface.pairs import Touch
+from msmpetsc.contact.surface.pairs import ContactSummary
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.elasticity.springs import crushing_energy
@@ -66,7 +66,7 @@ class Energies:
     contact: float
     potential: float
     momentum: Floats
-    touch: Touch
+    touch: ContactSummary
 
     @property
     def inner(self) -> float:
@@ -92,7 +92,7 @@ class EnergyBalance:
         self.lattice = self.environment.lattice
         self.comm = self.lattice.table.comm
         self.credit = OSCILLATION_CREDIT * self.swings
-        self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
+        self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), ContactSummary())
         self.known: tuple[Positions, Energies] | None = None
         self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
 

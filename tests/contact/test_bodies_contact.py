@@ -17,7 +17,7 @@ from mpi4py import MPI
 import msmpetsc.contact.surface.pairs
 from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
-from msmpetsc.contact.surface.pairs import Contacts, NearPairs
+from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
@@ -159,7 +159,7 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     assert model.collision is not None
     start = model.lattice.nodes.copy()
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.02 + 2.5 * SIDE], 0.0)
-    contacts = Contacts(NearPairs(MPI.COMM_SELF, model.collision), 0.0, 0.01)
+    contacts = ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), 0.0, 0.01)
     contacts.find(start, with_points=True)
     contacts.find(end, with_points=True)
     free = 0.02 / (0.02 + 2.5 * SIDE)
@@ -227,7 +227,7 @@ def test_the_surface_is_asked_about_around_what_touches_alone(
 
 def begun_with_all(self: Environment, q: np.ndarray, time: float, time_step: float) -> None:
     assert self.self_contact is not None
-    self.contacts = Contacts(self.self_contact, max(time - time_step, 0.0), time)
+    self.contacts = ContactSearch(self.self_contact, max(time - time_step, 0.0), time)
 
 
 def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypatch):
@@ -236,7 +236,7 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     model = build_model(MPI.COMM_SELF, load_scene(scene))
     assert model.collision is not None
     contacts, start = (
-        Contacts(NearPairs(MPI.COMM_SELF, model.collision), 0.0, 0.01),
+        ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), 0.0, 0.01),
         model.lattice.nodes,
     )
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.002 - 0.5 * DISTANCE], 0.0)

@@ -10,7 +10,7 @@ import trimesh
 from block_scene import play
 
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
-from msmpetsc.contact.surface.places import PairSet
+from msmpetsc.contact.surface.places import CandidateSet
 from msmpetsc.geometry.surface import Surface
 
 # cells of a plate's grid along each side of 1 m
@@ -68,7 +68,7 @@ def tip_energies(bent: float, tips: np.ndarray) -> np.ndarray:
     ]
     at, energies = surface.points.copy(), []
     for at[tip] in tips:
-        energies.append(barrier.energy(barrier.contacts((PairSet(candidates),), at), at))
+        energies.append(barrier.energy(barrier.contacts((CandidateSet(candidates),), at), at))
     return np.array(energies) / (0.25 * barrier.mesh.vertex_areas[tip])
 
 

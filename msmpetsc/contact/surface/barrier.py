@@ -27,7 +27,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.contact.friction import STICK
 from msmpetsc.contact.surface.continuous_collision import candidates_on_paths
 from msmpetsc.contact.surface.creases import creases, neighbours
-from msmpetsc.contact.surface.places import PairSet, Places, without_fading_links
+from msmpetsc.contact.surface.places import CandidateSet, Places, without_fading_links
 from msmpetsc.contact.surface.surface_friction import FrictionPairs, SurfaceFriction, friction_pairs
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.lattice.lattice import Lattice
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 # A set of candidates, or of contacts, for each distance from which pairs push
-PairSets: TypeAlias = tuple[PairSet, ...]
+CandidateSets: TypeAlias = tuple[CandidateSet, ...]
 ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"
 
 # Young's modulus over k_1 / h (lattice.material)
@@ -117,7 +117,7 @@ class Barrier:
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
         # Pairs of creases by distance; the first distance has none
-        self.creases: PairSets = (PairSet(ipctk.Candidates()),)
+        self.creases: CandidateSets = (CandidateSet(ipctk.Candidates()),)
         # Pairs of creases by kind, with their points (k, 4)
         self._creased: list[list[tuple[list[Any], Indices]]] = []
         self.last_friction: tuple[Positions, FrictionPairs] | None = None
@@ -144,7 +144,7 @@ class Barrier:
                 pairs, True
             )
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
-        self.creases += tuple(map(PairSet, sets.values()))
+        self.creases += tuple(map(CandidateSet, sets.values()))
         for crease in sets.values():
             kinds, parts = (
                 (crease.fv_candidates, crease.ee_candidates),
@@ -189,7 +189,9 @@ class Barrier:
                 found.add((int(min(first, second)), int(max(first, second))))
         return sorted(found)
 
-    def candidates(self, points: Positions, margin: float, moved: Rows | None = None) -> PairSets:
+    def candidates(
+        self, points: Positions, margin: float, moved: Rows | None = None
+    ) -> CandidateSets:
         """Return the pairs that may come closer than dhat, and all pairs of creases.
 
         Each point may move by ``margin`` [m] from its place, or from its path by ``moved``.
@@ -198,7 +200,7 @@ class Barrier:
         moved  : (p, 3) [m]; None if points stay
         """
         near = self.law.distance + 2 * margin
-        pairs = PairSet(candidates_on_paths(self.mesh, points, near, moved))
+        pairs = CandidateSet(candidates_on_paths(self.mesh, points, near, moved))
         cushions = (
             self._cushion(points, distance + 2 * margin)
             for distance in self.distances[len(self.creases) :]
@@ -219,16 +221,16 @@ class Barrier:
             self.distances.pop()
             self.potentials.pop()
 
-    def _cushion(self, points: Positions, distance: float) -> PairSet:
+    def _cushion(self, points: Positions, distance: float) -> CandidateSet:
         """Return the pairs of a body and an obstacle closer than this [m] at points (p, 3) [m]."""
         mesh, pairs, usual = self.mesh, self.ipctk.Candidates(), self.mesh.can_collide
         sides = np.repeat([0, 1], [self._bodies, len(points) - self._bodies])
         mesh.can_collide = self.ipctk.make_vertex_patches_filter(sides)
         pairs.build(mesh, np.asfortranarray(points), 0.5 * distance, self.ipctk.LBVH())
         mesh.can_collide = usual
-        return PairSet(pairs)
+        return CandidateSet(pairs)
 
-    def around(self, touched: Mask, points: Positions, margin: float) -> PairSets:
+    def around(self, touched: Mask, points: Positions, margin: float) -> CandidateSets:
         """Return the pairs of parts that have a point in ``touched`` (p,) or next to one.
 
         The pairs hold while points move by ``margin`` [m] from S (p, 3) [m].
@@ -253,9 +255,9 @@ class Barrier:
             sets[-1].fv_candidates, sets[-1].ee_candidates = (
                 [pairs[i] for i in np.flatnonzero(near[of].any(axis=1))] for pairs, of in kinds
             )
-        return tuple(map(PairSet, sets))
+        return tuple(map(CandidateSet, sets))
 
-    def clear_margin(self, sets: PairSets, points: Positions, margin: float) -> float:
+    def clear_margin(self, sets: CandidateSets, points: Positions, margin: float) -> float:
         """Return the displacement [m] of points, at most ``margin``, below which no pair pushes.
 
         Return 0 if a pair pushes already.
@@ -268,7 +270,7 @@ class Barrier:
                 margin = min(margin, max(0.5 * (self._least(near, points) - distance), 0.0))
         return margin
 
-    def contacts(self, sets: PairSets, points: Positions) -> ContactSets:
+    def contacts(self, sets: CandidateSets, points: Positions) -> ContactSets:
         """Return the pairs that push at points (p, 3) [m]."""
         kinds = zip(sets, self.distances, strict=True)
         return tuple(self.places.build(pairs, points, distance) for pairs, distance in kinds)
@@ -362,7 +364,7 @@ class Barrier:
         numbers = [] if nearest is None else [i for i in nearest.vertex_ids(*parts) if i >= 0]
         return np.array(numbers, np.int64)
 
-    def clearance(self, contacts: ContactSets, sets: PairSets, points: Positions) -> float:
+    def clearance(self, contacts: ContactSets, sets: CandidateSets, points: Positions) -> float:
         """Return a lower bound [m] of candidate pairs' distances, by their contacts at S (p, 3)."""
         # A larger distance of obstacles has the same pairs
         known = zip(contacts, sets, self.distances, strict=False)

@@ -15,7 +15,7 @@ from msmpetsc.backend.arrays import Positions, Rows
 if TYPE_CHECKING:
     import ipctk
 
-    from msmpetsc.contact.surface.barrier import Barrier, PairSets
+    from msmpetsc.contact.surface.barrier import Barrier, CandidateSets
 
 # Share of the path to a crossing that a step takes
 TAKEN = 0.9
@@ -63,7 +63,7 @@ def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
     return (rest - x @ linear, size) if size < STRETCHED else (rest, 0.0)
 
 
-def free_share(barrier: "Barrier", start: Positions, moved: Rows, sets: "PairSets") -> float:
+def free_share(barrier: "Barrier", start: Positions, moved: Rows, sets: "CandidateSets") -> float:
     """Return the free share of the paths from start (p, 3) by ``moved`` (p, 3) [m].
 
     sets : candidate pairs of the paths
@@ -88,7 +88,7 @@ def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
 
 
 def _share_to_crossing(
-    barrier: "Barrier", start: Positions, end: Positions, sets: "PairSets"
+    barrier: "Barrier", start: Positions, end: Positions, sets: "CandidateSets"
 ) -> float:
     """Return the share of paths before the first crossing of candidate pairs."""
     paths = barrier.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, barrier.ccd

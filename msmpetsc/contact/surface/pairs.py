@@ -5,9 +5,9 @@ moved by more than a margin; a common translation does not count. A bound by dis
 comes first: if no candidate pair can come near, no point is computed. Otherwise the points decide,
 since light nodes around a body swing much farther than its points.
 
-Candidate pairs outlive a step (``NearPairs``). Contacts at positions are kept during a step
-(``Contacts``). If few points touch, a step is narrow: it uses the candidates around these points,
-and all candidates once, at its end.
+Candidate pairs outlive a step (``CandidateCache``). Contacts at positions are kept during a step
+(``ContactSearch``). If few points touch, a step is narrow: it uses the candidates around these
+points, and all candidates once, at its end.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
-from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, PairSets
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, CandidateSets, ContactSets
 from msmpetsc.contact.surface.continuous_collision import PIECE, free_share, sweep
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
@@ -64,8 +64,8 @@ class CollisionSurface:
 
 
 @dataclass(frozen=True)
-class Touch:
-    """Number of contacts, least distance [m], NaN without contact, and energy [J]."""
+class ContactSummary:
+    """Number of contacts, least distance [m] (NaN without contact) and energy [J]."""
 
     contacts: int = 0
     distance: float = np.nan
@@ -73,7 +73,7 @@ class Touch:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class CandidatePairs:
     """Candidate pairs that are valid while points stay within a margin of their places or paths.
 
     A common translation of all points does not count.
@@ -92,10 +92,10 @@ class Pairs:
     margin: float
     clear: float
     points: Positions
-    sets: PairSets
+    sets: CandidateSets
     moved: Rows | None = None
 
-    def serve(self, points: Positions) -> bool:
+    def is_valid_at(self, points: Positions) -> bool:
         """Return whether points S (p, 3) [m] are within the margin, on rank 0."""
         gone = points - self.points
         if self.moved is not None:
@@ -105,7 +105,7 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class ContactsAt:
+class SurfaceContactsAt:
     """Contacts at positions and a time of obstacles.
 
     q        : (owned, 3) [m]
@@ -122,7 +122,7 @@ class ContactsAt:
     contacts: ContactSets
 
 
-class NearPairs:
+class CandidateCache:
     """Cache of candidate pairs of a run.
 
     All methods are collective. Positions are (owned or more, 3) [m].
@@ -140,20 +140,17 @@ class NearPairs:
         )
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         # The newest first
-        self._known: list[Pairs] = []
+        self._known: list[CandidatePairs] = []
 
-    def around(self, q: Positions, time: float) -> Pairs:
+    def around(self, q: Positions, time: float) -> CandidatePairs:
         """Return the newest candidates, or those at q if there are none yet."""
         return self._known[0] if self._known else self.broad_phase(q, time, self.law.distance)
 
-    def serving(self, *places: Positions) -> Pairs | None:
-        """Return the newest candidates that serve all these places (p, 3) [m] of points.
-
-        None without.
-        """
+    def valid_at(self, *places: Positions) -> CandidatePairs | None:
+        """Return the newest candidates that are valid at all these points (p, 3) [m], or None."""
         known = enumerate(self._known if self.barrier else ())
         number: int | None = self.comm.bcast(
-            next((i for i, pairs in known if all(map(pairs.serve, places))), None)
+            next((i for i, pairs in known if all(map(pairs.is_valid_at, places))), None)
         )
         if number is None:
             return None
@@ -162,18 +159,18 @@ class NearPairs:
 
     def broad_phase(
         self, q: Positions, time: float, margin: float, moved: Rows | None = None
-    ) -> Pairs:
+    ) -> CandidatePairs:
         """Find candidate pairs at q, or on the paths from there by ``moved`` (p, 3) [m]."""
         points, margin = (
             self.points(q, time),
             min(max(margin, LEAST * self.edge), FARTHEST * self.edge),
         )
-        sets: PairSets = ()
+        sets: CandidateSets = ()
         clear = 0.0
         if self.barrier:
             sets = self.barrier.candidates(points, margin, moved)
             clear = self.barrier.clear_margin(sets, points, margin) if moved is None else 0.0
-        newest = Pairs(
+        newest = CandidatePairs(
             q[: self.owned].copy(), time, margin, self.comm.bcast(clear), points, sets, moved
         )
         self._known = [newest, *self._known[: REMEMBERED - 1]]
@@ -202,7 +199,7 @@ class NearPairs:
             self.barrier.last_friction = None
 
 
-class Contacts:
+class ContactSearch:
     """Contacts in a step from ``begin`` to ``time`` [s]. All methods are collective.
 
     Positions are (owned or more, 3) [m]. Obstacles have their places at the end of the step unless
@@ -214,7 +211,7 @@ class Contacts:
     """
 
     def __init__(
-        self, near: NearPairs, begin: float, time: float, before: "Contacts | None" = None
+        self, near: CandidateCache, begin: float, time: float, before: "ContactSearch | None" = None
     ):
         self.begin, self.time = begin, time
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
@@ -222,9 +219,11 @@ class Contacts:
         self.is_narrow = self.is_left_out = False
         # Candidates of a narrow step, and whether they are around each point (p,), on
         # rank 0
-        self._around: PairSets = ()
+        self._around: CandidateSets = ()
         self._touched: Mask | None = None
-        self._moments: list[ContactsAt] = before._moments if before and not before.is_narrow else []
+        self._moments: list[SurfaceContactsAt] = (
+            before._moments if before and not before.is_narrow else []
+        )
         # q, time and points of the last positions
         self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
 
@@ -234,7 +233,7 @@ class Contacts:
         time: float | None = None,
         with_points: bool = False,
         base: Positions | None = None,
-    ) -> ContactsAt:
+    ) -> SurfaceContactsAt:
         """Return the contacts at positions q.
 
         time        : of obstacles [s]; None for the end of the step
@@ -248,15 +247,15 @@ class Contacts:
         pairs = self.near.around(q, time)
         bound = self.near.farthest(q, pairs.q, time, pairs.time)
         if bound < pairs.clear and not with_points:
-            return ContactsAt(q, time, 0, np.empty((0, 3)), ())
+            return SurfaceContactsAt(q, time, 0, np.empty((0, 3)), ())
         points = self.points_at(q, time)
         if bound > pairs.margin and not self.is_narrow:
-            pairs = self.near.serving(points) or self._broad_phase(q, time, points, base)
+            pairs = self.near.valid_at(points) or self._broad_phase(q, time, points, base)
         sets = self._around if self.is_narrow else pairs.sets
         contacts = self.barrier.contacts(sets, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
         self._moments = [
-            ContactsAt(q.copy(), time, count, points, contacts),
+            SurfaceContactsAt(q.copy(), time, count, points, contacts),
             *self._moments[: REMEMBERED - 1],
         ]
         return self._moments[0]
@@ -307,7 +306,7 @@ class Contacts:
         energy of the pairs used. From then on all candidates are used. If the path is free and x is
         not right, the step stays narrow, with the candidates around all contacts at x.
         """
-        known = Touch() if self.is_left_out else self.touch(x, self.time)
+        known = ContactSummary() if self.is_left_out else self.touch(x, self.time)
         self.widen()
         pairs, bound = self._bound(q, self.begin, x)
         ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
@@ -325,7 +324,7 @@ class Contacts:
 
     def _broad_phase(
         self, q: Positions, time: float, points: Positions, base: Positions | None
-    ) -> Pairs:
+    ) -> CandidatePairs:
         """Find candidates at q, with points S (p, 3) [m], and on a short path there from base."""
         moved = None if base is None else self.points_at(base, time) - points
         if self.comm.bcast(
@@ -351,14 +350,16 @@ class Contacts:
         """Return whether obstacles have the same places at two times [s]."""
         return not self.obstacles.moves(begin, end)
 
-    def touch(self, q: Positions, time: float) -> Touch:
+    def touch(self, q: Positions, time: float) -> ContactSummary:
         """Return number, least distance and energy of the contacts at q and a time [s]."""
         moment = self.find(q, time)
-        touch = Touch()
+        touch = ContactSummary()
         if self.barrier and moment.count:
             least = self.barrier.least(moment.contacts, moment.points)
-            touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))
-        of_all: Touch = self.comm.bcast(touch)
+            touch = ContactSummary(
+                moment.count, least, self.barrier.energy(moment.contacts, moment.points)
+            )
+        of_all: ContactSummary = self.comm.bcast(touch)
         return of_all
 
     def nearest(self, q: Positions) -> str:
@@ -376,7 +377,7 @@ class Contacts:
         in_words: str = self.comm.bcast(words)
         return in_words
 
-    def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[Pairs, float]:
+    def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[CandidatePairs, float]:
         """Return the newest candidates and a bound [m] of points' distances from their places.
 
         The bound holds on the path from q at ``begin`` [s] to ``end``.
@@ -402,12 +403,12 @@ class Contacts:
         sets = self._around
         if not self.is_narrow:
             # Candidates must be valid at both ends of the path
-            serving = self.near.serving(start, start + moved)
-            if not serving and length > PIECE * self.near.edge:
+            known = self.near.valid_at(start, start + moved)
+            if not known and length > PIECE * self.near.edge:
                 return float(
                     self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
                 )
-            sets = (serving or self.near.broad_phase(q, begin, LEAST * self.near.edge, moved)).sets
+            sets = (known or self.near.broad_phase(q, begin, LEAST * self.near.edge, moved)).sets
         return float(
             self.comm.bcast(free_share(self.barrier, start, moved, sets) if self.barrier else 1.0)
         )

@@ -51,8 +51,8 @@ KEPT = 1 << 15
 
 
 @dataclass(frozen=True)
-class PairSet:
-    """Candidate pairs; their numbers (2, k) are read when contacts are first asked for."""
+class CandidateSet:
+    """Candidate pairs, with the numbers (2, k) of their parts, read at the first use."""
 
     candidates: "ipctk.Candidates"
 
@@ -92,7 +92,9 @@ class Places:
         self._shape = EDGES + 1, self.mesh.size, self.mesh.size, CROSSING + 1
         self._collision = lru_cache(KEPT)(self._new_collision)
 
-    def build(self, pairs: PairSet, points: Positions, distance: float) -> "ipctk.NormalCollisions":
+    def build(
+        self, pairs: CandidateSet, points: Positions, distance: float
+    ) -> "ipctk.NormalCollisions":
         """Return the places of pairs nearer than ``distance`` [m] at points (p, 3) [m]."""
         import ipctk
 

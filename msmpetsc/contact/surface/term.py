@@ -13,7 +13,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
-from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
+from msmpetsc.contact.surface.pairs import ContactSearch, SurfaceContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
 TINY = np.finfo(float).tiny
@@ -101,7 +101,7 @@ class SurfaceContact:
 
     def __init__(
         self,
-        contacts: Contacts,
+        contacts: ContactSearch,
         start: Positions,
         time_step: float,
         last: Positions | None = None,
@@ -112,7 +112,7 @@ class SurfaceContact:
         self.has_friction = False
         self.friction: SurfaceFriction | None = None
         # The last Hessians, projected or not
-        self._hessians: dict[bool, tuple[ContactsAt, Rows | None, SurfaceHessian]] = {}
+        self._hessians: dict[bool, tuple[SurfaceContactsAt, Rows | None, SurfaceHessian]] = {}
         if contacts.law.friction > 0:
             moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
             self.has_friction = moment.count > 0
@@ -126,7 +126,7 @@ class SurfaceContact:
 
     def _friction(
         self,
-        moment: ContactsAt,
+        moment: SurfaceContactsAt,
         points: Positions,
         came: Rows | None,
         time_step: float,
@@ -165,7 +165,7 @@ class SurfaceContact:
         by = self.friction.limit.sum() if self.friction else 0.0
         return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
 
-    def _acting(self, q: Positions, base: Positions | None = None) -> ContactsAt | None:
+    def _acting(self, q: Positions, base: Positions | None = None) -> SurfaceContactsAt | None:
         """Return the contacts at q, with points for friction; None if nothing acts.
 
         base : start of a path to q
@@ -202,7 +202,7 @@ class SurfaceContact:
         gone = np.abs(points(q, time) - points(base, time)).max(initial=0.0)
         return bool(self.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
-    def _energy(self, moment: ContactsAt | None) -> float:
+    def _energy(self, moment: SurfaceContactsAt | None) -> float:
         """Return the energy [J] of the barrier on rank 0, else 0."""
         barrier = self.contacts.barrier
         return barrier.energy(moment.contacts, moment.points) if barrier and moment else 0.0
@@ -238,12 +238,12 @@ class SurfaceContact:
             moved if whole is None else (whole @ moved.ravel()).reshape(-1, 3), gradient
         )
 
-    def _gradient(self, moment: ContactsAt) -> Rows:
+    def _gradient(self, moment: SurfaceContactsAt) -> Rows:
         """Return the gradient (total, 3) [N] with friction on rank 0; (0, 3) elsewhere."""
         of_friction = self.friction.gradient(moment.points) if self.friction else 0.0
         return self._pushes(moment) + of_friction
 
-    def _pushes(self, moment: ContactsAt) -> Rows:
+    def _pushes(self, moment: SurfaceContactsAt) -> Rows:
         """Return the gradient (total, 3) [N] of the barrier on rank 0; (0, 3) elsewhere."""
         barrier = self.contacts.barrier
         return (
@@ -324,7 +324,7 @@ class SurfaceContact:
         )
         return bound
 
-    def _negative_part(self, moment: ContactsAt) -> tuple[Indices, Floats] | None:
+    def _negative_part(self, moment: SurfaceContactsAt) -> tuple[Indices, Floats] | None:
         """Return points (k,) with a negative part of the Hessian and its row sums (k,) [N/m].
 
         Return None on ranks but 0.
@@ -338,7 +338,7 @@ class SurfaceContact:
         return touched, sums[touched]
 
     def _curvature(
-        self, moment: ContactsAt, projected: bool, duals: Rows | None
+        self, moment: SurfaceContactsAt, projected: bool, duals: Rows | None
     ) -> tuple[Indices, csr_array] | None:
         """Return the points (k,) in contact and their Hessian (3k, 3k) [N/m], on rank 0."""
         whole = self._whole_hessian(moment, projected, duals)
@@ -350,7 +350,7 @@ class SurfaceContact:
         return touched, csr_array(whole[numbers][:, numbers])
 
     def _whole_hessian(
-        self, moment: ContactsAt, projected: bool, duals: Rows | None
+        self, moment: SurfaceContactsAt, projected: bool, duals: Rows | None
     ) -> csr_array | None:
         """Return the Hessian (3 total, 3 total) [N/m] of all points on rank 0, else None."""
         barrier = self.contacts.barrier

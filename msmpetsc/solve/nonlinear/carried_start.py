@@ -24,7 +24,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows, greatest
 from msmpetsc.comm import Stop
-from msmpetsc.contact.surface.pairs import Contacts
+from msmpetsc.contact.surface.pairs import ContactSearch
 from msmpetsc.errors import StepFailed, StepStopped
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
@@ -87,7 +87,7 @@ class CarriedStart:
         finally:
             contacts.time, functional.problem, obstacles.straight = end, problem, None
 
-    def _moved_with_obstacles(self, contacts: Contacts, moved: Rows) -> Rows:
+    def _moved_with_obstacles(self, contacts: ContactSearch, moved: Rows) -> Rows:
         """Return displacements (l, 3) [m] of nodes.
 
         Nodes go with the obstacles that they touch, other nodes by ``moved``.
@@ -98,7 +98,7 @@ class CarriedStart:
         times = contacts.begin, contacts.time
         return contacts.obstacles.carried(q, moved, times, distances, functional.lattice.cell_size)
 
-    def _cushion(self, contacts: Contacts) -> float:
+    def _cushion(self, contacts: ContactSearch) -> float:
         """Return the distance [m] from which obstacles push: the longest move of a moving part."""
         problem, obstacles = (
             self.functional.problem,
@@ -107,7 +107,7 @@ class CarriedStart:
         fixed = self.functional.comm.allreduce(greatest(np.abs(problem.fixed - problem.q)), MPI.MAX)
         return float(max(fixed, greatest(np.abs(obstacles)), contacts.law.distance))
 
-    def _carry(self, contacts: Contacts, end: float) -> Positions:
+    def _carry(self, contacts: ContactSearch, end: float) -> Positions:
         """Return the start at s = 1 by Newton's directions. Raises StepFailed."""
         functional, problem, begin = self.functional, self.functional.problem, contacts.begin
         is_fixed, still = functional.lattice.held, np.zeros((1, 3))

@@ -159,12 +159,12 @@ def fill(
     kind, *cut = (route.send(column)[order] for column in columns)
     fills, moments = cut or (None, None)
     copies = find_copies(of_parts, grids, table)
-    _tell_copies(copies)
+    _log_copies(copies)
     points = tuple(parts.points if parts else None for parts in of_parts)
     return Cages(grids, table, kind, fills, moments, is_weighted, copies, points)
 
 
-def _tell_copies(copies: Copies | None) -> None:
+def _log_copies(copies: Copies | None) -> None:
     """Log how many copies of cells and nodes there are."""
     if copies:
         cells = int((copies.keys % COPIES > 0).sum())

@@ -122,7 +122,7 @@ def _suspects(parts: CellParts) -> Indices:
 
 @cache
 def _disconnected() -> Mask:
-    """Return for each mask (256,) of octants whether they do not all hang together by faces."""
+    """Return for each mask (256,) of octants whether the octants are not all joined by faces."""
     joined = [(1 << low, 1 << high) for _, low, high in FACES]
     found = np.zeros(256, bool)
     for mask in range(1, 256):

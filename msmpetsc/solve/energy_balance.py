@@ -154,7 +154,7 @@ class EnergyBalance:
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
         displacement = result.position[owned] - result.previous[owned]
-        pressing, dragged = self.environment.obstacles.way_of_pressing(
+        pressing, dragged = self.environment.obstacles.pressing_displacement(
             (result.position[owned], after.sides), time, time_step
         )
         is_held = self.environment.anchors.fixed_at(time)[owned].any(axis=0)

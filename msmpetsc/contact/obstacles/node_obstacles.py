@@ -152,7 +152,9 @@ class NodeObstacles:
                     work += p.friction * p.stiffness * depth * distance
         return work
 
-    def way_of_pressing(self, state: Placed, time: float, time_step: float) -> tuple[float, Floats]:
+    def pressing_displacement(
+        self, state: Placed, time: float, time_step: float
+    ) -> tuple[float, Floats]:
         """Return the sum of penalty forces [N], and the sum (3,) [N m] of force times displacement.
 
         The sums are over this rank's nodes, with the obstacles' displacements in the step.

@@ -130,7 +130,7 @@ class Barrier:
         )
 
     def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
-        """Let pairs in creases push from smaller distances alone.
+        """Let pairs in creases push only from smaller distances.
 
         Return the number of these pairs, and of pairs too close to push at all.
 

@@ -49,7 +49,7 @@ def collision_surface(
     lattice: Lattice,
     obstacles: list[Obstacle],
 ) -> CollisionSurface | None:
-    """Return the surface of all bodies that meets itself or obstacles (collective).
+    """Return the contact surface of all bodies and obstacles (collective).
 
     Return None if the scene asks for neither.
 
@@ -90,7 +90,7 @@ def collision_surface(
 def _prepared(
     bodies: list[Surface], table: SelfContactTable, meets_itself: bool, cell_size: float
 ) -> tuple[list[Surface], float, float]:
-    """Return the surfaces that meet, their distance from the bodies' surfaces, and their mean edge.
+    """Return the contact surfaces, their distance from the bodies' surfaces, and their mean edge.
 
     The surfaces have about as many triangles as the table asks for, all of them if it does not.
     Triangles that cross are left out. The distance is the median over the bodies' points [m].
@@ -143,7 +143,7 @@ def _gap(
 
 
 def _refuse_touching(surface: CollisionSurface) -> None:
-    """Raise InputError if an obstacle cuts a body at rest, or all but touches it."""
+    """Raise InputError if an obstacle cuts a body at rest, or nearly touches it."""
     whole, law = surface.surface, surface.law
     if whole is None or not surface.points.obstacles.total:
         return

@@ -110,7 +110,7 @@ def creases(
 def _left_out(
     near: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
 ) -> list["ipctk.FaceVertexCandidate | ipctk.EdgeEdgeCandidate"]:
-    """Return the pairs of a point and a triangle and of two edges that are neighbours altogether.
+    """Return the pairs of point and triangle and of two edges whose points are all neighbours.
 
     All points of one part are neighbours of all points of the other part.
     """

@@ -98,7 +98,7 @@ def _add(
 
 @njit()
 def _to_edge(along: Vector, vertex: Vector) -> tuple[float, int]:
-    """Return the squared distance [m^2] of a vertex from an edge, and where the nearest point is.
+    """Return the squared distance [m^2] of a vertex from an edge, and its nearest point.
 
     The nearest point is at an end of the edge (0, 1) or between the ends (2).
     Ericson 2005, Real-Time Collision Detection, 5.1.2.

@@ -43,7 +43,7 @@ TINY = np.finfo(float).tiny
 
 @dataclass(frozen=True)
 class CollisionSurface:
-    """Surface that meets itself or obstacles.
+    """Surface of bodies and obstacles in contact.
 
     surface      : of bodies without crossing triangles, then of obstacles; on rank 0, else None
     points       : of the surface, by nodes
@@ -343,7 +343,7 @@ class ContactSearch:
         return self._points[0][2]
 
     def _is_at(self, known: Positions, at: float, q: Positions, time: float) -> bool:
-        """Return whether positions and obstacles agree with known ones on all ranks."""
+        """Return whether positions and obstacles' places equal known ones on all ranks."""
         return self.same(at, time) and self.comm.allreduce(bool(np.array_equal(q, known)), MPI.LAND)
 
     def same(self, begin: float, end: float) -> bool:

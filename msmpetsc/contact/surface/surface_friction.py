@@ -65,7 +65,7 @@ class SurfaceFriction(Friction):
         return u, np.linalg.norm(u, axis=1)
 
     def after(self, last: "SurfaceFriction | None", points: Positions) -> "SurfaceFriction":
-        """Return friction that goes on from ``last``, of the last step, at points (p, 3) [m]."""
+        """Return friction that continues the last step's friction at points (p, 3) [m]."""
         return (
             replace(self, begin=self.values_of(last.pairs, last.elastic_slip(points, self.stick)))
             if last
@@ -93,7 +93,7 @@ class SurfaceFriction(Friction):
 def friction_pairs(
     found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
 ) -> FrictionPairs:
-    """Return the pairs of some sets that push, their pushes lessened by links of negative weight.
+    """Return the pushing pairs of some sets, their pushes reduced by links of negative weight.
 
     The vertex or edge with the lesser first number is first, since ipctk has no order of its own.
     """

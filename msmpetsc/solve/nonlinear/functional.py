@@ -251,7 +251,7 @@ class StepFunctional:
 
 
 class Rounding:
-    """Rounding in the steps of one lattice and time step, which no error is below.
+    """Lower bound on errors by rounding, in the steps of one lattice and time step.
 
     All methods are collective.
 

@@ -137,7 +137,7 @@ class Jacobian:
 
 
 class FrictionDuals:
-    """Forces of friction, which are unknowns of Newton's method beside positions.
+    """Dual unknowns of Newton's method: forces of friction over their limits.
 
     See contact.obstacles.node_friction.
 

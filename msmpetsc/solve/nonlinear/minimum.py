@@ -51,7 +51,7 @@ class Verdict:
 
 
 class Minimum:
-    """Examination of a stepper's iterates. All methods are collective."""
+    """Second-order test of a stepper's iterates. All methods are collective."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class Minimum:
         return relative(first + second, distance)
 
     def lower_iterate(self, at: Iterate, verdict: Verdict) -> Iterate | None:
-        """Return an iterate of lower g than one that is no minimum; None if there is none.
+        """Return an iterate of lower g than an iterate that is no minimum, or None.
 
         It is the point examined, or a point farther along a direction of negative curvature.
         """

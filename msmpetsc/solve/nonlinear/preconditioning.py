@@ -288,7 +288,7 @@ class StepPreconditioner:
 
     @property
     def is_uniform(self) -> bool:
-        """Whether smooth errors fade as fast as rough errors."""
+        """Whether smooth errors converge as fast as oscillating errors."""
         return self.is_chosen or self.is_searching
 
     @property

@@ -4,6 +4,7 @@ lattice has."""
 import numpy as np
 import pytest
 from hierarchies import COMM, LATTICES, SHAPES, Case, build, heavier, hierarchy
+from lattices import block
 
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
 
@@ -65,6 +66,17 @@ def check_operator(coarse: CoarseOperator) -> None:
         np.testing.assert_allclose(
             found.array, expected.array, rtol=0, atol=2e-6 * abs(expected.array).max()
         )
+
+
+@pytest.mark.parametrize("seed", [0, 3, 4, 5])
+def test_levels_of_random_lattices_are_galerkin_products(seed: int):
+    """Pinned nodes hold several parts, each with copies of coarse nodes of its own."""
+    rng = np.random.default_rng(seed)
+    cells = block(7, 7, 7)
+    lattice = build(COMM, cells[rng.random(len(cells)) < 0.3])
+    lattice = lattice.pin(rng.random(len(lattice.nodes)) < 0.4)
+    with hierarchy(COMM, lattice, SHAPES["twisted"], coarsest=10) as case:
+        check_levels(case)
 
 
 @pytest.mark.parametrize("name", CASES)

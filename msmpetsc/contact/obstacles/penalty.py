@@ -30,6 +30,8 @@ from msmpetsc.scene.obstacles import ObstacleTable
 
 # default stiffness [stiffest spring]; so that nodes sink in by little
 STIFFNESS = 10.0
+# depth at which nodes are stopped [fraction]; above 0, so that the Hessian has contact
+STOP_DEPTH = 1e-3
 # duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
 Duals = list[Rows | None]
 
@@ -156,6 +158,15 @@ class ContactState:
         if self.friction:
             self.friction.add_gradient(q, gradient)
 
+    def stopped(self, q: Positions, base: Positions) -> tuple[Indices, Rows]:
+        """Return the nodes (a,) inside at q but not at base (n, 3), and displacements (a, 3) [m].
+
+        The displacements move the nodes from q to a small depth, where the Hessian has the contact.
+        """
+        rows, depth, normal = self.pressed(q)
+        new = self.depths(base)[0][rows] <= 0
+        return rows[new], (1 - STOP_DEPTH) * depth[new][:, None] * normal[new]
+
     def change(self, q: Positions, base: Positions) -> float:
         """Return the change [J] of the penalty energy from base to q (n, 3)."""
         depths, face = self.depths(q)
@@ -205,6 +216,16 @@ class Contact:
     def change_of_friction(self, q: Positions, base: Positions) -> float:
         """Return the change [J] of the energy of the obstacles' friction from base to q."""
         return sum(state.friction.change(q, base) for state in self.states if state.friction)
+
+    def stopped(self, q: Positions, base: Positions) -> Positions | None:
+        """Return q with the nodes that enter obstacles from base stopped; None without them."""
+        corrections = [state.stopped(q[: self.owned], base[: self.owned]) for state in self.states]
+        if not any(len(rows) for rows, _ in corrections):
+            return None
+        stopped = q.copy()
+        for rows, correction in corrections:
+            stopped[rows] += correction
+        return stopped
 
     def at(self, q: Positions) -> "ContactAt":
         """Return the contact at q."""

@@ -1,7 +1,7 @@
 """Newton's method for a step, with the true Hessian H of g, CG, and a line search on g:
 
     H(x_k) y = F(x_k)                by CG, to the digits that the step still lacks
-    y <- the part of y on which the surface crosses nothing
+    y <- y bent at obstacles, and the part of it on which the surface crosses nothing
     x_(k+1) = x_k - s y              g(x_(k+1)) <= g(x_k) - ALPHA s y . F(x_k)     (Armijo)
 
 until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
@@ -13,9 +13,11 @@ over for some iterations.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array
+from msmpetsc.backend.arrays import Array, Positions
+from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
@@ -35,6 +37,8 @@ ALPHA = 1e-4
 LEAST, MOST = 0.1, 0.5
 # Least step length; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
+# Share of its slope that a direction must keep when it is bent at obstacles
+DOWNHILL = 0.1
 KSP = PETSc.KSP.ConvergedReason
 # Reasons of KSP without a usable direction
 USELESS = (
@@ -90,7 +94,7 @@ class Newton(StepMethod):
                 break
             if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
                 outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
-            self._shorten(now)
+            self._limit(now)
             found = self._search(now, outcome.is_flat)
             if found is None and projected:
                 reason = REASON.DIVERGED_LINE_SEARCH
@@ -177,15 +181,41 @@ class Newton(StepMethod):
         self.functional.vectors.give_back(x)
         return None
 
-    def _shorten(self, now: Iterate) -> None:
-        """Shorten y so that the surface crosses nothing on the way from x to x - y."""
-        if self.functional.surface is None:
+    def _limit(self, now: Iterate) -> None:
+        """Bend y at obstacles, then shorten it, so that the surface crosses nothing to x - y."""
+        contact = self.functional.problem.contact
+        if contact is None:
             return
         self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
-            share = self.functional.free_share(now.q, self.functional.positions(self.end))
+            end = self._stop_at_obstacles(now, contact, self.functional.positions(self.end))
+            share = self.functional.free_share(now.q, end)
         if share < 1.0:
             self.y.scale(share)
+
+    def _stop_at_obstacles(self, now: Iterate, contact: Contact, end: Positions) -> Positions:
+        """Bend y so that nodes stop at obstacles that they would enter.
+
+        H at x does not know obstacles that nodes do not touch yet. A line search that shortened the
+        whole step for each of them would let them come in one by one. A direction that hardly
+        descends when bent stays as it is.
+
+        end : positions (l, 3) [m] at x - y
+
+        Return the new end (l, 3) [m].
+        """
+        functional, bent = self.functional, self.end
+        stopped = contact.stopped(end, now.q)
+        if not functional.comm.allreduce(stopped is not None, MPI.LOR):
+            return end
+        functional.unknowns.from_nodes(end if stopped is None else stopped, bent)
+        # Fixed nodes stay at their places
+        free = functional.positions(bent)
+        bent.aypx(-1.0, now.x)
+        if not bent.dot(now.f) > DOWNHILL * self.y.dot(now.f):
+            return end
+        bent.copy(self.y)
+        return free
 
 
 def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:

@@ -158,15 +158,6 @@ class ContactState:
         if self.friction:
             self.friction.add_gradient(q, gradient)
 
-    def stopped(self, q: Positions, base: Positions) -> tuple[Indices, Rows]:
-        """Return the nodes (a,) inside at q but not at base (n, 3), and displacements (a, 3) [m].
-
-        The displacements move the nodes from q to a small depth, where the Hessian has the contact.
-        """
-        rows, depth, normal = self.pressed(q)
-        new = self.depths(base)[0][rows] <= 0
-        return rows[new], (1 - STOP_DEPTH) * depth[new][:, None] * normal[new]
-
     def change(self, q: Positions, base: Positions) -> float:
         """Return the change [J] of the penalty energy from base to q (n, 3)."""
         depths, face = self.depths(q)
@@ -216,16 +207,6 @@ class Contact:
     def change_of_friction(self, q: Positions, base: Positions) -> float:
         """Return the change [J] of the energy of the obstacles' friction from base to q."""
         return sum(state.friction.change(q, base) for state in self.states if state.friction)
-
-    def stopped(self, q: Positions, base: Positions) -> Positions | None:
-        """Return q with the nodes that enter obstacles from base stopped; None without them."""
-        corrections = [state.stopped(q[: self.owned], base[: self.owned]) for state in self.states]
-        if not any(len(rows) for rows, _ in corrections):
-            return None
-        stopped = q.copy()
-        for rows, correction in corrections:
-            stopped[rows] += correction
-        return stopped
 
     def at(self, q: Positions) -> "ContactAt":
         """Return the contact at q."""
@@ -292,6 +273,25 @@ class ContactAt:
             state.add_gradient(self.q[: self.contact.owned], pressed, gradient)
         if self.surface:
             self.surface.add_gradient(self.q, gradient)
+
+    def stopped(self, end: Positions) -> Positions | None:
+        """Return positions with the nodes that enter obstacles on the path to ``end`` stopped.
+
+        They stop at a small depth, where the Hessian has the contact. Return None without such
+        nodes.
+
+        end : (owned or more, 3) [m]
+        """
+        owned, stopped = self.contact.owned, None
+        for state, (inside, _, _) in self.of_obstacles:
+            rows, depth, normal = state.pressed(end[:owned])
+            was_inside = np.zeros(owned, bool, like=end)
+            was_inside[inside] = True
+            new = ~was_inside[rows]
+            if new.any():
+                stopped = end.copy() if stopped is None else stopped
+                stopped[rows[new]] += (1 - STOP_DEPTH) * depth[new][:, None] * normal[new]
+        return stopped
 
     def hessian(self, duals: Duals | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield the nodes (a,) and blocks (a, 3, 3) [N/m] of each obstacle's penalty and friction.

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Positions
-from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
@@ -183,17 +183,16 @@ class Newton(StepMethod):
 
     def _limit(self, now: Iterate) -> None:
         """Bend y at obstacles, then shorten it, so that the surface crosses nothing to x - y."""
-        contact = self.functional.problem.contact
-        if contact is None:
+        if now.contact is None:
             return
         self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
-            end = self._stop_at_obstacles(now, contact, self.functional.positions(self.end))
+            end = self._stop_at_obstacles(now, now.contact, self.functional.positions(self.end))
             share = self.functional.free_share(now.q, end)
         if share < 1.0:
             self.y.scale(share)
 
-    def _stop_at_obstacles(self, now: Iterate, contact: Contact, end: Positions) -> Positions:
+    def _stop_at_obstacles(self, now: Iterate, contact: ContactAt, end: Positions) -> Positions:
         """Bend y so that nodes stop at obstacles that they would enter.
 
         H at x does not know obstacles that nodes do not touch yet. A line search that shortened the
@@ -205,7 +204,7 @@ class Newton(StepMethod):
         Return the new end (l, 3) [m].
         """
         functional, bent = self.functional, self.end
-        stopped = contact.stopped(end, now.q)
+        stopped = contact.stopped(end)
         if not functional.comm.allreduce(stopped is not None, MPI.LOR):
             return end
         functional.unknowns.from_nodes(end if stopped is None else stopped, bent)

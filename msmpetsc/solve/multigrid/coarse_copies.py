@@ -47,7 +47,7 @@ class CoarseCopies:
 
     cells    : (m, 8) keys of the corners of this rank's cells on the last level
     of_nodes : (l, 8) copies of the parents of the lattice's local nodes, ghosts included; the
-               parents are at half the node's index plus CORNERS
+               parents are at half the node's index plus CORNERS; 0 for a pinned node
     """
 
     def __init__(self, lattice: Lattice, keys: Indices, offsets: Indices):
@@ -59,7 +59,9 @@ class CoarseCopies:
         """
         corners = to_host(lattice.local_cells)[: lattice.cells_owned]
         self.cells = keys[corners] + offsets[corners].max(axis=1, keepdims=True)
-        own = self._coarsen(lattice.table, lattice.global_numbers[corners])
+        # A pinned node may hold several bodies, whose copies differ
+        unknown = np.where(to_host(lattice.pinned), -1, lattice.global_numbers)
+        own = self._coarsen(lattice.table, unknown[corners])
         self.of_nodes = lattice.table.with_ghosts(lattice.ghosts, own)
 
     def of(self, table: SortedKeys) -> Array:

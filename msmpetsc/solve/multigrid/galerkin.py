@@ -264,8 +264,6 @@ def _by_cell(
     """
     lattice = unknowns.lattice
     pinned, free = to_host(lattice.pinned), to_host(unknowns.free)
-    # A pinned node may hold several bodies, whose copies differ
-    parents = np.where(pinned[:, None], 0, parents)
     springs = to_host(lattice.springs)[: lattice.springs_owned if elasticity.springs else 0]
     moving = np.flatnonzero(~pinned[springs].all(axis=1))
     corners = elasticity.corners

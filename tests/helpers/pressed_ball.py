@@ -10,7 +10,8 @@ from scipy.sparse.linalg import spsolve
 # Young's modulus [Pa], Poisson's ratio, Lame's parameters [Pa]; the radius is 1 m
 E, NU = 1e6, 0.3
 MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
-# change of a Newton iteration that ends it [m], and the most iterations and changes of the contact
+# the change of a Newton iteration that ends it [m]
+# the most iterations and changes of the contact
 SMALL, MOST = 1e-9, 60
 
 

@@ -13,7 +13,7 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch, ContactSummary
-from msmpetsc.contact.surface.term import SurfaceContact
+from msmpetsc.contact.surface.surface_contact import SurfaceContact
 
 # ratio of the normal force at a step's end to the force that limited friction; beyond
 # it, in either direction, the step is solved again with the new limit

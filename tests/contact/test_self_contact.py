@@ -17,8 +17,8 @@ from stopped_runs import assert_goes_on_exactly
 
 from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
+from msmpetsc.contact.surface.surface_contact import SMALL, SurfaceContact
 from msmpetsc.contact.surface.surface_friction import FrictionPairs, friction_pairs
-from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene

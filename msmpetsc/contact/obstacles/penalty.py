@@ -25,7 +25,7 @@ from msmpetsc.contact.obstacles.node_friction import (
     Pressed,
     apply_friction,
 )
-from msmpetsc.contact.surface.term import SurfaceContact
+from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.scene.obstacles import ObstacleTable
 
 # default stiffness [stiffest spring]; so that nodes sink in by little

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
 from msmpetsc.backend.arrays import Indices, Mask, Rows, to_host
-from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.pressure import PressureHessian
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import Springs, elastic_hessian

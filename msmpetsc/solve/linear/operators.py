@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.contact.obstacles.penalty import ContactAt, Duals
-from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.errors import InputError

@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dpstrf
 from scipy.sparse import csr_array, eye_array, kron
 
 from msmpetsc.backend.arrays import Array, Rows
-from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 
 # most contact nonzeros kept, over those in use; the factor must stay sparse

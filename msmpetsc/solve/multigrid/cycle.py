@@ -19,7 +19,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows, to_host
-from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.initial_state import uniform

@@ -7,7 +7,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.contact import ContactSmoother

@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest, like, to_host
 from msmpetsc.contact.obstacles.penalty import Contact, ContactAt
-from msmpetsc.contact.surface.term import SurfaceContact
+from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.initial_state import uniform

@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Positions, Rows, like
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.penalty import ContactAt
-from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from pinch import pinch_scene
 
-from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.multigrid import cycle
 from msmpetsc.solve.multigrid.contact import CoarseContact, ContactSmoother
 

@@ -28,10 +28,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
-from msmpetsc.comm import places_of
 from msmpetsc.geometry.grid import Grid, packed, unpacked
 from msmpetsc.geometry.lines_in_cells import LINES, split_cell
 from msmpetsc.geometry.morton import COPIES
+from msmpetsc.geometry.partition import places_of
 from msmpetsc.geometry.surface import Surface, first_of_equal, is_inside
 from msmpetsc.geometry.valid_cells import touched_cells
 

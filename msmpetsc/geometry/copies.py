@@ -16,10 +16,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Array, Indices, Mask
-from msmpetsc.comm import SortedKeys, places_of
 from msmpetsc.geometry.cell_parts import CellParts
 from msmpetsc.geometry.grid import CORNERS, BodyGrids, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.geometry.partition import SortedKeys, places_of
 
 # offsets of the 8 cells around a node from the node
 OCTANTS = -CORNERS

@@ -14,12 +14,13 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
-from msmpetsc.comm import Route, SortedKeys
+from msmpetsc.comm import Route
 from msmpetsc.geometry.blended_coordinates import affine_weights, cages_weights, gradient_table
 from msmpetsc.geometry.block import MIDDLE, NODE_STRIDE
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.geometry.partition import SortedKeys
 
 # largest distance of a point outside its cell [cells]; above rounding
 ROUNDING = 1e-9

@@ -12,9 +12,10 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, to_host
-from msmpetsc.comm import SortedKeys, starts
+from msmpetsc.comm import starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.copies import Copies
+from msmpetsc.geometry.partition import SortedKeys
 from msmpetsc.lattice.mass_and_stiffness import SolidCells, law_of_solid, law_of_springs
 from msmpetsc.lattice.material import MaterialOfCells
 from msmpetsc.lattice.topology import DIRECTION_KIND, Topology, topology_of

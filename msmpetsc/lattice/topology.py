@@ -6,10 +6,10 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Indices, Mask, Rows
 from msmpetsc.backend.kernel import njit
-from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.geometry.partition import SortedKeys
 
 # direction (8, 8) from corner a to b [-]; an index into the 3 x 3 x 3 nodes around a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])

@@ -5,11 +5,11 @@ from itertools import product
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import SortedKeys
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid
 from msmpetsc.geometry.morton import encode_morton
+from msmpetsc.geometry.partition import SortedKeys
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.scene.body import Material
 from msmpetsc.solve.nonlinear.functional import StepProblem

@@ -1,11 +1,14 @@
-"""Checks msmpetsc.comm against plain arrays that every rank knows in full. Run by test_comm.py
-under mpiexec."""
+"""Check communication and partition against plain arrays that every rank knows in full.
+
+test_comm.py runs this worker under mpiexec.
+"""
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import Route, SortedKeys, on_root, together
+from msmpetsc.comm import Route, on_root, together
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.geometry.partition import SortedKeys
 
 comm = MPI.COMM_WORLD
 

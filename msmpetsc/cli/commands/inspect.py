@@ -1,7 +1,7 @@
 """``msmpetsc inspect``: print mesh groups, counts and memory of a scene without a run.
 
 The counts give ranks equal parts of cells and nodes along the Morton curve. The parts of a run,
-made by sampling (comm.SortedKeys), agree with these within an eighth.
+made by sampling (geometry.partition.SortedKeys), agree with these within an eighth.
 """
 
 import argparse

@@ -13,9 +13,10 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Indices, Mask, to_host
 from msmpetsc.backend.kernel import njit
 from msmpetsc.backend.trees import root
-from msmpetsc.comm import Route, SortedKeys, places_of
+from msmpetsc.comm import Route
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.geometry.partition import SortedKeys, places_of
 from msmpetsc.lattice.lattice import Lattice
 
 # index in CORNERS of an offset, from its digits ON_AXES

@@ -18,8 +18,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows, like, to_host
-from msmpetsc.comm import Route, SortedKeys
+from msmpetsc.comm import Route
 from msmpetsc.geometry.morton import LIMIT, decode_morton, encode_morton
+from msmpetsc.geometry.partition import SortedKeys
 from msmpetsc.solve.linear.unknowns import Unknowns
 
 

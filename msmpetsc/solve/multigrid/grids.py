@@ -12,9 +12,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Indices, Mask
-from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import decode_morton, encode_morton
+from msmpetsc.geometry.partition import SortedKeys
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 

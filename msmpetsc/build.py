@@ -48,7 +48,7 @@ from msmpetsc.lattice.topology import Topology, topology_of
 from msmpetsc.scene.motion import Gravity, Traction
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import OfBody, held_by, surface_loads
+from msmpetsc.scene.schema import OfBody, holders_of, surface_loads
 
 # range of a body's longest side [m]; its fourth power stays within a double
 SIDE_LIMITS = 1e-60, 1e60
@@ -212,13 +212,13 @@ def build_model(
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
     points = geometry.nearest if tables else lattice.nodes
     masks = {table.key: finder.find(table, lattice, points) for table in tables}
-    held = {t.key: masks[t.key][:, None] & np.array(t.table.held) for t in held_by(scene)}
+    components = {t.key: masks[t.key][:, None] & np.array(t.table.fixed) for t in holders_of(scene)}
     lattice = lattice.pin(
-        reduce(np.logical_or, (held[pin.key] for pin in scene.tables("pin")), lattice.held)
+        reduce(np.logical_or, (components[pin.key] for pin in scene.tables("pin")), lattice.fixed)
     )
-    holders = Holders.of_masks(held, lattice)
-    anchors = _anchors(scene.tables("anchor"), lattice, held, holders)
-    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.held)
+    holders = Holders.of_masks(components, lattice)
+    anchors = _anchors(scene.tables("anchor"), lattice, components, holders)
+    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.fixed)
     outside = geometry.outside(lattice.nodes) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
@@ -266,7 +266,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
             lattice,
             nodes=send(lattice.nodes),
             mass=send(lattice.mass),
-            held=send(lattice.held),
+            fixed=send(lattice.fixed),
             local_cells=send(lattice.local_cells),
             solid=solid and solid._replace(forms=send(solid.forms)),
         ),
@@ -357,18 +357,18 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
 
 
 def _anchors(
-    tables: Iterable[OfBody], lattice: Lattice, held: Regions, holders: Holders
+    tables: Iterable[OfBody], lattice: Lattice, components: Regions, holders: Holders
 ) -> list[Anchor]:
     """Return the anchors (collective). A component follows its pin, else its first anchor.
 
-    held : components (l, 3) in the region of each table
+    components : fixed components (l, 3) in the region of each table
 
     Raises InputError if pins and anchors leave no node to move.
     """
     anchors = []
-    prescribed = lattice.held
+    prescribed = lattice.fixed
     for anchor in tables:
-        where = held[anchor.key] & ~prescribed
+        where = components[anchor.key] & ~prescribed
         center_of_mass = holders.centers[holders.keys.index(anchor.key)]
         center = center_of_mass if anchor.table.center is None else np.array(anchor.table.center)
         path = Motion.through(anchor.table.path, center)

@@ -33,9 +33,9 @@ class Anchors:
         return [anchor for anchor in self.all if anchor.acts_at(time)]
 
     def fixed_at(self, time: float) -> Mask:
-        """Return the mask (l, 3) of components that are held at a time [s]: no unknowns."""
+        """Return the mask (l, 3) of components that are fixed at a time [s]: no unknowns."""
         return reduce(
-            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.held
+            np.logical_or, (anchor.where for anchor in self.acting(time)), self.lattice.fixed
         )
 
     def prescribed(

@@ -1,17 +1,17 @@
 """Pins and anchors: their nodes, the springs and cells that a clamp's edge cuts, and reactions.
 
-A pin's region ends between nodes. A spring from a free to a held node deforms only outside the
+A pin's region ends between nodes. A spring from a free to a fixed node deforms only outside the
 region, on the fraction theta of its length. So its stiffness is multiplied by 1 / theta. If the
-held node lies outside the body, as at a clamped face, the factor is 1 / (sigma theta). The spring
+fixed node lies outside the body, as at a clamped face, the factor is 1 / (sigma theta). The spring
 then stands for the fraction sigma of its length (cut_cells). Along a row of cells both are exact. A
 clamp oblique to the grid is second-order accurate, like the Poisson equation of Gibou, Fedkiw,
 Cheng and Kang (2002). A solid's cell uses the mean of sigma theta over its pairs of a free and a
-held corner. This is too stiff along the clamp, but no strain occurs there.
+fixed corner. This is too stiff along the clamp, but no strain occurs there.
 
 A pin of single components, a roller, ends at its nodes: the rest of their motion is free in its
 region, so that no spring is stiffer.
 
-The reaction on a held node is  m a + grad E - f_ext - push.  grad E sums to zero over a body, so
+The reaction on a fixed node is  m a + grad E - f_ext - push.  grad E sums to zero over a body, so
 reactions + loads + pushes = sum of m a.
 """
 
@@ -109,12 +109,14 @@ def clamped(
     tables = [
         t
         for t in chain(scene.tables("pin"), lasting)
-        if all(t.table.held) and not t.table.region.is_of_mesh
+        if all(t.table.fixed) and not t.table.region.is_of_mesh
     ]
-    held = np.any([np.zeros(len(points), bool), *(masks[table.key] for table in tables)], axis=0)
+    is_fixed = np.any(
+        [np.zeros(len(points), bool), *(masks[table.key] for table in tables)], axis=0
+    )
 
     def stiffening(free: Indices, fixed: Indices) -> Floats:
-        """Return 1 / (sigma theta) (n,) [-] for pairs of a free (n,) and a held node (n,)."""
+        """Return 1 / (sigma theta) (n,) [-] for pairs of a free (n,) and a fixed node (n,)."""
         body = lattice.body[free]
 
         def within(x: Positions) -> Mask:
@@ -130,26 +132,26 @@ def clamped(
         return np.maximum(of_body / theta**2, 1.0)
 
     if lattice.solid is not None:
-        return _with_cut_cells(lattice, held, stiffening)
+        return _with_cut_cells(lattice, is_fixed, stiffening)
     a, b = lattice.springs.T
-    cut = np.flatnonzero(held[a] != held[b])
-    fixed, free = np.where(held[a], (a, b), (b, a))[:, cut]
+    cut = np.flatnonzero(is_fixed[a] != is_fixed[b])
+    fixed, free = np.where(is_fixed[a], (a, b), (b, a))[:, cut]
     stiffness = lattice.stiffness.copy()
     stiffness[cut] *= stiffening(free, fixed)
     return replace(lattice, stiffness=stiffness)
 
 
 def _with_cut_cells(
-    lattice: Lattice, held: Mask, stiffening: Callable[[Indices, Indices], Floats]
+    lattice: Lattice, is_fixed: Mask, stiffening: Callable[[Indices, Indices], Floats]
 ) -> Lattice:
-    """Return a solid with stiffer cells between free and held corners.
+    """Return a solid with stiffer cells between free and fixed corners.
 
     The factor of a cell is 1 over the mean of sigma theta over its pairs of corners.
     """
     assert lattice.solid is not None
     corners = lattice.local_cells
-    is_held = held[corners]
-    cell, fixed, free = np.nonzero(is_held[:, :, None] & ~is_held[:, None, :])
+    corner_fixed = is_fixed[corners]
+    cell, fixed, free = np.nonzero(corner_fixed[:, :, None] & ~corner_fixed[:, None, :])
     sigma_theta = 1 / stiffening(corners[cell, free], corners[cell, fixed])
     factor = np.ones(len(corners))
     cut = np.unique(cell)
@@ -191,12 +193,12 @@ def taken(
     words = [
         f"{table.key} holds {', '.join(table.table.fix)} of {count(masks[table.key])} nodes"
         for table in scene.tables("pin")
-        if not all(table.table.held)
+        if not all(table.table.fixed)
     ]
     for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
         where = masks[table.key]
         nodes = count(where)
-        pinned = count(where & lattice.held[:, table.table.held].all(axis=1))
+        pinned = count(where & lattice.fixed[:, table.table.fixed].all(axis=1))
         anchored = count(anchor.where.any(axis=1))
         if anchored < nodes:
             text = f"{table.key}: of {nodes} nodes in its region pins hold {pinned}, "
@@ -211,11 +213,11 @@ def taken(
         # An anchor annuls a force only if it holds the node as long as the force acts.
         lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
         nodes = count(where)
-        held = count(where & reduce(np.logical_or, lasting, lattice.held).all(axis=1))
-        if held == nodes and force.pulls:
+        fixed = count(where & reduce(np.logical_or, lasting, lattice.fixed).all(axis=1))
+        if fixed == nodes and force.pulls:
             raise InputError(
                 f"{table.key} moves nothing: of {nodes} nodes in its region none is free "
                 "while it acts, pins and anchors hold all"
             )
-        words.append(f"{table.key} pulls {nodes} nodes" + f" ({held} of them held)" * bool(held))
+        words.append(f"{table.key} pulls {nodes} nodes" + f" ({fixed} of them held)" * bool(fixed))
     return tuple(words)

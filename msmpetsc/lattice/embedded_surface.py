@@ -180,7 +180,7 @@ def refuse_open(table: OfBody, edges: SurfacePart, lattice: Lattice) -> None:
     It has a potential if the part is closed, or if its edge may move only along itself: in a
     direction, or in the plane of a symmetry that contains the edge.
     """
-    moves = (edges((~lattice.held).astype(float)) > 1e-9).any(axis=0)
+    moves = (edges((~lattice.fixed).astype(float)) > 1e-9).any(axis=0)
     along = np.abs(edges.rest[1] - edges.rest[0])
     count = moves.sum(axis=1)
     leaves = np.where(moves, 0.0, along).max(axis=1) > 1e-6 * along.max(axis=1)

@@ -20,14 +20,14 @@ def initial_state(
     comm: MPI.Comm,
     starts: Sequence[Start | None],
     lattice: Lattice,
-    held: Mask,
+    fixed: Mask,
     bounds: Rows,
     read_state: ReadState | None = None,
 ) -> InitialState:
     """Return initial positions and velocities of nodes from their bodies' starts (collective).
 
     starts : the start of each body; None for a body at rest
-    held   : (l, 3) bool, components that stay at rest in their rest positions
+    fixed  : (l, 3) bool, components that stay at rest in their rest positions
     bounds : (b, 2, 3) bounding box of each body at rest [m]
     """
     states = {}
@@ -43,16 +43,16 @@ def initial_state(
             own = np.flatnonzero(body == number)
             owned = int((own < lattice.owned).sum())
             q[own] = moved(start, lattice.nodes[own], lattice.global_numbers[own], bounds[number])
-            at_rest = held[own]
+            at_rest = fixed[own]
             if start.from_ is not None:
                 q[own], velocity[own] = (rows[own] for rows in states[start.from_])
-                at_rest = held[own] & ~lattice.held[own]
+                at_rest = fixed[own] & ~lattice.fixed[own]
             q[own] = np.where(at_rest, lattice.nodes[own], q[own])
             mass = lattice.mass[own[:owned]]
             total: Floats = comm.allreduce(np.append(mass @ q[own[:owned]], mass.sum()))
             about = total[:3] / total[3] if start.about is None else np.array(start.about)
             velocity[own] += velocity_field(start, q[own] - about)
-    velocity[held] = 0
+    velocity[fixed] = 0
     return q, velocity
 
 

@@ -38,7 +38,7 @@ class Lattice:
                   the lower number. The rank of the lower-numbered end owns each further spring.
     rest_length : (s,) distance of the ends at rest [m]
     stiffness   : (s,) [N/m]; a solid has zero-length springs whose L bounds its Hessian at rest
-    held        : (l, 3) bool, components of nodes that do not move
+    fixed       : (l, 3) bool, components of nodes that do not move
     local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
                   first corner this rank owns. For a solid all cells around owned nodes follow.
     cell_stiffness : (d,) stiffness of an edge inside a body of the cell's material [N/m]
@@ -62,7 +62,7 @@ class Lattice:
     springs_owned: int
     rest_length: Floats
     stiffness: Floats
-    held: Mask
+    fixed: Mask
     local_cells: Indices = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
     cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
@@ -107,17 +107,17 @@ class Lattice:
     @cached_property
     def pinned(self) -> Mask:
         """Mask (l,) of the nodes that do not move."""
-        pinned: Mask = self.held.all(axis=1)
+        pinned: Mask = self.fixed.all(axis=1)
         return pinned
 
     @cached_property
     def rollers(self) -> tuple[Indices, ...]:
-        """Nodes (h,) and components (h,) that are held of nodes that are held in part."""
-        return np.nonzero(self.held & ~self.pinned[:, None])
+        """Nodes (h,) and components (h,) that are fixed, of nodes that are fixed in part."""
+        return np.nonzero(self.fixed & ~self.pinned[:, None])
 
     def pin(self, where: Mask) -> "Lattice":
-        """Return this lattice with the nodes (l,) or components (l, 3) ``where`` held, too."""
-        return replace(self, held=self.held | where.reshape(len(where), -1))
+        """Return this lattice with the nodes (l,) or components (l, 3) ``where`` fixed, too."""
+        return replace(self, fixed=self.fixed | where.reshape(len(where), -1))
 
 
 def build_lattice(
@@ -157,7 +157,7 @@ def build_lattice(
         springs_owned=net.springs_owned,
         rest_length=h * np.sqrt(DIRECTION_KIND[net.direction]),
         stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
-        held=np.zeros((len(net.ijk), 3), bool),
+        fixed=np.zeros((len(net.ijk), 3), bool),
         local_cells=net.cells[kept],
         cells_owned=int(first_owned.sum()),
         cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],

@@ -146,8 +146,8 @@ class Holder(Table):
     )
 
     @property
-    def held(self) -> tuple[bool, ...]:
-        """Return whether each component is held."""
+    def fixed(self) -> tuple[bool, ...]:
+        """Return whether each component is fixed."""
         return tuple(axis in self.fix for axis in "xyz")
 
 

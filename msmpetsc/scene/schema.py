@@ -64,7 +64,7 @@ class OfBody(NamedTuple):
         return ".".join(map(str, self.path))
 
 
-def held_by(scene: Any) -> Iterator[OfBody]:
+def holders_of(scene: Any) -> Iterator[OfBody]:
     """Yield the tables of pins, then of anchors. A node in several tables belongs to the first."""
     for kind in ("pin", "anchor"):
         yield from scene.tables(kind)

@@ -157,19 +157,19 @@ class EnergyBalance:
         pressing, dragged = self.environment.obstacles.pressing_displacement(
             (result.position[owned], after.sides), time, time_step
         )
-        is_held = self.environment.anchors.fixed_at(time)[owned].any(axis=0)
+        is_fixed = self.environment.anchors.fixed_at(time)[owned].any(axis=0)
         sums = self._sums(
             lattice.mass.sum(),
             pressing,
-            *to_host(is_held),
+            *to_host(is_fixed),
             *dragged,
             *(lattice.mass @ displacement / time_step),
         )
-        mass, pressing, is_held, momentum = sums[0], sums[1], sums[2:5], sums[8:]
+        mass, pressing, is_fixed, momentum = sums[0], sums[1], sums[2:5], sums[8:]
         if pressing > 0:
             frame = sums[5:8] / (pressing * time_step)
         else:
-            frame = np.where(is_held, 0.0, momentum / mass)
+            frame = np.where(is_fixed, 0.0, momentum / mass)
         start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
         gained = ended - start - work - struck

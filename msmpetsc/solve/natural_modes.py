@@ -42,7 +42,7 @@ class Modes:
     """The lowest modes about a state: rigid modes first, then by frequency.
 
     frequencies : (k,) [Hz]; 0 for rigid modes, negative if a mode grows at that rate
-    shapes      : (k, owned, 3) [-], orthonormal in M over all ranks, zero at held nodes
+    shapes      : (k, owned, 3) [-], orthonormal in M over all ranks, zero at fixed nodes
     position    : (owned, 3) [m] of the state
     rigid       : number of rigid modes
     """

@@ -22,7 +22,7 @@ from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.lattice.embedded_surface import EmbeddedPoints
 from msmpetsc.lattice.region import ProbePoints, probe_points
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import Solver, held_by
+from msmpetsc.scene.schema import Solver, holders_of
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, TrueErrors
@@ -80,7 +80,7 @@ def refuse_bad_options(
         raise InputError(
             f"contact of surfaces needs one of newton's presets, not {scene.solver.preset}"
         )
-    rolls = [table.key for table in held_by(scene) if not all(table.table.held)]
+    rolls = [table.key for table in holders_of(scene) if not all(table.table.fixed)]
     if rolls and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(
             f"{rolls[0]}.fix: single components need one of newton's presets, not "
@@ -344,7 +344,7 @@ class Forces:
 
     The fields are loads, reactions of pins and anchors, and contact forces of obstacles and of the
     surface. Inertia and friction are taken from the last implicit step. At the start and in
-    explicit steps, held nodes do not accelerate and obstacles have no friction.
+    explicit steps, fixed nodes do not accelerate and obstacles have no friction.
 
     rows : name of a field -> its number of rows
     """

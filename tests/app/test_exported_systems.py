@@ -212,7 +212,7 @@ def test_a_held_component_has_its_diagonal_alone(tmp_path: Path):
         lattice = build_model(MPI.COMM_SELF, load_scene(path)).lattice
         begun = file["frames/position"][0]
     free = ~lattice.pinned
-    held = lattice.held[free].ravel()
+    held = lattice.fixed[free].ravel()
     assert held.any() and not held.all()
     np.testing.assert_allclose(vector(folder, "coordinates"), begun[free].ravel(), atol=1e-12)
     rows, diagonal = hessian.toarray(), hessian.diagonal()

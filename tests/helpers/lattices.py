@@ -85,7 +85,7 @@ def one_spring(m: float, k: float, r: float) -> Lattice:
         springs_owned=1,
         rest_length=np.array([r]),
         stiffness=np.array([k]),
-        held=np.array([[True] * 3, [False] * 3]),
+        fixed=np.array([[True] * 3, [False] * 3]),
     )
 
 
@@ -105,5 +105,5 @@ def chain(m: float, k: float, r: float) -> Lattice:
         springs_owned=count - 1,
         rest_length=np.full(count - 1, r),
         stiffness=np.full(count - 1, k),
-        held=np.repeat(np.arange(count) % (count - 1) == 0, 3).reshape(-1, 3),
+        fixed=np.repeat(np.arange(count) % (count - 1) == 0, 3).reshape(-1, 3),
     )

@@ -54,7 +54,7 @@ def modes(path: Path, count: int) -> Modes:
 def dense_frequencies(path: Path, q: np.ndarray) -> np.ndarray:
     """All frequencies [Hz] about positions q (n, 3), by a dense eigensolver."""
     lattice = build_model(COMM, load_scene(path)).lattice
-    free = ~lattice.held.ravel()
+    free = ~lattice.fixed.ravel()
     stiffness = dense_hessian(Elasticity(lattice), q)[np.ix_(free, free)]
     squares = eigh(stiffness, np.diag(np.repeat(lattice.mass, 3)[free]), eigvals_only=True)
     return np.sign(squares) * np.sqrt(np.abs(squares)) / (2 * np.pi)
@@ -87,7 +87,7 @@ def test_a_bar_on_rollers_keeps_the_rigid_motions_they_leave(
     expected = dense_frequencies(path, lattice.nodes)[:8]
     assert found.rigid == rigid
     np.testing.assert_allclose(found.frequencies[rigid:], expected[rigid:], rtol=1e-6)
-    assert lattice.held.any() and (found.shapes[:, lattice.held] == 0).all()
+    assert lattice.fixed.any() and (found.shapes[:, lattice.fixed] == 0).all()
     of_free_bar = SPEED / (np.pi * 0.125) * np.sin(np.pi * 0.125 / 4)
     assert (np.abs(found.frequencies / of_free_bar - 1).min() < 1e-7) == (fix == "x")
 

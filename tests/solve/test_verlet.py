@@ -155,7 +155,7 @@ def test_the_limit_is_that_of_the_greatest_eigenvalue(law: str, held: bool):
     q = shaken(lattice, 0.02)
     stepper = integrator(lattice)
     stepper.position.values[:] = q
-    stepper._hold(0.0)
+    stepper._update_fixed(0.0)
     found, exact = stepper.highest.squared_at(stepper.position.values), greatest(lattice, q)
     stepper.destroy()
     assert 0.97 * exact < found <= greatest(lattice, q, projected=True) * (1 + 1e-12)

@@ -11,7 +11,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import plain_damage, refuse_deadly
-from msmpetsc.scene.schema import SceneFile, held_by, surface_loads
+from msmpetsc.scene.schema import SceneFile, holders_of, surface_loads
 from msmpetsc.view.drawable import read_scene
 
 SERIES = (
@@ -42,8 +42,8 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
     """
     yield "time [s]", run.frames.time[:]
     names = {
-        "reaction": [table.key for table in held_by(scene)],
-        "torque": [table.key for table in held_by(scene)],
+        "reaction": [table.key for table in holders_of(scene)],
+        "torque": [table.key for table in holders_of(scene)],
         "push": [f"obstacle.{number}" for number in range(len(scene.obstacle))],
         "contact_push": [f"body.{number}" for number in range(max(1, len(scene.body)))],
         "surface_load": [table.key for table in surface_loads(scene)],

@@ -63,8 +63,8 @@ class SurfaceHessian:
         order = np.argsort(-stiffness, kind="stable")
         stiff = min(most, int((stiffness > 1).sum()))
         parts = np.sort(order[:stiff]), np.sort(order[stiff:])
-        joined, held = (self._part(numbers) if len(numbers) else None for numbers in parts)
-        return joined, held
+        joined, remaining = (self._part(numbers) if len(numbers) else None for numbers in parts)
+        return joined, remaining
 
     def _part(self, numbers: Indices) -> "SurfaceHessian":
         rows = (3 * numbers[:, None] + np.arange(3)).ravel()

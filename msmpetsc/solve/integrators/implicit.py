@@ -222,7 +222,7 @@ class ImplicitEuler(Integrator):
             result.position,
             result.previous,
             StepTaken(time, time_step, sides),
-            self.stepper.lattice.held,
+            self.stepper.lattice.fixed,
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
@@ -264,7 +264,7 @@ class ImplicitEuler(Integrator):
             return result
         forces = np.zeros_like(result.position)
         viscosity.add_gradient(result.position, forces)
-        taken = -viscosity.change(result.position, problem.fixed)
+        taken = -viscosity.change(result.position, problem.fixed_positions)
         return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
 
     def _new_stepper(self, time: float) -> Stepper:
@@ -366,7 +366,7 @@ class Bdf2(ImplicitEuler):
             result.position,
             previous,
             StepTaken(time, self.time_step, sides),
-            self.stepper.lattice.held,
+            self.stepper.lattice.fixed,
         )
         cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
         result = replace(result, previous=previous, cost=cost, work=work, begun_error=begun_error)

@@ -130,10 +130,13 @@ class LoadPath:
         if reached == share_before:
             return q
         functional = self.stepper.functional
-        held = self.stepper.lattice.held
+        fixed = self.stepper.lattice.fixed
         ahead = q + (share - reached) / (reached - share_before) * (q - before)
         functional.begin(problem)
-        values = [functional.value(np.where(held, problem.fixed, guess)) for guess in (q, ahead)]
+        values = [
+            functional.value(np.where(fixed, problem.fixed_positions, guess))
+            for guess in (q, ahead)
+        ]
         return ahead if values[1] < values[0] else q
 
 
@@ -216,10 +219,10 @@ class Static(ImplicitEuler):
         return result, path
 
 
-def _rigid_rank(unknowns: Unknowns, held: Mask) -> int:
-    """Return how many rigid motions the few held components (owned, 3) prevent (collective)."""
+def _rigid_rank(unknowns: Unknowns, fixed: Mask) -> int:
+    """Return how many rigid motions the few fixed components (owned, 3) prevent (collective)."""
     lattice = unknowns.lattice
-    node, component = np.nonzero(held)
+    node, component = np.nonzero(fixed)
     x = to_host(lattice.nodes)[node] / lattice.cell_size
     # rotations about each axis, along the component
     turns = np.cross(np.eye(3), x[:, None])[np.arange(len(node)), :, component]
@@ -235,12 +238,12 @@ def refuse_free_bodies(unknowns: Unknowns) -> None:
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
     support = "held at a point or two, about which it turns"
     free = bodies.free.any(axis=1)
-    held = to_host(lattice.held[: lattice.owned])
-    count = unknowns.comm.allreduce(int(held.sum()))
+    fixed = to_host(lattice.fixed[: lattice.owned])
+    count = unknowns.comm.allreduce(int(fixed.sum()))
     if free.any():
         along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
         support = f"held by nothing along {', '.join(along)}"
-    elif count > 6 or _rigid_rank(unknowns, held) == 6:
+    elif count > 6 or _rigid_rank(unknowns, fixed) == 6:
         return
     subject = "the body"
     if len(bodies.free) > 1:

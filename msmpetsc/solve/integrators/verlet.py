@@ -160,7 +160,7 @@ class Verlet(Integrator):
     def _begin(self, state: State, start: float) -> None:
         """Set positions, velocities and forces to a state at time ``start`` [s] (collective)."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
-        self._hold(start)
+        self._update_fixed(start)
         self.work = self.springs_work = 0.0
         if state.q is not self.known:
             self.position.values[:] = state.q
@@ -289,12 +289,12 @@ class Verlet(Integrator):
 
     def _drift(self, begin: float, end: float) -> None:
         """Move q to the end of a substep: anchored nodes on their paths, impacts reflected."""
-        self._hold(end)
+        self._update_fixed(end)
         drift(len(self.free), self.q, end - begin, self._movers())
         prescribed = self.environment.anchors.prescribed(self.position.values, end)
         if prescribed is not None:
             owned = self.lattice.owned
-            moved = self.fixed & ~self.lattice.held[:owned]
+            moved = self.fixed & ~self.lattice.fixed[:owned]
             anchored = np.nonzero(moved)
             freed = moved & ~self.environment.anchors.fixed_at(self.end)[:owned]
             self.work -= self._kinetic(freed)
@@ -326,16 +326,16 @@ class Verlet(Integrator):
             self.v[struck] = (after[struck] - before[struck]) / (end - begin)
             self.q[struck] = after[struck]
 
-    def _hold(self, time: float) -> None:
+    def _update_fixed(self, time: float) -> None:
         """Update the free nodes if an anchor begins or ends before ``time`` [s]."""
         anchors = len(self.environment.anchors.acting(time))
         if anchors != self.anchors:
             self.anchors = anchors
             self._fix(self.environment.anchors.fixed_at(time)[: self.lattice.owned])
-            self.highest.hold(self.fixed)
+            self.highest.fix(self.fixed)
 
     def _fix(self, fixed: Mask) -> None:
-        """Set the held components (owned, 3), the nodes that move, and their held components."""
+        """Set the fixed components (owned, 3), the nodes that move, and their fixed components."""
         pinned = fixed.all(axis=1)
         self.fixed, self.free = fixed, np.flatnonzero(~pinned)
         self.partly = np.nonzero(fixed & ~pinned[:, None])

@@ -1,7 +1,7 @@
 """The Hessian of a step as a PETSc matrix, for solvers that need one.
 
 A row of the matrix belongs to a coordinate of a free node: x, y and z of a node in sequence. Rows
-and columns of held components are zero, but for their own diagonals. Products with all other
+and columns of fixed components are zero, but for their own diagonals. Products with all other
 operators need no matrix (solve.linear.operators).
 """
 
@@ -42,10 +42,10 @@ def blocks_of(hessian: TrueHessian) -> HessianBlocks:
     is_free = (whole[0] >= 0) & (whole[1] >= 0)
     blocks = HessianBlocks(*(part[is_free] for part in whole))
     unknowns = hessian.unknowns
-    node, component = map(to_host, unknowns.held)
-    held = 3 * unknowns.numbers[node] + component
+    node, component = map(to_host, unknowns.rollers)
+    fixed = 3 * unknowns.numbers[node] + component
     rows, columns = (
-        np.isin(3 * ends[:, None] + np.arange(3), held) for ends in (blocks.first, blocks.second)
+        np.isin(3 * ends[:, None] + np.arange(3), fixed) for ends in (blocks.first, blocks.second)
     )
     is_diagonal = (blocks.first == blocks.second)[:, None, None] & np.eye(3, dtype=bool)
     blocks.values[(rows[:, :, None] | columns[:, None, :]) & ~is_diagonal] = 0
@@ -93,7 +93,7 @@ def _summed(comm: MPI.Comm, size: tuple[int, int], blocks: HessianBlocks) -> PET
 def _parts(hessian: TrueHessian) -> Iterator[HessianBlocks]:
     """Yield the blocks of inertia, springs, cells, pressure and contact.
 
-    Blocks of pressure and of the surface's contact, whose nodes may be another rank's, lack held
+    Blocks of pressure and of the surface's contact, whose nodes may be another rank's, lack fixed
     components.
     """
     unknowns, t2, numbers = hessian.unknowns, hessian.t2, hessian.unknowns.numbers
@@ -165,7 +165,9 @@ def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> HessianBlocks:
 def _of_surface(surface: SurfaceHessian, unknowns: Unknowns, t2: float) -> HessianBlocks:
     """Return the blocks t^2 W^T H_c W in this rank's rows (collective)."""
     own = unknowns.numbers[unknowns.free]
-    weights = _by_component(surface.weights[:, unknowns.free], unknowns.lattice.held[unknowns.free])
+    weights = _by_component(
+        surface.weights[:, unknowns.free], unknowns.lattice.fixed[unknowns.free]
+    )
     rows = (3 * own[:, None] + np.arange(3)).ravel()
     placed = csr_array(
         (weights.data, rows[weights.indices], weights.indptr),
@@ -181,22 +183,22 @@ def _of_pressure(part: PressureHessian, unknowns: Unknowns, t2: float) -> Iterat
     """Yield the blocks t^2 W^T H_p W of this rank's triangles under pressure (collective)."""
     for surface, triangles in part.triangles():
         points = surface.points
-        numbers, held = (
+        numbers, fixed = (
             points.to_owner.answer(rows[points.asked])
-            for rows in (unknowns.numbers, unknowns.lattice.held)
+            for rows in (unknowns.numbers, unknowns.lattice.fixed)
         )
         # Points go by corner, then by triangle
         ends = np.arange(9 * len(triangles)).reshape(3, -1, 3).swapaxes(0, 1).reshape(-1, 9)
         places = np.broadcast_arrays(ends[:, :, None], ends[:, None, :])
         matrix = csr_array((triangles.ravel(), [of.ravel() for of in places]), (ends.size,) * 2)
-        weights = _by_component(points.weights, held)
+        weights = _by_component(points.weights, fixed)
         first, second, values = _joined(weights, csr_array(matrix @ weights))
         yield HessianBlocks(numbers[first], numbers[second], t2 * values)
 
 
-def _by_component(weights: csr_array, held: Mask) -> csr_array:
-    """Return weights (v, n) of nodes as (3v, 3n) of their components; held components weigh 0."""
-    return csr_array(kron(weights, eye_array(3)) @ diags_array(np.where(held, 0.0, 1.0).ravel()))
+def _by_component(weights: csr_array, fixed: Mask) -> csr_array:
+    """Return weights (v, n) of nodes as (3v, 3n) of their components; fixed components weigh 0."""
+    return csr_array(kron(weights, eye_array(3)) @ diags_array(np.where(fixed, 0.0, 1.0).ravel()))
 
 
 def _joined(left: csr_array, right: csr_array) -> HessianBlocks:

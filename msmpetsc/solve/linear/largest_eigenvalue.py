@@ -32,10 +32,10 @@ class HighestMode:
     def __init__(self, comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity):
         self.comm, self.lattice, self.elasticity = comm, lattice, elasticity
         self.mode, self.per_mass = Ghosted(comm, lattice), 1 / lattice.mass
-        self.fixed, self.squared = lattice.held[: lattice.owned], 0.0
+        self.fixed, self.squared = lattice.fixed[: lattice.owned], 0.0
 
-    def hold(self, fixed: Mask) -> None:
-        """Set the held components (owned, 3); start from a vector of all modes (collective)."""
+    def fix(self, fixed: Mask) -> None:
+        """Set the fixed components (owned, 3); start from a vector of all modes (collective)."""
         # The vector must not depend on the number of ranks.
         self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])

@@ -1,6 +1,6 @@
 """Numbering of the unknowns by nodes and coordinates, and ghost exchange of nodal values.
 
-Pinned nodes are not unknowns. A node that is held in part is an unknown. Its held components are
+Pinned nodes are not unknowns. A node that is fixed in part is an unknown. Its fixed components are
 zero in each vector of unknowns, and no operator or preconditioner changes them. On each rank, a
 vector of unknowns holds the x of the free nodes, then their y, then their z. Its local array is
 therefore an m x 3 dense block, which a scalar m x m matrix multiplies in a single product.
@@ -37,8 +37,8 @@ class Unknowns:
     numbers : (l,) global number of each local node among the free nodes, -1 if pinned
     total   : number of free nodes on all ranks
     inertia : (owned,) [kg] mass in the residual; 0 for statics
-    held    : (h,), (h,) local nodes and components of the lattice's rollers
-    is_held : whether any component of a node is held on any rank
+    rollers : (h,), (h,) local nodes and components of the lattice's rollers
+    has_fixed : whether any component of a node is fixed on any rank
     ballast : (owned,) [kg] mass in multigrid; small but positive for statics
     memory  : memory of PETSc's vectors, on the CPU or the GPU
 
@@ -56,12 +56,14 @@ class Unknowns:
         first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]
         self.total = comm.allreduce(self.size)
         refuse_unknowns(self.total)
-        self.held = lattice.rollers
-        self.is_held = self.total < lattice.table.total or comm.allreduce(len(self.held[0])) > 0
+        self.rollers = lattice.rollers
+        self.has_fixed = (
+            self.total < lattice.table.total or comm.allreduce(len(self.rollers[0])) > 0
+        )
         own = np.full(lattice.owned, -1, np.int64)
         own[to_host(self.free)] = first + np.arange(self.size)
-        node, component = (to_host(rows[self.held[0] < lattice.owned]) for rows in self.held)
-        self._held_rows = like(self.free, component * self.size + own[node] - first)
+        node, component = (to_host(rows[self.rollers[0] < lattice.owned]) for rows in self.rollers)
+        self._roller_rows = like(self.free, component * self.size + own[node] - first)
         self.numbers = lattice.table.with_ghosts(lattice.ghosts, own)
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
@@ -97,16 +99,16 @@ class Unknowns:
     def to_nodes(self, vector: PETSc.Vec, nodes: Array) -> None:
         """Copy a vector of unknowns to the free rows, with ghosts, of (l, 3) (collective).
 
-        Components that are held keep their values.
+        Components that are fixed keep their values.
         """
-        kept = nodes[self.held]
+        kept = nodes[self.rollers]
         if self.has_ghosts:
             with GHOSTS:
                 self.scatter.scatter(vector, self.ghost_values)
         _spread(self.size, self.columns(vector), self.rows, nodes)
         if len(self.free_ghosts):
             nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
-        nodes[self.held] = kept
+        nodes[self.rollers] = kept
 
     def from_nodes(self, nodes: Positions, vector: PETSc.Vec) -> None:
         """Copy the free owned rows of ``nodes`` (>= owned, 3) to a vector of unknowns."""
@@ -115,17 +117,17 @@ class Unknowns:
     def collect(self, nodes: Rows, columns: Rows) -> None:
         """Copy the free owned rows of ``nodes`` (>= owned, 3) to ``columns`` (3, m)."""
         columns[:] = nodes[self.free].T
-        columns.reshape(-1)[self._held_rows] = 0
+        columns.reshape(-1)[self._roller_rows] = 0
 
     def projected(self, rows: Rows) -> Rows:
-        """Return rows (k, 3 m) of unknowns with zero held components, in the same array."""
-        rows[:, self._held_rows] = 0
+        """Return rows (k, 3 m) of unknowns with their fixed components set to zero, in place."""
+        rows[:, self._roller_rows] = 0
         return rows
 
     def project(self, vector: PETSc.Vec) -> None:
-        """Set the held components of a vector of unknowns to zero."""
-        if len(self._held_rows):
-            self.memory.write(vector)[self._held_rows] = 0
+        """Set the fixed components of a vector of unknowns to zero."""
+        if len(self._roller_rows):
+            self.memory.write(vector)[self._roller_rows] = 0
 
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b of arrays (l, 3) of nodal values to a vector of unknowns."""

@@ -20,8 +20,8 @@ class ProjectedHessian:
     H belongs to the positions of the last ``update`` and is positive definite.
 
     products   : number of products so far
-    inverse    : (m, 9) D^-1 [1/kg], zero in held components
-    moves      : (m, 3) bool, the components that are not held
+    inverse    : (m, 9) D^-1 [1/kg], zero in fixed components
+    moves      : (m, 3) bool, the components that are not fixed
     compliance : (owned,) [m/N] estimated compliance of a node at rest
     """
 
@@ -35,7 +35,7 @@ class ProjectedHessian:
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
-        self.moves = ~lattice.held[unknowns.free]
+        self.moves = ~lattice.fixed[unknowns.free]
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         elasticity.add_bound(lattice.nodes, blocks)
         self.compliance = 1 / (
@@ -119,7 +119,7 @@ class FreeNodes(NamedTuple):
     """Terms of the diagonal blocks of H.
 
     free    : (m,) numbers of the free nodes
-    moves   : (m, 3) bool, the components that are not held
+    moves   : (m, 3) bool, the components that are not fixed
     mass    : (owned,) [kg]
     contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
     t2      : t^2 [s^2]
@@ -136,7 +136,7 @@ class FreeNodes(NamedTuple):
 def invert_blocks(
     first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes
 ) -> None:
-    """Invert the diagonal blocks m I + t^2 (blocks + contact) of components that are not held."""
+    """Invert the diagonal blocks m I + t^2 (blocks + contact) of components that are not fixed."""
     free, moves, mass, contact, t2 = nodes
     for i in range(first, count, step):
         node = free[i]

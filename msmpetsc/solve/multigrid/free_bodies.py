@@ -29,7 +29,7 @@ class Bodies:
     """Bodies of a lattice.
 
     number : (l,) body of each local node, -1 if pinned
-    free   : (b, 3) bool, whether no node of the body, or joined with it, is held along each axis
+    free   : (b, 3) bool, whether no node of the body, or joined with it, is fixed along each axis
     """
 
     number: Indices
@@ -62,13 +62,13 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
     label = _labels(unknowns, part)
     table = SortedKeys(comm, label[: lattice.owned][moves[: lattice.owned]])
     number = np.where(moves, table.find(np.where(moves, label, -1)), -1)
-    held = np.zeros((table.total, 3), bool)
+    fixed = np.zeros((table.total, 3), bool)
     ends = springs[either & ~both]
-    held[number[ends[moves[ends]]]] = True
+    fixed[number[ends[moves[ends]]]] = True
     node, component = map(to_host, lattice.rollers)
-    held[number[node], component] = True
-    comm.Allreduce(MPI.IN_PLACE, held, MPI.LOR)
-    return Bodies(number, ~held)
+    fixed[number[node], component] = True
+    comm.Allreduce(MPI.IN_PLACE, fixed, MPI.LOR)
+    return Bodies(number, ~fixed)
 
 
 def _labels(unknowns: Unknowns, part: Indices) -> Indices:
@@ -97,11 +97,11 @@ def _labels(unknowns: Unknowns, part: Indices) -> Indices:
 class Translations:
     """Treat translations of free bodies exactly in a multigrid cycle. All methods are collective.
 
-    A body that is held along some axes is free along the others.
+    A body that is fixed along some axes is free along the others.
 
     count   : number b of free bodies
     free    : (3, b) 1 along the axes on which each free body is free, otherwise 0
-    body    : (m,) free body of each free node; b if its body is held
+    body    : (m,) free body of each free node; b if its body is fixed
     mass    : (m,) mass of each free node [kg]
     of_body : (b,) mass of each free body [kg]
     """

@@ -6,7 +6,8 @@ weights (8,) of the cell's corners at end a of a spring, or 0 if the end is pinn
 
 - a spring with block B: (w_a - w_b)(w_a - w_b)^T (x) t^2 B
 - a node of mass m with contact block C: w w^T (x) (m I + t^2 C)
-- a held component of a node that is held in part: a spring to the ground, HELD as stiff as the node
+- a fixed component of a node that is fixed in part: a spring to the ground, GROUND as stiff as
+  the node
 - a solid cell: its Hessian in the strains of the coarse corners (elasticity.neo_hookean)
 """
 
@@ -46,7 +47,7 @@ PINNED = 27
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
 # stiffness of the spring that holds a component on coarse levels, over its node's [-];
 # the coarse matrix must not be much softer than the components that move
-HELD = 100.0
+GROUND = 100.0
 # entries of a row of ``_write_coarse`` [-]
 COARSE = 41
 # pairs (36, 2) of corners: the upper triangle of a cell's matrix
@@ -180,7 +181,7 @@ class GalerkinSum:
         self.own = np.zeros((lattice.owned, 6), like=lattice.nodes)
         self.own[:, DIAGONAL] = unknowns.ballast[:, None]
         node, component = (rows[lattice.rollers[0] < lattice.owned] for rows in lattice.rollers)
-        self.own[node, like(node, np.array(DIAGONAL))[component]] += HELD * t2 * stiff[node]
+        self.own[node, like(node, np.array(DIAGONAL))[component]] += GROUND * t2 * stiff[node]
         first, second, places = self._pairs(grid, corners)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)

@@ -77,7 +77,9 @@ class CarriedStart:
         for displacement in (moved, 0 * moved):
             if obstacles.total:
                 displacement = self._moved_with_obstacles(contacts, displacement)
-            carried = np.where(functional.lattice.held, problem.fixed, problem.q + displacement)
+            carried = np.where(
+                functional.lattice.fixed, problem.fixed_positions, problem.q + displacement
+            )
             if functional.free_share(problem.q, carried, contacts.begin) == 1.0:
                 return carried
         obstacles.straight = contacts.begin, end
@@ -104,22 +106,24 @@ class CarriedStart:
             self.functional.problem,
             contacts.obstacles.displacements(contacts.begin, contacts.time),
         )
-        fixed = self.functional.comm.allreduce(greatest(np.abs(problem.fixed - problem.q)), MPI.MAX)
+        fixed = self.functional.comm.allreduce(
+            greatest(np.abs(problem.fixed_positions - problem.q)), MPI.MAX
+        )
         return float(max(fixed, greatest(np.abs(obstacles)), contacts.law.distance))
 
     def _carry(self, contacts: ContactSearch, end: float) -> Positions:
         """Return the start at s = 1 by Newton's directions. Raises StepFailed."""
         functional, problem, begin = self.functional, self.functional.problem, contacts.begin
-        is_fixed, still = functional.lattice.held, np.zeros((1, 3))
+        is_fixed, still = functional.lattice.fixed, np.zeros((1, 3))
         q, s, gained = problem.q, 0.0, 1.0
         while gained > PROGRESS:
             begun = s
             for _ in range(PATIENCE):
                 now = begin + s * (end - begin)
-                left = np.where(is_fixed, (1 - s) * (problem.fixed - problem.q), 0.0)
+                left = np.where(is_fixed, (1 - s) * (problem.fixed_positions - problem.q), 0.0)
                 contacts.time, functional.problem = (
                     now,
-                    replace(problem, prescribed=problem.fixed - left),
+                    replace(problem, prescribed=problem.fixed_positions - left),
                 )
                 for _ in range(CORRECTIONS):
                     direction = self._direction(q, np.zeros_like(left), still)

@@ -207,9 +207,9 @@ class LowestCurvature:
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].
 
-        They are orthonormal in M. Return None if nodes or components are held.
+        They are orthonormal in M. Return None if nodes or components are fixed.
         """
-        if self.unknowns.is_held:
+        if self.unknowns.has_fixed:
             return None
         columns = q[self.unknowns.free].T
         motions = np.zeros((6, *columns.shape), like=columns)

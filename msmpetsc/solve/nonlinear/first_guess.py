@@ -14,8 +14,8 @@ class FirstGuess:
 
     def __init__(self, functional: StepFunctional, extrapolate: bool):
         self.functional, self.extrapolate = functional, extrapolate
-        # Whether some components are held and thus no unknowns
-        self.has_fixed = functional.unknowns.is_held
+        # Whether some components are fixed and thus no unknowns
+        self.has_fixed = functional.unknowns.has_fixed
         # c = x - y of the last steps (l, 3) [m], at most two, the newest first
         self.corrections: list[Positions] = []
 
@@ -54,7 +54,7 @@ class FirstGuess:
         """Return the guess (l, 3) [m] with fixed nodes at their places after the step."""
         lattice = self.functional.lattice
         return (
-            np.where(lattice.held, self.functional.problem.fixed, guess)
+            np.where(lattice.fixed, self.functional.problem.fixed_positions, guess)
             if self.has_fixed
             else guess
         )

@@ -63,7 +63,7 @@ class StepProblem:
     watch: Callable[[Any, Any], None] | None = None
 
     @property
-    def fixed(self) -> Positions:
+    def fixed_positions(self) -> Positions:
         """Positions (l, 3) [m] whose fixed nodes are at their places after the step."""
         return self.q if self.prescribed is None else self.prescribed
 
@@ -116,7 +116,7 @@ class StepFunctional:
 
     def positions(self, x: PETSc.Vec) -> Positions:
         """Return positions (l, 3) [m] of unknowns x, with fixed nodes at their places."""
-        q = self.problem.fixed.copy()
+        q = self.problem.fixed_positions.copy()
         self.unknowns.to_nodes(x, q)
         return q
 

@@ -79,7 +79,7 @@ class Jacobian:
             m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia)
         )
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
-        chooses = chooses and (self.unknowns.is_held or ratio < MASSLESS)
+        chooses = chooses and (self.unknowns.has_fixed or ratio < MASSLESS)
         self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio)
 
     @cached_property

@@ -89,7 +89,7 @@ def test_one_free_node():
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet"])
 def test_cycles_of_bodies_on_rollers(name: str, shape: str):
     """Planes of symmetry at both ends of an axis, and all nodes between two walls: no worse than
-    without, but for what springs to the ground leave of coarse components, 1 / HELD each."""
+    without, but for what springs to the ground leave of coarse components, 1 / GROUND each."""
     lattice = build(COMM, LATTICES[name])
     low, high = lattice.nodes.min(axis=0) + 0.01, lattice.nodes.max(axis=0) - 0.01
     x, y, _ = lattice.nodes.T

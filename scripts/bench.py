@@ -113,18 +113,18 @@ def row(name: str, runs: dict[str, list[Sample]]) -> lab.Row:
         method: [1e3 * mean for mean in means(repeats, "wall_time")]
         for method, repeats in runs.items()
     }
-    found: dict[str, object] = {"scene": name}
-    found |= {f"{method} [ms]": lab.spread(of) if of else None for method, of in times.items()}
+    entries: dict[str, object] = {"scene": name}
+    entries |= {f"{method} [ms]": lab.spread(of) if of else None for method, of in times.items()}
     for number in ("ksp_its", "products"):
-        found[number] = " / ".join(
+        entries[number] = " / ".join(
             lab.shown(means(of, number)[0]) if of else "-" for of in runs.values()
         )
     *rivals, last = runs
     if not runs[last]:
-        return found
+        return entries
     best = min((median(times[method]) for method in rivals if times[method]), default=None)
     return (
-        found
+        entries
         | {"times as fast": best / median(times[last]) if best else None}
         | of_method(name, runs[last])
     )

@@ -288,18 +288,18 @@ def row_of(name: str, rows: list[dict]) -> lab.Row:
     """Return the row of a preset: numbers of ends, and quantiles of estimate over true error."""
     statuses = [row["status"] for row in rows]
     ratios = ratios_of(rows)
-    found: dict[str, object] = {"preset": name} | {
+    entries: dict[str, object] = {"preset": name} | {
         word: statuses.count(status) for word, status in ENDS.items()
     }
-    found["faults"] = len(rows) - sum(statuses.count(status) for status in ENDS.values())
+    entries["faults"] = len(rows) - sum(statuses.count(status) for status in ENDS.values())
     finite = ratios[np.isfinite(ratios)]
     lowest = ["", "", ""]
     if len(finite):
         lowest = [f"{quantile:.2g}" for quantile in np.quantile(finite, (0, 0.05, 0.5))]
-    found |= {"steps": len(ratios)} | dict(
+    entries |= {"steps": len(ratios)} | dict(
         zip(("least ratio", "5%", "median"), lowest, strict=True)
     )
-    return found | {"below 1/3": int((ratios < LEAST).sum())}
+    return entries | {"below 1/3": int((ratios < LEAST).sum())}
 
 
 def bad(row: dict) -> bool:

@@ -46,7 +46,7 @@ class Tree:
     @cached_property
     def imports(self) -> dict[str, set[str]]:
         """The package's modules that each module imports, also in functions and TYPE_CHECKING."""
-        found: dict[str, set[str]] = {name: set() for name in self.modules}
+        imported: dict[str, set[str]] = {name: set() for name in self.modules}
         for name, node in self.nodes():
             if isinstance(node, ast.ImportFrom):
                 words = {f"{node.module}.{alias.name}" for alias in node.names} | {str(node.module)}
@@ -54,10 +54,10 @@ class Tree:
                 words = {alias.name for alias in node.names}
             else:
                 continue
-            found[name] |= {word.removeprefix("msmpetsc.") for word in words} & set(
+            imported[name] |= {word.removeprefix("msmpetsc.") for word in words} & set(
                 self.modules
             ) - {name}
-        return found
+        return imported
 
     def nodes(self) -> Iterator[tuple[str, ast.AST]]:
         """Yield each syntax node of the package with its module's name."""

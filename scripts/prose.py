@@ -107,15 +107,15 @@ def main() -> int:
         "--comments", action="store_true", help="check place and width of comments alone"
     )
     options = parser.parse_args()
-    found = [sorted(path.rglob("*.py")) or [path] for path in options.paths]
+    files = [sorted(path.rglob("*.py")) or [path] for path in options.paths]
     failed, folders = False, defaultdict[Path, Counter[str]](Counter)
     if options.comments:
-        for file in itertools.chain.from_iterable(found):
+        for file in itertools.chain.from_iterable(files):
             for line, fault in misplaced(file.read_text()):
                 print(f"{file}:{line}: {fault}")
                 failed = True
         return int(failed)
-    for file in itertools.chain.from_iterable(found):
+    for file in itertools.chain.from_iterable(files):
         for line, fault in sorted(offences(file, folders[file.parent])):
             is_count = fault.startswith("(")
             failed |= not is_count

@@ -313,7 +313,7 @@ def notes(number: int, case: Case) -> Iterator[str]:
             yield f"    *Deviation of {value.name}:* {value.note}"
 
 
-def chart(found: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
+def chart(results: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
     """Draw errors over seconds, and over cells beside the peers' published values.
 
     Errors below DRAWN stand at it.
@@ -326,7 +326,7 @@ def chart(found: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
     figure, (time, size) = pyplot.subplots(1, 2, figsize=(15, 9), layout="constrained")
     colours = pyplot.get_cmap("tab20")(range(20))
     ends: list[tuple[float, float, str, Any]] = []
-    for number, (case, runs) in enumerate(found.values(), 1):
+    for number, (case, runs) in enumerate(results.values(), 1):
         values = [zip(case.value, run.ours, strict=True) for run in runs]
         errors = [max(DRAWN, *(abs(case.error(*pair)) for pair in pairs)) for pairs in values]
         style: dict[str, Any] = {"color": colours[number % 20], "marker": "o", "ms": 4}
@@ -363,14 +363,14 @@ def main() -> None:
     parser.add_argument("--chart", type=Path, default=FOLDER / "yardstick.png", help="a PNG file")
     args = parser.parse_args()
     lab.heading()
-    found: dict[str, tuple[Case, list[Run]]] = {}
+    results: dict[str, tuple[Case, list[Run]]] = {}
 
     def all_rows(chosen: Sequence[Case]) -> lab.Rows:
         for case in chosen:
             sizes = case.sizes[: case.fast] if args.fast else case.sizes
             runs = [measured(case, size) for size in sizes]
-            found[case.name] = case, runs
-            yield from rows(len(found), case, runs)
+            results[case.name] = case, runs
+            yield from rows(len(results), case, runs)
 
     print(INTRODUCTION)
     everything = [
@@ -382,10 +382,10 @@ def main() -> None:
             print(f"\n## {title}")
             lab.table(all_rows(chosen))
     print("\n## Set-ups, sources, deviations\n")
-    for number, (case, _) in enumerate(found.values(), 1):
+    for number, (case, _) in enumerate(results.values(), 1):
         print("\n".join(notes(number, case)))
     print(LEFT_OUT)
-    chart(found, args.chart)
+    chart(results, args.chart)
 
 
 if __name__ == "__main__":

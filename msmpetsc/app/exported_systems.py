@@ -122,13 +122,13 @@ def _solved(now: Iterate, jacobian: Jacobian, y: PETSc.Vec) -> dict[str, Any]:
     ksp.getPC().setPythonContext(multigrid)
     rough, cost = y.duplicate(), {}
     # Timed second, when all kernels are loaded
-    for rtol, found in ((EXACT, y), (TIMED, rough)):
+    for rtol, solution in ((EXACT, y), (TIMED, rough)):
         multigrid.forget()
         began = perf_counter()
         multigrid.prepare(now.q, now.contact)
         ready = perf_counter()
         ksp.setTolerances(rtol=rtol)
-        ksp.solve(now.f, found)
+        ksp.solve(now.f, solution)
         cost = {
             "iterations": ksp.its,
             "set_up": ready - began,

@@ -340,7 +340,7 @@ def _links(
     links: list[Indices] = []
     separated = np.zeros(len(keys), bool)
     for axis, (below, above) in enumerate(bounding):
-        found = [np.stack([cell[below], part[below], part[above]])]
+        meeting = [np.stack([cell[below], part[below], part[above]])]
         low = np.flatnonzero(beyond[axis] >= 0)
         high = beyond[axis, low]
         # lines of cells with several parts tell which parts are inside at the face
@@ -354,8 +354,8 @@ def _links(
                 lines = [sides.parts[row[meet & both]] for row in rows]
                 meet[meet & both] = ((lines[0] == p) & (lines[1] == q)).any(axis=1)
                 own = low[meet]
-                found.append(np.stack([own, np.full_like(own, p), np.full_like(own, q)]))
-        own, p, q = np.unique(np.concatenate(found, axis=1), axis=1)
+                meeting.append(np.stack([own, np.full_like(own, p), np.full_like(own, q)]))
+        own, p, q = np.unique(np.concatenate(meeting, axis=1), axis=1)
         links.append(np.stack([own, beyond[axis, own], np.full_like(own, axis), p, q]))
         lonely = np.setdiff1d(low, own)
         separated[lonely] = separated[beyond[axis, lonely]] = True

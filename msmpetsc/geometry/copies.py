@@ -68,8 +68,10 @@ def find_copies(
     bodies : parts of each body's cells on rank 0; None on other ranks, and for a body without parts
     table  : keys of all valid cells
     """
-    found = [_copies_of_body(parts, grids.first(body), table) for body, parts in enumerate(bodies)]
-    keys, corners = (np.concatenate(rows) for rows in zip(*found, strict=True))
+    of_bodies = [
+        _copies_of_body(parts, grids.first(body), table) for body, parts in enumerate(bodies)
+    ]
+    keys, corners = (np.concatenate(rows) for rows in zip(*of_bodies, strict=True))
     ordinary = encode_morton(decode_morton(keys)[:, None] + CORNERS)
     own = np.flatnonzero((corners != ordinary).any(axis=1) | (keys % COPIES > 0))
     own = own[np.argsort(keys[own])]
@@ -124,15 +126,15 @@ def _suspects(parts: CellParts) -> Indices:
 def _disconnected() -> Mask:
     """Return for each mask (256,) of octants whether the octants are not all joined by faces."""
     joined = [(1 << low, 1 << high) for _, low, high in FACES]
-    found = np.zeros(256, bool)
+    disconnected = np.zeros(256, bool)
     for mask in range(1, 256):
         reached = mask & -mask
         for _ in range(7):
             for low, high in joined:
                 if reached & (low | high) and mask & low and mask & high:
                     reached |= low | high
-        found[mask] = reached != mask
-    return found
+        disconnected[mask] = reached != mask
+    return disconnected
 
 
 def _node_copies(parts: CellParts, cells: Indices, is_valid: Mask, around: Indices) -> Indices:

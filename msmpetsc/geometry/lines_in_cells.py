@@ -54,7 +54,7 @@ def _crossings(triangles: Rows, axis: int, place: Floats) -> Rows:
     A row has the number of the line, the height, LEAVES or ENTERS, and the triangle's row.
     """
     b, c = (axis + 1) % 3, (axis + 2) % 3
-    found = np.empty((16, 4))
+    crossings = np.empty((16, 4))
     n = 0
     for t in range(len(triangles)):
         p, q, r = triangles[t]
@@ -76,14 +76,14 @@ def _crossings(triangles: Rows, axis: int, place: Floats) -> Rows:
                 w = (p[b] - y) * (q[c] - z) - (p[c] - z) * (q[b] - y)
                 height = (u * p[axis] + v * q[axis] + w * r[axis]) / (u + v + w)
                 if -ROUNDING <= height <= 1.0 + ROUNDING:
-                    if n == len(found):
+                    if n == len(crossings):
                         larger = np.empty((2 * n, 4))
-                        larger[:n] = found
-                        found = larger
-                    found[n, 0], found[n, 1] = i * LINES + j, min(max(height, 0.0), 1.0)
-                    found[n, 2], found[n, 3] = LEAVES if left else ENTERS, t
+                        larger[:n] = crossings
+                        crossings = larger
+                    crossings[n, 0], crossings[n, 1] = i * LINES + j, min(max(height, 0.0), 1.0)
+                    crossings[n, 2], crossings[n, 3] = LEAVES if left else ENTERS, t
                     n += 1
-    return found[:n]
+    return crossings[:n]
 
 
 @njit()

@@ -25,11 +25,11 @@ def export_systems(path: Path, folder: Path, steps: str, full: bool = False) -> 
     Problems whose run fails are left out with a warning. Raises InputError if all fail.
     """
     last, processes, written = max(steps_in(steps)), Processes(), []
-    found = problems(study_cases(load_study(path), path.parent, full))
-    if not found:
+    named = problems(study_cases(load_study(path), path.parent, full))
+    if not named:
         raise InputError(f"{path}: no sweep solves linear systems, so --export has none to write")
     try:
-        for name, case in found.items():
+        for name, case in named.items():
             own = folder / name
             own.mkdir(parents=True, exist_ok=True)
             result = own / "run.h5"
@@ -61,9 +61,9 @@ def problems(cases: Sequence[Case]) -> dict[str, Case]:
             kept = tuple(change for change in case.set if not change.startswith("solver="))
             case = replace(case, set=(*kept, 'solver.preset="newton"'), options="", true_error=None)
             firsts.setdefault((case.file, case.set, case.integrator), case)
-    found: dict[str, Case] = {}
+    named: dict[str, Case] = {}
     for case in firsts.values():
         base = re.sub(r"[^A-Za-z0-9.-]+", "_", case.scene)
-        number = sum(name == base or name.startswith(f"{base}-") for name in found)
-        found[f"{base}-{number + 1}" if number else base] = case
-    return found
+        number = sum(name == base or name.startswith(f"{base}-") for name in named)
+        named[f"{base}-{number + 1}" if number else base] = case
+    return named

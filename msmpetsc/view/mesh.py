@@ -113,9 +113,9 @@ def _choose_copies(
     place[order] = np.append(0, np.cumsum(~is_copy))
     copies = np.bincount(place)[place] > 1
     for row in np.flatnonzero(copies[cells]):
-        found = np.flatnonzero(place == place[cells[row]])
+        candidates = np.flatnonzero(place == place[cells[row]])
         nodes = embedding[neighbours[row]].indices
-        cells[row] = found[np.isin(rest.cells[found], nodes).sum(axis=1).argmax()]
+        cells[row] = candidates[np.isin(rest.cells[candidates], nodes).sum(axis=1).argmax()]
 
 
 def _split(subject: Drawable) -> Drawable:

@@ -64,12 +64,12 @@ def page_of_script(text: str) -> str:
 
 def linked(path: Path, text: str) -> dict[str, Path]:
     """Return the files of the tree that a text links to, by the target as written."""
-    found = {}
+    files = {}
     for _, target, _, _ in LINK.findall(text):
         file = Path(os.path.normpath(path.parent / target))
         if "://" not in target and ROOT in file.parents and file.is_file():
-            found[target] = file
-    return found
+            files[target] = file
+    return files
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:

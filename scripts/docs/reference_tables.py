@@ -174,4 +174,4 @@ TABLES: dict[str, Callable[[], str]] = {
 
 def with_tables(text: str) -> str:
     """Return the text of a page with its tables. Raises KeyError for an unknown table."""
-    return MARKER.sub(lambda found: TABLES[found[1]](), text)
+    return MARKER.sub(lambda marker: TABLES[marker[1]](), text)

@@ -170,13 +170,13 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, li
         load_scene(scene, numbers.run.changes, by_user=False)
     with redirect_stdout(None) if as_json else nullcontext():
         print(HEAD, flush=True)
-        found = {str(scene): checked(scene, numbers, ranks) for scene, numbers in stored.items()}
-        for scene_name, lines in found.items():
+        by_scene = {str(scene): checked(scene, numbers, ranks) for scene, numbers in stored.items()}
+        for scene_name, lines in by_scene.items():
             for line in lines:
                 print(f"{scene_name}: {line}")
     if as_json:
-        print(json.dumps({"same": not any(found.values()), "differences": found}, indent=1))
-    return found
+        print(json.dumps({"same": not any(by_scene.values()), "differences": by_scene}, indent=1))
+    return by_scene
 
 
 def checked(scene: Path, stored: Numbers, ranks: int) -> list[str]:

@@ -180,14 +180,14 @@ class Barrier:
 
     def touching(self, owner: Indices) -> list[tuple[int, int]]:
         """Return the pairs of bodies closer than dhat at rest, by the body of each point (p,)."""
-        mesh, points, found = self.mesh, self.mesh.rest_positions, set()
+        mesh, points, body_pairs = self.mesh, self.mesh.rest_positions, set()
         near = self.candidates(points, 0.0)[0].candidates
         for pair in (*near.fv_candidates, *near.ee_candidates):
             first, _, second, _ = owner[pair.vertex_ids(mesh.edges, mesh.faces)]
             far = pair.compute_distance(points, mesh.edges, mesh.faces) >= self.law.distance**2
             if first != second and not far:
-                found.add((int(min(first, second)), int(max(first, second))))
-        return sorted(found)
+                body_pairs.add((int(min(first, second)), int(max(first, second))))
+        return sorted(body_pairs)
 
     def candidates(
         self, points: Positions, margin: float, moved: Rows | None = None
@@ -238,7 +238,7 @@ class Barrier:
         ipctk, corners, near = self.ipctk, (self.mesh.edges, self.mesh.faces), touched.copy()
         near[corners[0][touched[corners[0]].any(axis=1)]] = True
         edges, faces = (np.flatnonzero(near[of].any(axis=1)) for of in corners)
-        phase, found = ipctk.LBVH(), ipctk.Candidates()
+        phase, candidates = ipctk.LBVH(), ipctk.Candidates()
         phase.can_vertices_collide = self.mesh.can_collide
         parts = (
             np.asfortranarray(of[chosen])
@@ -246,10 +246,10 @@ class Barrier:
         )
         phase.build(np.asfortranarray(points), *parts, 0.5 * self.law.distance + margin)
         ends = [(pair.edge0_id, pair.edge1_id) for pair in phase.detect_edge_edge_candidates()]
-        found.ee_candidates = [ipctk.EdgeEdgeCandidate(edges[i], edges[j]) for i, j in ends]
+        candidates.ee_candidates = [ipctk.EdgeEdgeCandidate(edges[i], edges[j]) for i, j in ends]
         met = [(pair.face_id, pair.vertex_id) for pair in phase.detect_face_vertex_candidates()]
-        found.fv_candidates = [ipctk.FaceVertexCandidate(faces[i], j) for i, j in met]
-        sets = [found]
+        candidates.fv_candidates = [ipctk.FaceVertexCandidate(faces[i], j) for i, j in met]
+        sets = [candidates]
         for kinds in self._creased:
             sets.append(ipctk.Candidates())
             sets[-1].fv_candidates, sets[-1].ee_candidates = (
@@ -338,13 +338,13 @@ class Barrier:
         A step begins with the pairs that the last step ended with.
         """
         if self.last_friction is None or not np.array_equal(self.last_friction[0], points):
-            found = []
+            collisions = []
             for potential, pairs in self._pushing(contacts):
-                found.append(self.ipctk.TangentialCollisions())
-                found[-1].build(
+                collisions.append(self.ipctk.TangentialCollisions())
+                collisions[-1].build(
                     self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction
                 )
-            self.last_friction = points, friction_pairs(found, self.mesh)
+            self.last_friction = points, friction_pairs(collisions, self.mesh)
         return self.last_friction[1]
 
     def least(self, contacts: ContactSets, points: Positions) -> float:

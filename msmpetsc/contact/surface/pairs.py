@@ -314,9 +314,9 @@ class ContactSearch:
         if bound > pairs.margin and ahead <= FARTHEST * self.near.edge:
             self.near.broad_phase(x, self.time, ahead)
         self.find(x, base=q)
-        found, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
+        of_all, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
         is_right = (
-            free and abs(found.energy - known.energy) <= SAME_ENERGY * known.energy + left_out
+            free and abs(of_all.energy - known.energy) <= SAME_ENERGY * known.energy + left_out
         )
         if free and not is_right:
             self.narrow(x, self.time)

@@ -116,10 +116,10 @@ class Places:
         kinds = np.unravel_index(places[kept], self._shape)[0]
         every = list(map(self._collision, places[kept].tolist(), sums[kept].tolist()))
         first, second, third = np.cumsum(np.bincount(kinds, minlength=4))[:3]
-        found = ipctk.NormalCollisions()
-        found.vv_collisions, found.ev_collisions = every[:first], every[first:second]
-        found.fv_collisions, found.ee_collisions = every[second:third], every[third:]
-        return found
+        collisions = ipctk.NormalCollisions()
+        collisions.vv_collisions, collisions.ev_collisions = every[:first], every[first:second]
+        collisions.fv_collisions, collisions.ee_collisions = every[second:third], every[third:]
+        return collisions
 
     def _new_collision(self, place: int, weight: float) -> "ipctk.NormalCollision":
         """Return a place by its number, in ipctk's form."""

@@ -261,14 +261,14 @@ class SurfaceContact:
         """
         moment = self._acting(q)
         points, obstacles = self.contacts.points, self.contacts.obstacles
-        found = np.zeros((len(obstacles.numbers), 3)), 0.0
+        forces_and_work = np.zeros((len(obstacles.numbers), 3)), 0.0
         if obstacles.total and moment is not None:
             if len(moment.points):
                 forces = self._gradient(moment)[points.bodies :]
                 moved = obstacles.displacements(self.contacts.begin, self.contacts.time) - frame
-                found = obstacles.sums(forces), float((forces * moved).sum())
-            found = self.comm.bcast(found)
-        return found
+                forces_and_work = obstacles.sums(forces), float((forces * moved).sum())
+            forces_and_work = self.comm.bcast(forces_and_work)
+        return forces_and_work
 
     def released(self, q: Positions) -> float:
         """Return the energy [J] of elastic slips at the start minus that at q, on rank 0."""

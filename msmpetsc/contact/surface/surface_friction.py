@@ -91,7 +91,7 @@ class SurfaceFriction(Friction):
 
 
 def friction_pairs(
-    found: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
+    collisions: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
 ) -> FrictionPairs:
     """Return the pushing pairs of some sets, their pushes reduced by links of negative weight.
 
@@ -99,7 +99,7 @@ def friction_pairs(
     """
     point, edge, face = np.arange(mesh.num_vertices)[:, None], mesh.edges, mesh.faces
     numbers, weights, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]
-    for built in found:
+    for built in collisions:
         # Each kind is a copy: a loop over ``built`` itself may crash (ipctk 1.6)
         for pairs, *parts in (
             (built.vv_collisions, ("vertex0_id", point), ("vertex1_id", point)),

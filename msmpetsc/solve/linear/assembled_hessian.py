@@ -120,9 +120,9 @@ def _of_springs(hessian: TrueHessian) -> Iterator[HessianBlocks]:
     given = lattice.springs, lattice.rest_length, lattice.stiffness
     springs = Springs(*(to_host(part)[: lattice.springs_owned] for part in given))
     q, projected = hessian.at
-    found = np.empty((len(springs.ends), 4))
-    elastic_hessian(to_host(q), springs, projected, found)
-    c, e = found[:, :1, None], found[:, 1:]
+    coefficients = np.empty((len(springs.ends), 4))
+    elastic_hessian(to_host(q), springs, projected, coefficients)
+    c, e = coefficients[:, :1, None], coefficients[:, 1:]
     blocks = hessian.t2 * (c * np.eye(3) + e[:, :, None] * e[:, None, :])
     a, b = hessian.unknowns.numbers[springs.ends].T
     for first, second, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
@@ -141,7 +141,7 @@ def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> HessianBlocks:
     span = int(corners.max(initial=0)) + 1
     first, second = corners[:, :, None], corners[:, None, :]
     pairs = np.where((first >= 0) & (second >= 0), first * span + second, -1)
-    found, place = np.unique(pairs, return_inverse=True)
+    distinct, place = np.unique(pairs, return_inverse=True)
     place = place.reshape(-1, 8, 8)
     alone = CellHessians(
         blocks._replace(
@@ -152,14 +152,14 @@ def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> HessianBlocks:
         ),
         to_host(part.state)[:owned],
     )
-    sums, v = np.zeros((len(found), 3, 3)), np.zeros((corners.size, 3))
+    sums, v = np.zeros((len(distinct), 3, 3)), np.zeros((corners.size, 3))
     for corner, component in product(range(8), range(3)):
         v[:] = 0
         v[corner::8, component] = t2
         forces = np.zeros_like(v)
         alone(v, forces)
         np.add.at(sums[:, :, component], place[:, :, corner], forces.reshape(-1, 8, 3))
-    return HessianBlocks(found // span, found % span, sums)
+    return HessianBlocks(distinct // span, distinct % span, sums)
 
 
 def _of_surface(surface: SurfaceHessian, unknowns: Unknowns, t2: float) -> HessianBlocks:

@@ -148,19 +148,19 @@ class LowestCurvature:
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
     ) -> tuple[Floats, Rows]:
         """Return the lowest curvatures (k,) and their modes (k, n), by a short or a long search."""
-        found, before = None, self.searched
+        lowest, before = None, self.searched
         more = (
             compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
         )
         # Another mode may be the lowest after an alarm or a greater compression
         if not (alarm or more):
-            found = self._followed()
-        if found is None:
+            lowest = self._followed()
+        if lowest is None:
             # After an alarm the next step makes a long search, too
             self.searched = NONE if alarm else compression
             with self.preconditioner.searching(q, self.functional.contact_at(q)):
-                found = self._long_search(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
-        return found
+                lowest = self._long_search(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
+        return lowest
 
     def _followed(self) -> tuple[Floats, Rows] | None:
         """Return the lowest curvatures and their modes near the last mode.

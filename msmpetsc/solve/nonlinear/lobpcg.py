@@ -120,14 +120,14 @@ class Lobpcg:
         left_out : directions (r, n), orthonormal in M, that the search leaves out
         """
         lowest = []
-        for its, found in enumerate(self.iterates(start, block, left_out)):
-            lowest.append(found[0][0])
+        for its, ritz in enumerate(self.iterates(start, block, left_out)):
+            lowest.append(ritz[0][0])
             if its == most:
                 break
             least_its, settled = (2, 1 / SETTLED) if lowest[-1] < 0 else (max(least, 1), SETTLED)
             if its >= least_its and lowest[-1] > settled * lowest[its // 2]:
                 break
-        return found[0], found[1].copy()
+        return ritz[0], ritz[1].copy()
 
     def iterates(
         self, start: Rows, block: int, left_out: Rows | None = None

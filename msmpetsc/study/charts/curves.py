@@ -342,12 +342,12 @@ def with_curves(rows: DataFrame) -> DataFrame:
 
 def styles_of(curves: DataFrame, styles: Styles) -> Styles:
     """Return the style of each curve; curves of a label share its colour but not its marker."""
-    found = {}
+    of_curves = {}
     number = curves.groupby("label").cumcount()
     for curve, label, more in zip(curves["curve"], curves["label"], number, strict=True):
         shape = SHAPES[(SHAPES.index(styles[label].shape) + more) % len(SHAPES)]
-        found[curve] = replace(styles[label], shape=shape)
-    return found
+        of_curves[curve] = replace(styles[label], shape=shape)
+    return of_curves
 
 
 def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:

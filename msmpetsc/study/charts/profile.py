@@ -70,12 +70,12 @@ def ratios(problems: list[DataFrame], cost: str) -> DataFrame:
 
     An entry is infinite if the method did not solve the problem.
     """
-    found = []
+    table = []
     for rows in problems:
         costs = measured(succeeded(rows), cost).groupby("label")[cost].min()
-        found.append(costs / costs.min())
+        table.append(costs / costs.min())
     labels = dict.fromkeys(label for rows in problems for label in rows["label"])
-    return DataFrame(found, columns=list(labels)).fillna(np.inf).reset_index(drop=True)
+    return DataFrame(table, columns=list(labels)).fillna(np.inf).reset_index(drop=True)
 
 
 def profile_chart(name: str, problems: list[DataFrame], styles: Styles) -> Chart:

@@ -22,18 +22,18 @@ class Scenes:
 
     def setup_cache(self) -> dict[str, dict[str, float]]:
         """Run each scene once and return its figures by name."""
-        found = {}
+        figures = {}
         for scene, frames in FRAMES.items():
             run = lab.run(
                 scene, Path("run.h5"), ["--frames", frames], [CELLS, "output.surface=false"]
             )
-            found[scene] = {
+            figures[scene] = {
                 name: float(values[1:].mean()) for name, values in run.frames(*MEANS).items()
             }
             totals = run.cost["memory"], run.cost["time"]["setup"]
-            found[scene] |= dict(zip(TOTALS, totals, strict=True))
-        return found
+            figures[scene] |= dict(zip(TOTALS, totals, strict=True))
+        return figures
 
-    def track_figure(self, found: dict[str, dict[str, float]], scene: str, figure: str) -> float:
+    def track_figure(self, figures: dict[str, dict[str, float]], scene: str, figure: str) -> float:
         """Return a figure of a scene."""
-        return found[scene][figure]
+        return figures[scene][figure]

@@ -16,7 +16,7 @@ FALL = {"time": {"step": 0.01, "duration": 0.02}, "gravity": {"acceleration": [0
 
 @pytest.fixture
 def no_gpu():
-    """Or skipped where there is one."""
+    """Skip the test on a machine with a GPU."""
     if device.what_is_missing() is None:
         pytest.skip("there is a GPU here")
 

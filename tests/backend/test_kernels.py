@@ -1,5 +1,7 @@
-"""Compiled kernels are found again by the same sources, wherever they can be kept, and never by
-changed ones."""
+"""Compiled kernels are found again by the same sources, in any writable folder.
+
+Changed sources never find them.
+"""
 
 import os
 import resource
@@ -48,7 +50,7 @@ def copied(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The folder that kernels are kept in, within the one that the user has chosen."""
+    """Return the folder of kernels within the folder that the user has chosen."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     kernel_cache.folders.cache_clear()
@@ -59,8 +61,7 @@ def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def environment(package: Path, **variables: object) -> dict[str, str]:
-    """Variables with which kernels of this package can be kept in those folders alone that are
-    named here, or /tmp."""
+    """Return variables that keep kernels only in the folders named here, or in /tmp."""
     given = {"HOME": NOWHERE, "PYTHONPATH": str(package.parent), **variables}
     others = {
         name: x
@@ -71,7 +72,7 @@ def environment(package: Path, **variables: object) -> dict[str, str]:
 
 
 def called(package: Path, **variables: object) -> tuple[float, int]:
-    """What the kernel returns in a process of its own, and whether it was found compiled."""
+    """Return the kernel's value in a process of its own, and whether it was found compiled."""
     done = python(package / "backend" / "caller.py", env=environment(package, **variables))
     assert done.returncode == 0 and not done.stderr, done.stderr
     value, found = done.stdout.split()
@@ -171,7 +172,7 @@ def test_no_folder_is_read_that_somebody_else_may_write_to(chosen: Path, kind: s
 
 
 def test_kernels_of_a_folder_that_cannot_be_written_are_found(copied: Path, tmp_path: Path):
-    """As in a container whose image has them: what lacks is kept elsewhere."""
+    """As in a container whose image has the kernels: missing kernels are kept elsewhere."""
     if not os.getuid():
         pytest.skip("root can write to any folder: scripts/bare tries it as a user")
     assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (8.0, 0)

@@ -1,6 +1,7 @@
-"""Runs on a GPU, a real one where there is one, and one that is pretended (pretend_gpu): the same
-frames as on the CPU, no array of one place among those of the other, and nothing carried but what
-frames and checkpoints need."""
+"""Runs on a GPU, real or pretended (pretend_gpu), give the frames of a CPU.
+
+Arrays of CPU and GPU never mix. Only frames and checkpoints need copies.
+"""
 
 import importlib
 import json
@@ -277,7 +278,7 @@ def test_kernels_do_the_same_as_threads(tmp_path: Path):
 
 
 def bodies() -> list[Callable]:
-    """Of all kernels: what ``kernel`` was given."""
+    """Return the bodies that ``kernel`` was given."""
     found = []
     for path in PACKAGE.rglob("*.py"):
         if "\n@kernel\n" in path.read_text():
@@ -362,8 +363,7 @@ with pretended():
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [3, pytest.param(2, marks=pytest.mark.cuda)])
 def test_ranks_agree_on_gpus_too(tmp_path: Path, ranks: int):
-    """And a run of the command line: ranks with ghosts, on pretended GPUs or a real one, against
-    one on the CPU."""
+    """Also by the command line: ranks with ghosts, on pretended or real GPUs, against a CPU."""
     path = block_scene(tmp_path, **CASES["pressed and rubbed"])
     there = ["-c", ON_GPUS, "run"]
     if ranks == 2:

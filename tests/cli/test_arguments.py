@@ -1,5 +1,7 @@
-"""Paths on the command line that lead nowhere, or to what is no file, or bear the name of another
-format: one line, and status 2. Commands for one process say so under mpiexec."""
+"""Paths on the command line that do not exist, are no file, or have the name of another format.
+
+Each gives one line and status 2. Commands for one process say so under mpiexec.
+"""
 
 import os
 from pathlib import Path

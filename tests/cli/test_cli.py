@@ -1,5 +1,4 @@
-"""The command line: what it writes, what it refuses and how, and that no failure hangs or leaves
-anything behind."""
+"""The command line: output, refusals, and failures that neither hang nor leave files behind."""
 
 import subprocess
 import tomllib
@@ -70,7 +69,7 @@ def on(ranks: int, *arguments: object, status: int | None = None) -> subprocess.
     return run(ranks, *COMMAND, *arguments, status=status)
 
 
-# What it writes
+# Output
 
 
 def test_the_default_output_is_in_out_and_is_not_replaced_unasked(
@@ -176,7 +175,7 @@ def test_our_options_and_petscs_stand_in_any_order(given: str, ours: str, petsc:
     assert split_petsc_options(given.split()) == (ours.split(), petsc.split())
 
 
-# What it refuses
+# Refusals
 
 
 def test_an_unused_option_of_a_name_that_solving_might_read_is_told_at_the_end(
@@ -228,7 +227,7 @@ REFUSALS = [*((1, name) for name in BAD), *((2, name) for name in list(BAD)[::2]
 
 @pytest.fixture(scope="module")
 def refusals(folder: Path) -> dict[tuple[int, str], Answers]:
-    """By ranks and what is wrong; half of them on two ranks."""
+    """Refusals by number of ranks and fault; half of them on two ranks."""
     found = {}
     for ranks in (1, 2):
         names = [name for number, name in REFUSALS if number == ranks]
@@ -262,15 +261,17 @@ def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path):
     assert "14 boundary edges" in warning
 
 
-# What fails on the way
+# Failures on the way
 
 
 @pytest.mark.parametrize(("ranks", "preset"), [(1, "newton"), (2, "anderson")])
 def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
     scene: Path, tmp_path: Path, ranks: int, preset: str
 ):
-    """At rest until a force sets in at 0.025 s: frames 0 to 2 need no iteration, frame 3 more than
-    one."""
+    """A body at rest until a force sets in at 0.025 s.
+
+    Frames 0 to 2 need no iteration, frame 3 several.
+    """
     out = tmp_path / "o.h5"
     force = "force.0={region={sphere={center=[0,0,-1],radius=1}},total=[1e4,0,0],start=0.025}"
     at_rest = sets("gravity.acceleration=[0,0,0]", force, "time.duration=0.05")

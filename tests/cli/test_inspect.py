@@ -1,4 +1,4 @@
-"""What inspect says of R ranks and of bytes, against what R ranks hold; and where integers end."""
+"""The counts and bytes of inspect against those of a run on R ranks, and the limits of integers."""
 
 import json
 import re
@@ -44,7 +44,7 @@ def scene(ball: Path, tmp_path: Path) -> Path:
 
 
 def counted(scene: Path, cells: int, ranks: int) -> Partition:
-    """What count_partition says."""
+    """Return the counts of count_partition."""
     return count_partition(
         Geometry(SELF, load_scene(scene, [f"cages.count={cells}"])).topology, ranks
     )
@@ -62,7 +62,7 @@ def assert_counts_are_near_those_of_real_ranks(scene: Path, cells: int, rel: flo
 
 
 def test_the_counts_are_near_those_of_real_ranks(scene: Path, tmp_path: Path):
-    """Of several bodies, too: each has slabs of its own, along its own longest side."""
+    """Also of several bodies: each has slabs of its own, along its own longest side."""
     assert_counts_are_near_those_of_real_ranks(scene, 3000, 0.01)
     turned = "{ rotate = { axis = [0, 1, 0], degrees = 90 } }"
     (tmp_path / "bar.obj").write_text((ROOT / "scenes/studies/beam.obj").read_text())
@@ -189,8 +189,7 @@ def test_the_bytes_of_a_lattice_are_those_of_its_arrays(lattice: Lattice):
 
 
 def test_the_assembly_says_the_bytes_that_it_takes(lattice: Lattice):
-    """As Python's own count of memory has it, within a tenth; what PETSc takes for A is not in
-    that."""
+    """Without PETSc's memory of A the bytes agree with Python's count within a tenth."""
     unknowns = Unknowns(SELF, lattice)
     tracemalloc.start()
     matrix = assemble(SELF, unknowns, 0.01)

@@ -1,4 +1,4 @@
-"""``msmpetsc new``: what it measures of a mesh, and that the scene which it writes runs at once."""
+"""``msmpetsc new``: its measures of a mesh, and a scene that runs at once."""
 
 import json
 import os
@@ -24,8 +24,10 @@ from msmpetsc.scene.reading import load_scene
 
 
 def chair(upwards: int, back: int) -> trimesh.Trimesh:
-    """A chair of boxes that stands on y (1) or z (2), its back towards one end (1) or the other
-    (-1)."""
+    """Return a chair of boxes on y (1) or z (2).
+
+    Its back points to one end (1) or the opposite end (-1).
+    """
     # seat and back
     boxes = [[[0, 0.4, 0], [0.45, 0.45, 0.45]], [[0, 0.45, 0], [0.45, 0.9, 0.05]]]
     boxes += [[[x, 0, z], [x + 0.05, 0.4, z + 0.05]] for x in (0, 0.4) for z in (0, 0.4)]
@@ -178,8 +180,7 @@ def test_a_shipped_scene_is_copied_as_it_is(tmp_path: Path, capsys):
 
 
 def packed(folder: Path, kind: str) -> set[str]:
-    """The files of a wheel, an editable one or a source archive of this clone, built in a
-    folder."""
+    """Return the files of a wheel, an editable wheel or a source archive, built in a folder."""
     tree = folder / "tree"
     shutil.copytree(ROOT, tree, symlinks=True, ignore=lambda folder, names: [
         name for name in names if name.startswith(".") or name in ("out", "tests", "build",

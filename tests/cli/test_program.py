@@ -1,4 +1,4 @@
-"""What is about the program itself: doctor, examples, quiet and verbose, mistaken words."""
+"""The program itself: doctor, examples, quiet and verbose, mistaken words."""
 
 import json
 import os

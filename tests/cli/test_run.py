@@ -1,4 +1,4 @@
-"""A whole run through the command line: the file alone must prove what happened."""
+"""A whole run by the command line: the file alone must prove its course."""
 
 import h5py
 import numpy as np

@@ -105,8 +105,10 @@ def wait_until(condition: Callable[[], object]) -> None:
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks: int):
-    """The step would take 100,000 iterations; a rank that gets the signal takes the other one
-    along."""
+    """The step would take 100,000 iterations.
+
+    A rank that gets the signal takes the second rank along.
+    """
     path = tmp_path / "x.h5"
     scene = hanging(
         tmp_path, 2, cages={"cell_size": 1 / 32}, material={"young_modulus": 1e9, "density": 1000.0}
@@ -148,7 +150,7 @@ def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks:
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path):
-    """Both come within one linear solve, which these settings would not end for minutes."""
+    """Both signals come within one linear solve, which these settings would not end for minutes."""
     path = tmp_path / "x.h5"
     scene = hanging(
         tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9}

@@ -1,5 +1,4 @@
-"""How a command starts: help and refusals import little, and a command imports what it needs
-itself."""
+"""The start of a command: help and refusals import little, a command imports its own needs."""
 
 import re
 from pathlib import Path

@@ -1,5 +1,4 @@
-"""Damaged and hostile result files given to run --resume: it goes on, or says in one line why
-not."""
+"""Damaged and hostile result files for run --resume: it resumes, or refuses in one line."""
 
 import re
 import signal

@@ -31,7 +31,7 @@ def run_killed(ranks: int, seconds: float, *arguments: object) -> subprocess.Com
 
 
 def frames_left(path: Path, whole: Path, least: int) -> int:
-    """Return how many frames there are, which are those of a run that was never killed."""
+    """Return the number of frames; they agree with frames of a run that was never killed."""
     if not path.exists():
         assert least == 0
         return 0

@@ -191,7 +191,7 @@ def test_what_was_asked_for_beside_the_frames_is_there_after_going_on(whole: Pat
 
 
 def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path, monkeypatch):
-    """A checkpoint at the start alone, and a failure later: not one frame is written again."""
+    """With a checkpoint at the start alone and a failure later, not a frame is written again."""
     path = tmp_path / "x.h5"
 
     def killed() -> None:
@@ -260,8 +260,10 @@ def test_other_options_of_petsc_are_refused_unless_they_only_tell(whole: Path):
 
 
 def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
-    """From a stopped and from a finished file; the 40th step had a frame as the last one, and has
-    none any more."""
+    """A longer run from a stopped and from a finished file.
+
+    The 40th step had a frame as the last step; now it has none.
+    """
     longer = tmp_path / "longer.h5"
     more = ["--set", "time.duration=0.56"]
     assert (
@@ -388,8 +390,7 @@ def test_positions_that_no_frame_knows_are_refused(
 def test_a_file_cannot_name_meshes_of_another_folder(
     whole: Path, stopped: Path, tmp_path, lies_there: str
 ):
-    """What it says of its scene's folder is not believed: that scene must lie there, and name the
-    mesh."""
+    """The folder that the file names is not trusted: it must hold the scene that names the mesh."""
     other = tmp_path / "other"
     other.mkdir()
     shutil.copy(whole.parent / "scene.ply", other / "scene.ply")
@@ -410,8 +411,7 @@ def test_a_file_cannot_name_meshes_of_another_folder(
 def test_a_file_cannot_make_a_run_do_more_than_solve(
     stopped: Path, tmp_path, monkeypatch, option: str
 ):
-    """Options without effect on results are forgotten, all others that choose no solver are
-    refused."""
+    """Options without effect on results are dropped. Options that choose no solver are refused."""
     monkeypatch.chdir(tmp_path)
     with h5py.File(stopped, "r+") as file:
         file.attrs["petsc_options"] = option
@@ -443,7 +443,7 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path):
 
 
 def take_and_free(path: Path, times: int, twice) -> None:
-    """A lock again and again; a file that the holder alone should make tells of a second one."""
+    """Take and free a lock many times. A file for its holder alone reveals a second holder."""
     from msmpetsc.results.disk import Lock
 
     for _ in range(times):
@@ -482,7 +482,7 @@ def test_what_cannot_be_resumed_is_told(given, monkeypatch, tmp_path):
 
 
 def test_on_two_ranks_exactly_and_on_another_number_closely(tmp_path):
-    """Stopped on two ranks after its fifth step; gone on with on two, and on one."""
+    """Stopped on two ranks after its fifth step, then resumed on two ranks and on a single rank."""
     worker = WORKERS / "stop_worker.py"
     scene = hanging(tmp_path, 12, solver={"preset": "newton", "error": 1e-10})
     for step, name in ((5, "x.h5"), (-1, "whole.h5")):

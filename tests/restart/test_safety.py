@@ -1,4 +1,4 @@
-"""What a run notices about its steps, and what it does about one that fails."""
+"""Faults that a run notices in its steps, and its response to a failed step."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,8 +29,10 @@ def of(frames: list[Frame], name: str) -> np.ndarray:
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
 def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
-    """Implicit Euler only loses; explicit substeps and BDF2 swing about what is there by a few
-    percent."""
+    """Implicit Euler only loses energy.
+
+    Explicit substeps and BDF2 vary around the energy by a few percent.
+    """
     _, frames = play(beam(tmp_path, time=TIME | {"integrator": integrator}))
     # energy from the weight [J]
     worked = of(frames, "potential")[0] - of(frames, "potential").min()
@@ -43,8 +45,7 @@ def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
 
 @pytest.mark.parametrize("integrator, share", [("implicit-euler", 1e-6), ("bdf2", 0.01)])
 def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, share: float):
-    """What anchors and moving obstacles put in is work: a plate of much friction that is pressed in
-    and pulled away."""
+    """Work of anchors and obstacles counts: a rough plate is pressed in and pulled away."""
     time = TIME | {"integrator": integrator, "step": STEP / 4 if integrator == "bdf2" else STEP}
     floor = {
         "shape": "plane",
@@ -62,8 +63,7 @@ def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, s
 
 
 class Overshooting:
-    """Makes whole steps of the usual solver go too far by a share, from the first on: what is wrong
-    grows."""
+    """Solver whose steps overshoot by a share from the first step on, so that the error grows."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, share: float):
         step = Stepper.step
@@ -135,7 +135,7 @@ def test_inverted_cells_are_counted_and_told_with_their_place(
 
 
 def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """One corner of a block is led through its cell, to the far side of the opposite corner."""
+    """A corner of a block is led through its cell to the far side of the opposite corner."""
     corner = {"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}
     corner["path"] = [{"time": STEP, "by": [1.2 * CELL] * 3}]
     _, frames = play(
@@ -220,7 +220,7 @@ def test_what_no_halving_mends_stops_with_the_number_of_pieces(
 
 
 def test_a_rescued_explicit_or_bdf2_step_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """BDF2 begins anew after it: still within what a step of first order may be off."""
+    """BDF2 begins anew after the step, so the error is still that of a step of first order."""
     scene = beam(tmp_path, time=TIME | {"integrator": "bdf2"})
     _, usual = play(scene)
     Failing(monkeypatch, {4})

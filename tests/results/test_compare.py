@@ -1,5 +1,4 @@
-"""msmpetsc compare: errors are those of the formulas it states; it names the first frame and node
-that differ."""
+"""msmpetsc compare: errors by its formulas, and the first frame and node that differ."""
 
 import re
 from pathlib import Path
@@ -38,7 +37,7 @@ def moved(index: int, node: int, by: float) -> np.ndarray:
 
 
 def told(capsys, *arguments: object) -> tuple[int, str, str]:
-    """Exit status, and what the command says."""
+    """Return the exit status and the output of the command."""
     status = main(["compare", *map(str, arguments)])
     said = capsys.readouterr()
     return status, said.out, said.err

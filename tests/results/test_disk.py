@@ -1,5 +1,7 @@
-"""A disk that is full, or may not be written: one line, exit status 2, and the run goes on when
-there is room."""
+"""A disk that is full or write-protected: one line and exit status 2.
+
+The run goes on when there is room.
+"""
 
 import subprocess
 from collections.abc import Iterator

@@ -1,5 +1,7 @@
-"""Result files that are damaged or hostile: they are read, or one line says why not; no other file
-is opened."""
+"""Damaged or hostile result files: they are read or refused in one line.
+
+No file beside them is opened.
+"""
 
 import argparse
 from pathlib import Path
@@ -179,7 +181,7 @@ def test_names_and_versions_act_on_no_terminal(bar_result, tmp_path):
 
 @pytest.mark.parametrize("ending", ["crashes", "hangs"])
 def test_where_hdf5_itself_fails_a_child_fails(bar_result, monkeypatch, ending):
-    """The child is made to do what HDF5 does on damaged tables, where no exception comes."""
+    """The child is made to crash as HDF5 does on damaged tables, where no exception comes."""
     from msmpetsc.results import untrusted_file
 
     code = {"crashes": "os.abort()", "hangs": "while True: pass"}[ending]

@@ -1,5 +1,4 @@
-"""msmpetsc.open: what is in the file comes out, of running and of old files too; a bad file ends in
-one line."""
+"""msmpetsc.open returns the content of running and of old files; a bad file ends in a line."""
 
 import sys
 from collections.abc import Callable

@@ -27,7 +27,7 @@ class Terminal(io.StringIO):
 
 
 def shown(monkeypatch, stream: io.StringIO, indices: range, **options) -> str:
-    """What a progress writes of frames of 100."""
+    """Return the output of a progress bar after some frames of 100."""
     monkeypatch.setattr("sys.stderr", stream)
     bar = Progress(100, **options)
     for index in indices:

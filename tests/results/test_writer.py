@@ -36,7 +36,7 @@ def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
 
 
 def assert_holds(file: h5py.File, count: int, surface: str | None = "f8") -> None:
-    """The first `count` frames are those of frames_worker, bit for bit."""
+    """Assert that the first ``count`` frames are the frames of frames_worker, bit for bit."""
     expected = [frame(index) for index in range(count)]
     fields = {
         name: FRAME_FIELDS[name].dtype
@@ -192,7 +192,7 @@ def saved(index: int) -> Checkpoint:
 
 
 def places(file: h5py.File) -> Iterator[tuple[int, int]]:
-    """Where the chunks of frames and checkpoints lie, [byte]."""
+    """Return the byte offsets of the chunks of frames and checkpoints."""
     for group in ("frames", "checkpoint"):
         for dataset in (file[group][name] for name in file[group] if f"{group}/{name}" in FIELDS):
             for number in range(dataset.id.get_num_chunks()):

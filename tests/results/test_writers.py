@@ -1,8 +1,8 @@
-"""Every writer there is, in one table: on a disk that fills up it says so in one line and leaves
-nothing half-written.
+"""Every writer on a full disk says so in a line and leaves no half-written file.
 
-By the limit on the size of files, which the system tells like a full disk, and which needs no
-rights."""
+A limit on the size of files stands for the full disk. The system reports both alike, and the limit
+needs no rights.
+"""
 
 import re
 import resource
@@ -42,7 +42,7 @@ Write = Callable[[Path], object]
 
 
 class Writer(NamedTuple):
-    """A writer: its module, what it writes under a path, and what must lie there before."""
+    """A writer: its module, a call that writes below a path, and files that must exist before."""
 
     module: str
     write: Write
@@ -77,8 +77,10 @@ def chart(path: Path) -> None:
 
 
 def ask_for_no_cases(path: Path) -> None:
-    """Write a study file all of whose cases are for --full: run_study notes what it was asked, and
-    runs nothing."""
+    """Write a study file whose cases are all for --full.
+
+    run_study stores its request and runs nothing.
+    """
     scene = ROOT / "scenes" / "studies" / "beam_soft.toml"
     text = f'[[scene]]\nname = "a"\nfile = "{scene}"\n[[sweep]]\nfull = true\n'
     path.parent.with_name("asked.toml").write_text(text)
@@ -127,8 +129,7 @@ def writers(sources: Path) -> dict[str, Writer]:
 
 NUMBERS = check.Numbers(run=check.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={})
 NAMES = [*writers(Path())]
-# what never ends a run, and what needs one to be called: these too write by the one
-# way, and nothing else
+# writers that never end a run or need a run to be called; they use the same function
 NOT_TRIED = {"app/summary.py", "app/exported_systems.py", "cli/commands/series.py"}
 
 

@@ -29,7 +29,7 @@ def test_a_damaged_scene_or_study_is_read_or_refused(tmp_path, content, changes,
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with a scene, beside what it must not reach."""
+    """Return a folder with a scene, beside files that the scene must not reach."""
     (tmp_path / "own" / "below").mkdir(parents=True)
     block_scene(tmp_path / "own", time=ONCE)
     for name in ("out.ply", "own/below/in.ply"):

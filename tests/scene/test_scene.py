@@ -1,4 +1,4 @@
-"""Scene files: what they mean, and that every mistake is named in one plain line."""
+"""Scene files: their meaning, and one plain line for every mistake."""
 
 import json
 import math
@@ -90,7 +90,7 @@ def changed(old: str, new: str) -> str:
     return EXAMPLE.replace(old, new)
 
 
-# --- what a scene says
+# --- meaning of a scene
 
 
 def test_defaults(tmp_path):

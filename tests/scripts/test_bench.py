@@ -18,8 +18,7 @@ COST = {
 
 
 def sample(seconds: list[float]) -> bench.Sample:
-    """Return what a run of so many seconds a frame measures, with one iteration, 30 its and 60
-    products each."""
+    """Return the measurement of a run: seconds a frame, an iteration, 30 its, 60 products each."""
     frames = {"wall_time": np.array(seconds), "step_error": np.linspace(0, 1e-4, len(seconds))}
     counts = {"iterations": 1, "ksp_its": 30, "products": 60, "proof_products": 6}
     return bench.Sample(

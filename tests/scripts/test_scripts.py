@@ -1,5 +1,7 @@
-"""The scripts run from a clone as their README writes them, whatever Python is found first;
-scripts/setup and scripts/build_petsc_cuda, with stand-ins for what they call."""
+"""The scripts run from a clone as their README writes them, with any Python found first.
+
+scripts/setup and scripts/build_petsc_cuda have stand-ins for the programs that they call.
+"""
 
 import os
 import shutil
@@ -60,7 +62,7 @@ def program(folder: Path, name: str, text: str) -> None:
 
 # ---- scripts/setup
 
-# what scripts/setup asks of a Python: petsc4py is there, a venv gets a copy, pip talks
+# a stand-in for Python in scripts/setup: petsc4py, a venv with a copy, a pip that talks
 PYTHON = """case "$*" in
 "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
 *sysconfig*) echo .venv ;;
@@ -187,8 +189,10 @@ def test_a_folder_of_others_is_left_alone(bare: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
-    """Two cards of one kind and one of another name the build; the same call then only prints what
-    to export."""
+    """Two cards of the same kind and a third card name the build.
+
+    A second call prints the exports alone.
+    """
     program(bare, "nvidia-smi", "printf '9.0\\n8.0\\n9.0\\n'")
     prefix = tmp_path / "petsc"
     prefix.mkdir()

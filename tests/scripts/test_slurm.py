@@ -17,8 +17,7 @@ STAND_INS = {
     "srun": """while [[ $1 == --* ]]; do shift; done
         exec mpirun --oversubscribe -n 2 "$@" """,
     "scontrol": 'echo "$@" >> requeued',
-    # keeps the contract of msmpetsc run and msmpetsc study: what a signal does, what
-    # --resume says
+    # behaves like msmpetsc run and msmpetsc study on a signal and with --resume
     "msmpetsc": """echo "$@ threads=$OMP_NUM_THREADS" >> "told-$$"
         trap 'touch "$4"; exit 0' USR1
         trap 'exit 130' TERM
@@ -83,7 +82,7 @@ class Job:
         )  # fmt: skip
 
     def stopped(self, ranks: int) -> str:
-        """What it says, stopped by Slurm once so many ranks run."""
+        """Return the output of a script that Slurm stops once so many ranks run."""
         process = self.start()
         while len(list(self.folder.glob("ready-*"))) < ranks:
             assert process.poll() is None, process.communicate()[0]
@@ -100,7 +99,7 @@ class Job:
         return process.returncode
 
     def told(self) -> list[str]:
-        """What the program was called with, each rank of each call; forgotten afterwards."""
+        """Return the arguments of each rank of each call of the program, and forget them."""
         calls = sorted(self.folder.glob("told-*"))
         lines = [line for call in calls for line in call.read_text().splitlines()]
         for call in calls:

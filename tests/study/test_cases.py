@@ -1,4 +1,4 @@
-"""The cases of a study file: what is refused, what a sweep multiplies, and what defines a case."""
+"""The cases of a study file: refusals, combinations of a sweep, definition of a case."""
 
 # ruff: noqa: F811 (fixtures are imported)
 import json
@@ -129,8 +129,10 @@ def test_a_case_is_its_scene_its_mesh_and_its_options(tmp_path: Path):
 
 
 def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
-    """It has neither a case's cells nor what a sweep changes, and surfaces are stored, which are
-    compared."""
+    """The reference has neither a case's cells nor the sweep's changes.
+
+    Surfaces are stored for comparison.
+    """
     reference = 'reference = { cells = 5000, integrator = "bdf2", step = 0.005 }\n'
     sweep = '[[sweep]]\ncells = [10, 80]\n[[sweep]]\ncells = [10]\nset = ["cages.boundary=whole"]'
     found = all_cases(tmp_path, ONE_SCENE + reference + sweep)
@@ -153,7 +155,7 @@ def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
 
 
 def test_a_law_is_that_of_the_reference_too(tmp_path: Path):
-    """Each has a reference of its own, unless the scene names the law of one for all."""
+    """Each law has a reference of its own, unless the scene names the law of a common reference."""
     reference = 'reference = { cells = 5000, integrator = "bdf2", step = 0.005 }\n'
     sweep = '[[sweep]]\nlaws = ["linear", "neo-hookean"]'
     found = all_cases(tmp_path, ONE_SCENE + reference + sweep)

@@ -31,7 +31,7 @@ def processes():
 def carry_out(
     processes: Processes, path: Path, *words: str, timeout: float = 60, warm: bool = True
 ) -> tuple[Ended, str]:
-    """How it ended, and what it said."""
+    """Return how the process ended, and its output."""
     log = path.with_suffix(".log")
     ended = processes.run(
         [*COLD, "run", str(path), "-o", str(path.with_suffix(".h5")), *words], log, timeout, warm
@@ -56,8 +56,10 @@ def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
 def test_a_process_alone_takes_no_folder_from_others(
     tmp_path: Path, processes: Processes, monkeypatch
 ):
-    """One that ended robbed one that began of a folder of both: a case in 300 failed. Open MPI 5
-    leaves them."""
+    """A process that ended once removed a folder that a new process used: a case in 300 failed.
+
+    Open MPI 5 leaves the folders.
+    """
     (tmp_path / "shared").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "shared"))
     code = "import os; from mpi4py import MPI; print(*os.listdir(os.environ['TMPDIR']))"

@@ -82,8 +82,10 @@ def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
 
 @pytest.mark.parametrize(("order", "cosine"), [(1.0, 0.0), (1.5, 0.0), (1.5, 0.5), (2.0, 0.9)])
 def test_lattices_that_err_by_chance(order: float, cosine: float):
-    """What parts two runs is at an angle to the finer one's error, which as if it were at none is
-    too great."""
+    """The difference of two runs is at an angle to the finer run's error.
+
+    An angle of 0 would give too much.
+    """
     sizes, e = (4.0, 2.0, 1.0), [0.03 * size**order for size in (4, 2, 1)]
     first, second = (math.sqrt(a**2 - (1 - cosine**2) * b**2) - cosine * b for a, b in pairwise(e))
     across = math.sqrt(first**2 + second**2 + 2 * cosine * first * second)
@@ -138,8 +140,7 @@ def test_a_smaller_error_costs_more_and_none_is_promised_that_cannot_be():
 
 
 def test_explicit_substeps_shorten_with_the_cells():
-    """Eight times the cells are twice the substeps; the costs known are of implicit steps, or of
-    explicit ones."""
+    """Eight times the cells need twice the substeps. Known costs are implicit or explicit."""
     for explicit, factor in ((False, 16), (True, 8)):
         model = replace(MODEL, steppings=[stepping("verlet", 0.01, 1e-4, 3.0)], explicit=explicit)
         costs = [
@@ -161,8 +162,9 @@ def test_cost_grows_with_cells_as_measured():
 
 
 class Bodies:
-    """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of
-    their solution.
+    """A bench whose runs are formulas.
+
+    The error has parts of cells, of order 1.5, of steps and of their solution.
 
     slow        : whether explicit substeps take too long
     inverted    : cells inside out at the end, by cells
@@ -255,7 +257,7 @@ def case_of(method: Candidate) -> Case:
 def test_the_plan_meets_the_error_and_wastes_little(
     tmp_path: Path, monkeypatch, explicit: bool, target: float
 ):
-    """The choice's own error, of the formula, is little less than what was asked for."""
+    """The choice's own error by the formula is a little below the error asked for."""
     plan, bench, _ = sized(tmp_path, monkeypatch, target, explicit=explicit)
     method, cells = plan.choice.method, plan.choice.cells
     assert plan.met and not plan.bounds and (explicit or method.integrator != "verlet")
@@ -266,7 +268,7 @@ def test_the_plan_meets_the_error_and_wastes_little(
 
 @pytest.mark.parametrize("cell_error", [1.5, 3.7, 5.2])
 def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell_error: float):
-    """Of fewer cells than the finest lattice, of nearly as many and of many more."""
+    """Choices of fewer cells than the finest lattice, of nearly as many and of many more."""
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.04, cell_error=cell_error, explicit=False)
     true = bench.error_of(case_of(plan.choice.method), plan.choice.cells)
     assert plan.met and plan.choice.budget.total == pytest.approx(true, rel=0.2)
@@ -276,8 +278,10 @@ def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell
 def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
     tmp_path: Path, monkeypatch, target
 ):
-    """What parts two runs is at right angles to the finer one's error, of order 1; added up it was
-    twice as much."""
+    """The difference of two runs is at right angles to the finer run's error, of order 1.
+
+    Their sum was twice as much.
+    """
 
     def distance_between(a: Path, b: Path) -> float:
         return math.sqrt(abs(bench.errors[a] ** 2 - bench.errors[b] ** 2))
@@ -346,8 +350,10 @@ def test_thin_walls_are_tried_on_enough_cells(
 
 
 def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path, monkeypatch):
-    """At 300 cells, as where a foot folds one way or another: no lattice has the error asked for,
-    or little less."""
+    """The error jumps at 300 cells, as if a foot folds differently.
+
+    No lattice has the error asked for, or slightly less.
+    """
     monkeypatch.setattr(
         Bodies,
         "error_of",
@@ -387,8 +393,10 @@ def test_orders_that_differ_are_assumed_to_be_their_mean(tmp_path: Path, monkeyp
 
 
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
-    """Verlet runs away on the cells that are chosen, though not on those tried before: BDF2 it is,
-    and that is said."""
+    """Verlet runs away on the chosen cells, though not on the cells tried before.
+
+    The plan takes BDF2 and says so.
+    """
     first, *_ = sized(tmp_path, monkeypatch, 0.1)
     runs_away = lambda integrator, cells: integrator == "verlet" and cells == first.choice.cells  # noqa: E731
     plan, _, said = sized(tmp_path, monkeypatch, 0.1, fails=runs_away)
@@ -444,7 +452,7 @@ def test_a_plan_says_what_bounds_the_error(tmp_path: Path, monkeypatch, bound: s
 
 
 def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
-    """On the finest lattice that was tried: then order 1 is assumed. Coarser ones do not matter."""
+    """On the finest lattice tried, so order 1 is assumed. Coarser lattices do not matter."""
     plan, _, _ = sized(
         tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0
     )
@@ -479,8 +487,7 @@ def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monk
 
 
 def true_error(scene: Path, *, choice: list[str], finer: list[str]) -> float:
-    """Return the error of what a plan wrote, against a run of 32 times the cells; each with changes
-    of its own."""
+    """Return the error of a plan's choice against a finer run of 32 times the cells."""
     fine = [f"cages.count={32 * load_scene(scene).cages.count}", *finer]
     results = [scene.with_name("choice.h5"), scene.with_name("finer.h5")]
     for result, changes in zip(results, (choice, fine), strict=True):

@@ -1,5 +1,4 @@
-"""Maps of a study: their cases, how a run is judged, and what the charts show of it. The runs are
-stand-ins."""
+"""Maps of a study: their cases, the outcome of a run, and the charts. The runs are stand-ins."""
 
 # ruff: noqa: F811 (fixtures are imported)
 import re

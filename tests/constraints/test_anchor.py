@@ -26,7 +26,7 @@ UP = [
 
 
 def place(path: list[dict], time: float) -> np.ndarray:
-    """Where a path is."""
+    """Return the place on a path at a time."""
     stops = [{"time": 0, "by": [0, 0, 0]}, *path]
     return np.array(
         [np.interp(time, [s["time"] for s in stops], [s["by"][c] for s in stops]) for c in range(3)]
@@ -108,8 +108,7 @@ def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
 def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(
     tmp_path: Path, petsc_options
 ):
-    """And one of the user's that the first solver used is not called unused, nor taken out with our
-    defaults."""
+    """An option that the first solver used is not reported, nor removed with our defaults."""
     scene = load_scene(anchored_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
     petsc_options(ksp_rtol="1e-8")
     with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
@@ -203,15 +202,14 @@ WRONG = {
 }
 
 
-# ---- on one rank and on two, by the command line
+# ---- on a single rank and on two, by the command line
 
 PRESETS = "newton", "anderson", "fast-msm"
 
 
 @pytest.fixture(scope="module")
 def runs(balls: Path) -> dict[int, tuple[Path, list]]:
-    """On so many ranks: the folder of results, and (status, what was told) of each rank for each of
-    all commands."""
+    """Return the folder of results, and each rank's status and output, by number of ranks."""
     half, most_of_it = (
         {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]},
         {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]},
@@ -248,8 +246,10 @@ def runs(balls: Path) -> dict[int, tuple[Path, list]]:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_two_ranks_lead_and_let_go_as_one(runs: dict, preset: str):
-    """The solver is built three times; at first six nodes of the last corner are free, which leaves
-    one rank none."""
+    """The solver is built three times.
+
+    At first six nodes of the last corner are free, so a rank has none.
+    """
     files = {}
     for ranks, (out, answers) in runs.items():
         assert [status for status, _ in answers[PRESETS.index(preset)]] == [0] * ranks, answers

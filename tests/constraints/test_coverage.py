@@ -1,5 +1,4 @@
-"""What a run says at its start: what takes which nodes, what has no effect, and a body of an odd
-size."""
+"""Messages at the start of a run: nodes of tables, tables without effect, odd sizes."""
 
 import logging
 import re
@@ -40,7 +39,7 @@ def build(folder: Path, **tables) -> Model:
 
 
 def assert_warns(lines: list[tuple[str, str]], words: str) -> None:
-    """One warning, which begins so."""
+    """Assert that a single warning comes, with this beginning."""
     assert [(level, line[: len(words)]) for level, line in lines] == [("WARNING", words)]
 
 
@@ -204,7 +203,7 @@ def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
 
 
 def test_ranks_refuse_and_warn_as_one(tmp_path):
-    """Nodes of a region may all lie on one of the ranks."""
+    """Nodes of a region may all lie on the same rank."""
     block_scene(tmp_path, time=TIME)
     tables = {
         "none is free": {"pin.0.region": LEFT_HALF, "force.0": force(LEFT)},

@@ -78,7 +78,10 @@ def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping,
 
 
 def test_explicit_steps_hang_from_their_pin_with_their_weight_in_the_mean(tmp_path):
-    """Over whole swings the reaction is minus the weight; within one, the momentum's change."""
+    """Over whole swings the mean reaction is minus the weight.
+
+    Within a swing it also changes the momentum.
+    """
     scene = block_scene(
         tmp_path, **TIGHT, material=SOLID, pin=[{"region": BOTTOM}],
         time={"step": 1e-4, "duration": 3e-3, "integrator": "verlet"},

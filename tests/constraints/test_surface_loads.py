@@ -56,7 +56,7 @@ def test_a_traction_has_resultant_moment_and_stretch_of_a_bar(tmp_path: Path):
 
 
 def hollow(folder: Path, cell: float) -> np.ndarray:
-    """Return the displacements inside and outside of a hollow sphere over those of Lame."""
+    """Return the displacements at the inside and outside of a hollow sphere, relative to Lame's."""
     outer, inner = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (1.0, 0.5))
     inner.invert()
     trimesh.util.concatenate([outer, inner]).export(folder / "hollow.ply")

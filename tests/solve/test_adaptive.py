@@ -45,8 +45,10 @@ def exact(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
 
 @pytest.mark.parametrize("method, order", [("implicit-euler", 1), ("bdf2", 2)])
 def test_the_local_error_of_a_swing(method: str, order: int):
-    """Of x'' = -w^2 x from exact values, as the scheme itself steps; its leading part, so that the
-    ratio tends to 1."""
+    """For x'' = -w^2 x from exact values, by the scheme's own steps.
+
+    The leading part is compared, so the ratio tends to 1.
+    """
     ratios = []
     for wt in (0.04, 0.02):
         tau = wt if order == 1 else 2 / 3 * wt
@@ -75,8 +77,10 @@ def test_the_error_reached_is_the_error_asked(
 
 
 def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact: list[Frame]):
-    """Frames 16 times as dense as the steps that 3e-2 needs: most lie within one, and are as
-    good."""
+    """Frames 16 times as dense as the steps that 3e-2 needs.
+
+    Most frames lie within a step, and are as accurate.
+    """
     dense = beam(tmp_path, step=STEP / 16, error=3e-2)
     model, frames = play(dense)
     steps = np.array([frame.steps for frame in frames])
@@ -94,8 +98,11 @@ def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact:
     "start", [{"twist": {"axis": [1, 0, 0], "degrees": 120}}, {"scale": [1.3, 1, 1]}]
 )
 def test_the_estimate_of_a_bar_two_cells_across_that_is_let_go(tmp_path: Path, start: dict):
-    """Within a factor of two. Means over neighbours remove such a motion, and the first step from
-    rest looks as if its acceleration were constant."""
+    """Within a factor of two.
+
+    Means over neighbours remove this motion. The first step from rest looks as if its acceleration
+    were constant.
+    """
     tables = {
         "start": start,
         "material": {"law": "neo-hookean", "young_modulus": 1e5, "density": 1e3},
@@ -138,8 +145,7 @@ LANDING = {
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [3e-2, pytest.param(1e-2, marks=pytest.mark.slow)])
 def test_the_error_reached_where_a_penalty_pushes_is_the_error_asked(tmp_path: Path, error: float):
-    """Within a factor of three; without what pushes add to the estimate it is 4 and 7 times what
-    was asked."""
+    """Within a factor of three. Without pushes in the estimate it is 4 and 7 times the target."""
     time = {"step": 0.02, "duration": 0.2, "integrator": "bdf2"}
     fine = block_scene(tmp_path, **LANDING, time=time | {"step": 0.02 / 64})
     exact = play(fine, "output.every=64")[1]
@@ -168,8 +174,10 @@ def test_a_fall_is_a_few_long_steps_and_an_impact_many_short_ones(tmp_path: Path
 
 @pytest.mark.parametrize("stop", [0.1, 0.115])
 def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float):
-    """At that time the nodes are still where they were led; a step of one length lets them go as it
-    begins."""
+    """At that time the nodes are still at the anchor's places.
+
+    A step of constant length lets them go at its start.
+    """
     end = {"region": {"half_space": {"point": [0.99, 0, 0], "normal": [1, 0, 0]}}}
     anchor = [end | {"path": [{"time": stop, "by": [0, 0, 0.02]}], "stop": stop}]
     time = {"step": 0.005, "duration": 0.16}

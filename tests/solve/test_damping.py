@@ -129,7 +129,7 @@ def test_viscosity_is_of_implicit_steps(tmp_path: Path, integrator: str):
 
 
 def test_a_bent_solid_that_is_let_go_creeps_back_and_gains_nothing(tmp_path: Path, caplog):
-    """Of so much viscosity that inertia is nothing; the work of what led it counts."""
+    """The viscosity is so high that inertia is negligible. The work of the anchor counts."""
     top = {"box": [[-1, -1, 0.49], [1, 1, 0.51]]}
     anchor = {"region": top, "path": [{"time": 0.05, "by": [0.1, 0, 0]}], "stop": 0.1}
     scene = viscous(

@@ -1,5 +1,4 @@
-"""What a run says of its errors: the estimate, the true error, the way of a step, and what it
-cost."""
+"""Errors that a run reports: the estimate, the true error, the path of a step, and the cost."""
 
 import json
 from pathlib import Path
@@ -56,7 +55,7 @@ SCENES = {
 def test_the_estimate_is_within_three_of_the_true_error(
     tmp_path: Path, name: str, preset: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """Where no bound is taken for it. A bound may be further above; it is never far below."""
+    """Unless a bound is reported. A bound may be far above the error and is never far below."""
     estimate = ErrorEstimate.__call__
     monkeypatch.setattr(ErrorEstimate, "__call__", lambda self, at, _=0.0: estimate(self, at))
     scene = load_scene(
@@ -177,8 +176,7 @@ def test_linear_solves_are_as_close_as_the_step_needs():
 
 @pytest.mark.slow
 def test_an_estimate_does_not_trust_a_cycle_that_smooths_nothing(tmp_path: Path):
-    """The norm of such a preconditioner does not see what it leaves: 0.59 off was said to be
-    2.6e-4."""
+    """The preconditioner's norm does not see the remaining error: 0.59 was reported as 2.6e-4."""
     held = [{"region": {"half_space": {"point": [0, 0, 0], "normal": [-1, 0, 0]}}}]
     tables = {
         "cages": {"cell_size": 0.0015}, "time": {"integrator": "static"}, "gravity": GRAVITY,

@@ -1,4 +1,4 @@
-"""Events and stages in PETSc's log, products with the Hessian, and what --measure makes of them."""
+"""Events and stages in PETSc's log, products with the Hessian, and their use by --measure."""
 
 import json
 import re
@@ -21,7 +21,7 @@ LINE = re.compile(r"^(\S.*?) +(\d+) \S+ (\S+) ")
 
 
 def logged(text: str) -> dict[str, dict[str, tuple[int, float]]]:
-    """Of each stage of -log_view its events: count and seconds."""
+    """Return for each stage of -log_view its events: count and seconds."""
     tables = text.split("\nEvent  ", 1)[1].split("Object Type", 1)[0]
     stages = {}
     for part in tables.split("--- Event Stage ")[1:]:

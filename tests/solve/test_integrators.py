@@ -1,4 +1,4 @@
-"""The order of the integrators in time, and what they lose of a free oscillation."""
+"""The order of the integrators in time, and their loss of energy in a free oscillation."""
 
 from pathlib import Path
 
@@ -53,11 +53,11 @@ def test_order_in_time(
 @pytest.mark.parametrize("steps", [4, 8, 16])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
-    """A spinless mode of frequency w loses as the scheme's own roots say: implicit Euler 1 / (1 +
-    w^2 t^2) a step.
+    """A mode of frequency w without spin loses energy as the roots of the scheme say.
 
-    One cell whose shape is blown up evenly is that mode: by the forces of its springs, all in step,
-    at small strain; w^2 from the run's own elastic energy, 1/2 w^2 sum m |u|^2."""
+    Implicit Euler loses 1 / (1 + w^2 t^2) a step. The mode is a cell that grows evenly. Its springs
+    act in phase at small strain; w^2 follows from the run's elastic energy 1/2 w^2 sum m |u|^2.
+    """
     small = 1e-5
     scene = block_scene(
         tmp_path,
@@ -77,9 +77,11 @@ def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
 
 
 def energy_left(integrator: str, wt: float, steps: int) -> float:
-    """Of x'' = -w^2 x from x = 1, x' = 0, by the scheme itself on z = x + i x' / w, whose rate is
-    -i w z; BDF2 with the history that an implicit Euler step of two thirds makes up
-    (solve.integrators.implicit.Bdf2)."""
+    """Return the energy left of x'' = -w^2 x from x = 1 and x' = 0, by the scheme itself.
+
+    The scheme acts on z = x + i x' / w, whose rate is -i w z. BDF2 begins with an implicit Euler
+    step of two thirds (solve.integrators.implicit.Bdf2).
+    """
     # matrix of t d/dt for (x, x' / w)
     matrix = wt * np.array([[0, 1], [-1, 0]])
     one = np.array([1.0, 0.0])

@@ -1,8 +1,8 @@
-"""Where a step ends: at a minimum, no saddle, and as near to it as it says; what rounding leaves is
-an error like any other.
+"""A step ends at a minimum, not at a saddle, and as near as it reports.
 
-Cases in which a run once said of a step an error of 1e-3 or less that was 0.4 to 1, and a random
-sample of hard scenes."""
+Rounding counts as an error. The cases once reported an error of at most 1e-3 that was 0.4 to 1. A
+random sample of hard scenes follows.
+"""
 
 import json
 from contextlib import suppress
@@ -101,8 +101,10 @@ def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(
 
 
 def test_a_budget_that_ends_where_no_minimum_is_near_says_so(tmp_path: Path):
-    """One published iteration leaves the crushed beam flat: nothing bounds how far it is from where
-    it will go."""
+    """A published iteration leaves the crushed beam flat.
+
+    No bound on its distance from the end exists.
+    """
     (frame,) = play(
         write_case(tmp_path, "crushed", preset="newton", max_iterations=1),
         "solver={preset='newton', max_iterations=1}",
@@ -122,9 +124,11 @@ def squashed(tmp_path: Path, share: float) -> tuple[Stepper, np.ndarray]:
 def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     tmp_path: Path, petsc_options, share: float, multigrid: bool
 ):
-    """Of a squashed beam, free, so that its rigid motions are among the modes; after a search that
-    knows nothing, of a step with Jacobi's preconditioner, which has multigrid for the search unless
-    the user asks for Jacobi's."""
+    """The lowest curvature of a squashed free beam, whose modes include its rigid motions.
+
+    The search has no known mode. The step has Jacobi's preconditioner and the search has multigrid,
+    unless the user asks for Jacobi's.
+    """
     if not multigrid:
         petsc_options(pc_type="jacobi")
     simulation, q = squashed(tmp_path, share)
@@ -166,9 +170,12 @@ def dense_hessian(stepper: Stepper) -> np.ndarray:
 @pytest.mark.parametrize("preset", ["newton", "anderson", "fast-msm"])
 @pytest.mark.parametrize("shift", [0.0, 0.1], ids=["exactly", "by rounding"])
 def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: float):
-    """Its error is 0 / 0, or rounding over 0. With the push c = k (r - 1) across each spring,
-    M^(-1) H is no less than 1 - 4 t^2 c / m by the springs one by one, which is negative here and
-    calls for a search; its lowest eigenvalue is 1 - 3 t^2 c / m."""
+    """Its error is 0 / 0, or rounding over 0.
+
+    Let c = k (r - 1) be the push across each spring. Spring by spring the bound of M^(-1) H is 1 -
+    4 t^2 c / m. It is negative here and calls for a search. The lowest eigenvalue is 1 - 3 t^2 c /
+    m.
+    """
     k, r = 2e3, 1.1
     lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
     stepper = Stepper(MPI.COMM_SELF, lattice, T, find_preset(preset), error=1e-3)
@@ -199,8 +206,7 @@ def test_a_body_at_rest_is_not_far_off_its_solution(tmp_path: Path, caplog):
 
 
 def test_rounding_is_an_error_and_no_zero(tmp_path: Path):
-    """At a goal below what doubles can do the step says what they leave; it does not go on for
-    ever, nor say 0."""
+    """A goal below the precision of doubles ends with the error by rounding, not with 0."""
     for preset in ("newton", "anderson"):
         (frame,) = play(
             write_case(tmp_path, "crushed", preset=preset),
@@ -225,14 +231,14 @@ def test_parts_that_are_as_good_as_rigid_are_refused_at_once(
 
 
 def error_study(*words: object) -> str:
-    """What scripts/error_study.py prints."""
+    """Return the output of scripts/error_study.py."""
     done = python("-W", "ignore", ROOT / "scripts" / "error_study.py", *words)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def shares_said(seed: int, number: int, *changes: str) -> list[float]:
-    """The error that each step of one of its scenes says, over the true one."""
+    """Return the reported over the true error of each step of a scene."""
     printed = error_study(
         "--seed",
         seed,
@@ -244,7 +250,7 @@ def shares_said(seed: int, number: int, *changes: str) -> list[float]:
 
 
 def test_random_hard_scenes_say_no_less_than_a_third_of_their_error():
-    """A sample of what scripts/error_study.py draws; it takes 500."""
+    """A sample of the scenes of scripts/error_study.py, which takes 500."""
     (last,) = (
         line
         for line in error_study("--scenes", 12, "--seed", 7).splitlines()
@@ -261,10 +267,12 @@ SOLID = 'material.law="neo-hookean"', "material.poisson_ratio=0.45"
 def test_what_cg_has_left_is_no_bound_across_a_kink(
     seed: int, number: int, changes: tuple[str, ...]
 ):
-    """Friction and contact make F at the next iterate another than CG has left of it: errors of 0.3
-    and 1.6 were said to be 0.08 and 0.07, 0.27 and 0.04 of them. What is said is an estimate all
-    the same: where a body springs back from an eighth of its length, of the first step's error
-    0.47, 0.76 or over 0.9, by the way of 70 iterations."""
+    """Friction and contact make F at the next iterate differ from CG's residual.
+
+    Errors of 0.3 and 1.6 were reported as 0.08 and 0.07: 0.27 and 0.04 of them. The report stays an
+    estimate. In a scene a body springs back from an eighth of its length. Its first step reports
+    0.47, 0.76 or over 0.9 of its error, by the path of 70 iterations.
+    """
     said = shares_said(seed, number, 'solver.preset="newton-multigrid"', *changes)
     assert said[0] > 1 / 3 and said[1] > 0.6 and said[2] > 0.6
 
@@ -273,11 +281,13 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(
 def test_an_error_is_no_less_than_what_its_estimate_does_not_know(
     seed: int, number: int, was: float
 ):
-    """A stiff block lands on a plane with friction (40, 54): nodes come to touch within what is
-    missing of e, where g was never looked at. A cell hangs by an edge (115): CG of few iterations
-    has nothing of its mode.
+    """Errors that the estimate could not see.
 
-    was : the least share that was said
+    A stiff block lands on a plane with friction (40, 54): nodes begin to touch within the missing
+    part of e, where g was not evaluated. A cell hangs by an edge (115): CG of few iterations has
+    nothing of its mode.
+
+    was : the least share that was reported
     """
     assert was < 1 / 3 < min(shares_said(seed, number, 'solver.preset="newton-multigrid"'))
 
@@ -292,9 +302,11 @@ def test_a_mode_that_stiffens_hides_no_lower_one():
 
 
 def test_a_preconditioner_far_from_the_hessian_bounds_no_error(tmp_path: Path):
-    """A ball that a step of fast spin has folded: the least eigenvalue of P^(-1) H that CG had come
-    to was 0.008, and what a solve of nine iterations had left was 22 times as much as that had
-    bounded: 0.18 of the error was said."""
+    """A ball that a step of fast spin has folded.
+
+    CG had found 0.008 as the least eigenvalue of P^(-1) H. The residual of a solve of nine
+    iterations was 22 times its bound, so 0.18 of the error was reported.
+    """
     trimesh.creation.icosphere(2, 0.3).export(tmp_path / "ball.ply")
     scene = {
         "mesh": {"source": "ball.ply"},

@@ -79,8 +79,11 @@ def test_modes_at_rest_are_those_of_dense_matrices(tmp_path: Path, law: str):
 def test_a_bar_on_rollers_keeps_the_rigid_motions_they_leave(
     tmp_path: Path, fix: str, ends: list, rigid: int
 ):
-    """At one end along the bar: it moves along y and z, turns about x, and is half of a free bar of
-    2 m, whose longitudinal modes are exact. Across the bar at both ends: it slides along x."""
+    """Rollers at an end along the bar, or across the bar at both ends.
+
+    The bar moves along y and z and turns about x. It is half of a free bar of 2 m, whose
+    longitudinal modes are exact. Across, it slides along x.
+    """
     pins = [pin | {"fix": list(fix)} for pin in ends]
     path = body(tmp_path, [1, 0.25, 0.25], 0.125, pin=pins)
     found, lattice = modes(path, 8), build_model(COMM, load_scene(path)).lattice
@@ -93,7 +96,7 @@ def test_a_bar_on_rollers_keeps_the_rigid_motions_they_leave(
 
 
 def test_modes_of_a_loaded_body_are_those_of_its_state(tmp_path: Path):
-    """A sagging beam, by a static scene and from its file; they differ from those at rest."""
+    """A sagging beam, by a static scene and from its file. Its modes differ from those at rest."""
     loaded = {"pin": CLAMP, "gravity": {"acceleration": [0, 0, -40.0]}}
     path = body(tmp_path, [1, 0.25, 0.25], 0.125, **loaded, time={"integrator": "static"})
     found = modes(path, 6).frequencies
@@ -124,8 +127,11 @@ def test_an_obstacle_that_is_pressed_holds_the_tip(tmp_path: Path):
 
 
 def test_a_compressed_bar_grows_sideways_to_both_sides(tmp_path: Path):
-    """Shortened by 5%, beyond Euler's load 4 pi^2 EI / L^2 of strain pi^2 / 3 (t / L)^2 =
-    3.3% of two clamps, and short of the second load, 2.05 times as much."""
+    """Shortened by 5%, beyond the first and short of the second buckling load.
+
+    Euler's load of two clamps, 4 pi^2 EI / L^2, has the strain pi^2 / 3 (t / L)^2 = 3.3%. The
+    second load is 2.05 times as much.
+    """
     shape = [1, 0.1, 0.1]
     start = {"scale": [0.95, 1, 1]}
     result_on(
@@ -155,8 +161,11 @@ def timoshenko(slenderness: float) -> float:
 
 
 def test_a_free_bar_swings_by_the_theory_of_bars(tmp_path: Path):
-    """Of 10 x 1 x 1 m. Along the bar, masses at nodes have (c / (pi h)) sin(pi h / (2 L)) exactly.
-    Bending comes to Timoshenko's bar with h^2: the error falls by 4, and its limit is 1e-4 off."""
+    """A bar of 10 x 1 x 1 m.
+
+    Along the bar, lumped masses have (c / (pi h)) sin(pi h / (2 L)) exactly. Bending converges to
+    Timoshenko's bar with h^2: the error falls by 4, and its limit is 1e-4 off.
+    """
     bending = []
     for h in (0.5, 0.25):
         found = modes(body(tmp_path, [10, 1, 1], h), 14)
@@ -172,9 +181,11 @@ def test_a_free_bar_swings_by_the_theory_of_bars(tmp_path: Path):
 
 
 def test_a_cantilever_has_the_frequencies_of_finite_elements(tmp_path: Path):
-    """Of 10 x 1 x 1 m, nu = 0.3, by quadratic elements: bending 0.0510 and 0.3060, torsion 0.4546,
-    longitudinal 0.7933 Hz; torsion is lower by 4.1% with four cells across, since cells do not
-    warp."""
+    """A bar of 10 x 1 x 1 m, nu = 0.3, against quadratic elements.
+
+    They have 0.0510 and 0.3060 Hz in bending, 0.4546 in torsion, 0.7933 along the bar. Torsion is
+    4.1% lower with four cells across, since cells do not warp.
+    """
     found = modes(body(tmp_path, [10, 1, 1], 0.25, 0.3, pin=CLAMP), 6).frequencies
     np.testing.assert_allclose(
         found[[0, 1, 2, 3, 5]], [0.0510, 0.0510, 0.3060, 0.3060, 0.7933], rtol=2e-3

@@ -1,4 +1,4 @@
-"""PETSc's options are obeyed, or refused in one line before anything is built."""
+"""PETSc's options are obeyed, or refused in a line before anything is built."""
 
 import re
 from contextlib import nullcontext
@@ -33,7 +33,7 @@ SCENE = {
 COMMAND = ("-m", "msmpetsc.cli.main", "run")
 
 
-# What is refused before anything is built
+# Refused before anything is built
 
 NO_USE = {
     "snes_rtol": ("1e-3", "solver.error"),
@@ -86,7 +86,7 @@ LINES |= dict.fromkeys(
 
 @pytest.mark.parametrize("line", LINES)
 def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
-    """For rank 0 alone reads it, and the others would wait for ever."""
+    """Rank 0 alone reads the file, and the remaining ranks would wait for ever."""
     file = tmp_path / "options"
     file.write_text(f"-pc_type jacobi\n{line}\n")
     with nullcontext() if LINES[line] else pytest.raises(InputError, match="line 2"):

@@ -93,7 +93,7 @@ def attempt(folder: Path, words: list[str]) -> tuple[int | None, str]:
 
 
 def fault_of(status: int | None, said: str) -> str:
-    """Return why an end is none that a user should meet; "" for a good one."""
+    """Return why a user should not meet this end; an empty string for a good end."""
     errors = [line for line in said.splitlines() if line.startswith("msmpetsc: error:")]
     if status not in (0, 2, 3) or len(errors) != (status != 0):
         return f"status {status}, {len(errors)} lines of error"

@@ -1,5 +1,4 @@
-"""Small cases that are hard on a solver (scenes/studies/stability.toml): what comes of each, good
-or bad, and why."""
+"""Small cases that are hard on a solver (scenes/studies/stability.toml), with their ends."""
 
 import tomllib
 from dataclasses import dataclass
@@ -154,8 +153,10 @@ def test_it_comes_back_to_its_rest_shape(name: str):
 
 
 def test_a_micrometre_of_rubber_comes_back():
-    """Where CG's way climbs PETSc calls it a minimum in such units; the projected Hessian takes
-    over all the same."""
+    """In these units PETSc takes a climbing path of CG for a minimum.
+
+    The projected Hessian takes over.
+    """
     played = play("tiny", "material.law=neo-hookean", "material.poisson_ratio=0.49")
     assert not played.words and played.shape_error() < 1e-4
 
@@ -184,9 +185,11 @@ def test_it_hangs_at_rest(name: str):
 
 @pytest.mark.parametrize("name", ["column", "column, solid"])
 def test_a_column_bows_aside(name: str):
-    """The middle goes aside by w, by itself: all of the way that is not squeezed would be pi^2 w^2
-    / 4 L. With springs alone it twists as well where it folds, 15% lower in energy than the hinge
-    in one plane that it was, with w = 0.20."""
+    """The middle moves aside by w, by itself.
+
+    If the length were kept, it would be pi^2 w^2 / 4 L. Springs alone twist at the fold, too. That
+    is 15% lower in energy than the earlier hinge in a plane, with w = 0.20.
+    """
     played = play(name)
     middle = np.abs(played.lattice.nodes[:, 0] - 0.5) < 0.01
     assert 0.15 < np.linalg.norm(played.moved[middle].mean(axis=0)[1:]) < 0.41
@@ -212,7 +215,7 @@ def test_parts_of_the_greatest_contrast_are_solved():
     )
 
 
-# ---- what springs cannot see
+# ---- faults that springs cannot see
 
 
 def test_a_flat_body_leaves_its_plane():
@@ -252,8 +255,10 @@ def test_faces_led_through_each_other_leave_a_body_turned_over():
 
 
 def test_springs_pass_through_no_length_exactly():
-    """Those upright in the half that is led, 9 x 17 of them; let go, the half is turned over, but
-    for a crease."""
+    """The 9 x 17 upright springs in the half that is led.
+
+    When it is let go, the half is turned over, except for a crease.
+    """
     played = play("through, sheet")
     lattice, flat = played.lattice, played.frames[8].position
     length = np.linalg.norm(flat[lattice.springs[:, 0]] - flat[lattice.springs[:, 1]], axis=1)
@@ -312,7 +317,7 @@ def test_other_presets_bring_it_back_too(method: str, name: str):
 
 @pytest.mark.parametrize(("method", "name", "words"), DIVERGES)
 def test_other_presets_fail_and_say_so(method: str, name: str, words: str):
-    """In one line, with the frame and what to try."""
+    """In a line, with the frame and a remedy."""
     told = play(name, *OTHERS[method]).words
     assert (
         told.startswith("frame ")

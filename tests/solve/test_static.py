@@ -1,5 +1,4 @@
-"""Statics: equilibria against closed forms and against motions that have come to rest, what is
-refused, load steps."""
+"""Statics: equilibria against closed forms and against motions at rest; refusals; load steps."""
 
 from pathlib import Path
 
@@ -68,7 +67,7 @@ def test_a_hanging_bar(tmp_path: Path):
 
 
 def test_states_under_forces_that_come_and_go(tmp_path: Path):
-    """A state for each time; those under the same loads are the same, and cost nothing."""
+    """A state for each time. States under the same loads are the same and cost nothing."""
     states = {"step": 1.0, "duration": 6.0, "integrator": "static"}
     model, frames = play(column(tmp_path, states, pin=[{"region": BOTTOM}], force=SWITCHED))
     there, back, rest = (moved(model, frames[n]) for n in (1, 3, 5))
@@ -148,7 +147,7 @@ def test_a_column_buckles(tmp_path: Path, sideways: float, share: float, buckles
 def test_a_load_comes_on_in_steps_and_ends_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Brought on at once or in parts: the equilibrium is but one."""
+    """Applied at once or in load steps, the load has the same equilibrium."""
     _, at_once = play(column(tmp_path, **BEAM))
     monkeypatch.setattr(static, "Halving", lambda: Halving(3))
     _, in_parts = play(column(tmp_path, **BEAM))

@@ -1,4 +1,4 @@
-"""One step: against closed forms, against dense linear algebra, and preset against preset."""
+"""A single step: against closed forms, against dense linear algebra, and preset against preset."""
 
 from dataclasses import replace
 
@@ -76,8 +76,10 @@ def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("error", [1e-2, 1e-4])
 def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
-    """The stated error is the true one of the step, |x - x*|_M / |x* - y|_M, within a factor of 3
-    where it was estimated; where the bound did already, it may be further below."""
+    """The stated error of a step is |x - x*|_M / |x* - y|_M.
+
+    An estimate is within a factor of 3. A bound may be farther above the error.
+    """
     lattice = beam()
     q = swing("newton", 3, error=1e-12)
     q, before = q[-1].position, q[-2].position

@@ -46,8 +46,7 @@ def test_what_an_even_flight_saves_is_spent_on_the_impact_after_it():
 
 
 def test_no_moment_takes_all_the_steps():
-    """One a million times as hard, when all credit is spent, takes twenty times the steps of all
-    others at most."""
+    """A moment a million times as hard takes at most twenty times the steps of the rest."""
     account = control(2, 1e-2)
     levels = march(account, lambda time: 1e6 if 2.0 <= time <= 2.1 else 1.0)
     assert len(levels) < 20 * len(march(control(2, 1e-2), lambda _: 1.0))

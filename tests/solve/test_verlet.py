@@ -69,8 +69,11 @@ def shaken(lattice: Lattice, size: float) -> np.ndarray:
 
 
 def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
-    """x_n = cos(w n dt), v_n = -sin(w dt) / dt sin(w n dt) with w = 2 / dt asin(omega dt / 2),
-    omega^2 = k / m."""
+    """The dispersion of the leapfrog itself.
+
+    x_n = cos(w n dt) and v_n = -sin(w dt) / dt sin(w n dt), with w = 2 / dt asin(omega dt / 2).
+    Here omega^2 = k / m.
+    """
     m, k, r, size, count = 0.3, 400.0, 1.0, 0.2, 4
     dt = T / count
     w = 2 / dt * np.arcsin(np.sqrt(k / m) * dt / 2)
@@ -82,8 +85,10 @@ def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
 
 
 def test_free_flight_keeps_momentum_and_angular_momentum():
-    """The forces are central, and a kick changes v at one q: the leapfrog keeps r x m v, implicit
-    Euler does not."""
+    """The forces are central, and a kick changes v at constant q.
+
+    So the leapfrog keeps r x m v, which implicit Euler does not.
+    """
     lattice = cube()
     v = np.cross([0, 2, 9], lattice.nodes) + np.random.default_rng(1).normal(
         size=lattice.nodes.shape
@@ -139,7 +144,7 @@ def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_p
 
 
 def greatest(lattice: Lattice, q: np.ndarray, projected: bool = False) -> float:
-    """Of M^(-1) (Hessian of E) over the free nodes, by numpy."""
+    """Return the greatest eigenvalue of M^(-1) (Hessian of E) over the free nodes, by numpy."""
     free = np.repeat(~lattice.pinned, 3)
     H = dense_hessian(Elasticity(lattice), q, projected)[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.repeat(lattice.mass, 3)[free])
@@ -193,8 +198,11 @@ def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Pa
 
 
 def test_a_body_that_folds_is_not_heated(tmp_path: Path, monkeypatch):
-    """A soft beam that is stretched and let go folds over itself: springs of nearly no length turn
-    about in a substep at the limit. It gained 43% of its energy in one step of 0.1 s."""
+    """A soft beam that is stretched and let go folds over itself.
+
+    Springs of nearly no length turn about in a substep at the limit. The beam gained 43% of its
+    energy in a step of 0.1 s.
+    """
     scene = block_scene(
         tmp_path, sides=CELL * np.array([8, 2, 2]), time={"step": 0.1, "duration": 1.0} | EXPLICIT,
         start={"scale": [2, 1, 1]},

@@ -1,5 +1,4 @@
-"""Frames by multigrid are those by Jacobi's preconditioner, to the error that was asked for,
-whatever a scene has."""
+"""Frames by multigrid agree with frames by Jacobi's preconditioner to the error asked for."""
 
 from pathlib import Path
 

@@ -1,6 +1,8 @@
-"""The cycle is symmetric and positive definite, and no more than the inverse of what it is built
-from; CG on the true Hessian takes few iterations with it, whatever the time step, and no more on a
-finer lattice."""
+"""The cycle is symmetric, positive definite, and at most the inverse of its own Hessian.
+
+CG on the true Hessian takes few iterations with it at any time step, and no more on a finer
+lattice.
+"""
 
 import numpy as np
 import pytest
@@ -18,8 +20,11 @@ LOOSE = {"two bodies", "many bodies"}
 def check(
     case: Case, least: float, beyond: float = BEYOND, moves: np.ndarray | None = None
 ) -> None:
-    """Symmetric, B H with eigenvalues between ``least`` and 1: each part of B moves along a
-    descent, none too far. Of a lattice with rollers, the part of the components that move."""
+    """Check that B is symmetric and B H has eigenvalues between ``least`` and 1.
+
+    Each part of B moves along a descent, not too far. If the lattice has rollers, only its moving
+    components count.
+    """
     b, h = case.cycle(), case.hessian()
     if moves is not None:
         b, h = b[moves][:, moves], h[moves][:, moves]
@@ -43,8 +48,10 @@ def test_cycles(name: str, shape: str, coarsest: int):
 @pytest.mark.parametrize("coarsest", [pytest.param(800, marks=pytest.mark.slow), 10])
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "a cell"])
 def test_cycles_of_solids_with_contact_and_pins(name: str, coarsest: int):
-    """Of cells pressed to a fifth the cycle has less: their curvature is along few directions that
-    it cannot smooth."""
+    """For cells pressed to a fifth the cycle is weaker.
+
+    Their curvature is along few directions, which the cycle cannot smooth.
+    """
     lattice = build(COMM, LATTICES[name], poisson=0.25, pins=True)
     with hierarchy(COMM, lattice, SHAPES["crushed"], contact=True, coarsest=coarsest) as case:
         check(case, 0.002)
@@ -54,8 +61,7 @@ def test_cycles_of_solids_with_contact_and_pins(name: str, coarsest: int):
 @pytest.mark.parametrize("shape", ["twisted", "crushed"])
 @pytest.mark.parametrize("name", LATTICES)
 def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):
-    """A light body that nothing holds moves as a whole by what the raised diagonals lets it, a
-    1e10th."""
+    """A light free body moves as a whole as far as the raised diagonal allows, a 1e10th."""
     pinned = heavier(build(COMM, LATTICES[name], pins=True), mass)
     with hierarchy(COMM, pinned, SHAPES[shape], coarsest=10) as case:
         loose = name in LOOSE and mass < 1
@@ -66,7 +72,7 @@ def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):
 @pytest.mark.parametrize("pins", [False, True])
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "rod"])
 def test_cycles_of_two_materials(name: str, contrast: float, pins: bool):
-    """One precision serves both: what is 1e6 times softer has a digit or so of it left."""
+    """A single precision serves both: a part 1e6 times softer keeps about a digit."""
     with hierarchy(
         COMM, build(COMM, LATTICES[name], contrast=contrast, pins=pins), SHAPES["twisted"]
     ) as case:
@@ -88,8 +94,11 @@ def test_one_free_node():
 @pytest.mark.parametrize("shape", ["rest", "twisted"])
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet"])
 def test_cycles_of_bodies_on_rollers(name: str, shape: str):
-    """Planes of symmetry at both ends of an axis, and all nodes between two walls: no worse than
-    without, but for what springs to the ground leave of coarse components, 1 / GROUND each."""
+    """Planes of symmetry at both ends of an axis, and all nodes between two walls.
+
+    No worse than without, except for 1 / GROUND of each coarse component, which the springs to the
+    ground leave.
+    """
     lattice = build(COMM, LATTICES[name])
     low, high = lattice.nodes.min(axis=0) + 0.01, lattice.nodes.max(axis=0) - 0.01
     x, y, _ = lattice.nodes.T
@@ -103,8 +112,10 @@ def test_cycles_of_bodies_on_rollers(name: str, shape: str):
 @pytest.mark.parametrize("density", [1e-3, 1e3])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_sheet_with_its_underside_held(density: float, shape: str):
-    """Its free nodes lie halfway between layers of coarse ones: P^T H P is singular, but for the
-    raised diagonal."""
+    """Its free nodes lie halfway between layers of coarse nodes.
+
+    So P^T H P is singular without the raised diagonal.
+    """
     lattice = build(COMM, LATTICES["thin sheet"], density=density)
     with hierarchy(
         COMM, lattice.pin(lattice.nodes[:, 2] < 3.01), SHAPES[shape], coarsest=10

@@ -1,4 +1,4 @@
-"""PETSc's options of the cycle: obeyed, or refused in one line."""
+"""PETSc's options of the cycle: obeyed, or refused in a line."""
 
 from pathlib import Path
 

@@ -35,7 +35,7 @@ def raised(matrix: np.ndarray, case: Case) -> np.ndarray:
 
 
 def assert_close(found: np.ndarray, expected: np.ndarray, accuracy: float = 1e-12) -> None:
-    """Beside what the nodes have themselves: a soft part stands by a stiff one."""
+    """Assert equality relative to the nodes' own entries, since a soft part joins a stiff part."""
     size = np.sqrt(expected.diagonal())
     np.testing.assert_allclose(
         found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=accuracy
@@ -104,7 +104,7 @@ def test_levels_of_light_and_heavy_bodies(name: str, mass: float):
 
 
 def test_a_new_hierarchy_takes_nothing_of_the_old_one():
-    """Positions, contact, and what stood in the matrices."""
+    """Neither positions, nor contact, nor old entries of the matrices."""
     with hierarchy(
         COMM,
         build(COMM, LATTICES["limbs"], pins=True),

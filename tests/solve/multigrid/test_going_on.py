@@ -78,8 +78,7 @@ QUICK = {"solid, pressed", "switched, pressed", "fallback"}
 def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(
     tmp_path: Path, case: str, monkeypatch
 ):
-    """Of runs that build hierarchies in some steps and keep them in others, or change over in the
-    midst of a step."""
+    """Runs that build hierarchies in some steps only, or change over within a step."""
     built, chosen, build, choose = [], [], LatticePreconditioner._build, StepPreconditioner._choose
     monkeypatch.setattr(
         LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1]

@@ -62,8 +62,7 @@ def test_the_smoother_inverts_blocks_and_contact_together(surface: SurfaceHessia
 def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
     surface: SurfaceHessian,
 ):
-    """Stiff are those that give way less than their nodes let them, of the pairs here the last
-    one's."""
+    """A point is stiff if it gives way less than its nodes allow: here a point of the last pair."""
     compliance = np.full(NODES, 1e-8)
     stiff, others = surface.split(compliance, POINTS)
     assert stiff is not None and others is not None and stiff.points.shape == (6, 6)

@@ -1,4 +1,4 @@
-"""What several test files share: real MPI runs, and a small closed body."""
+"""Parts that several test files share: real MPI runs, and a small closed body."""
 
 import json
 import os

@@ -8,7 +8,7 @@ WORKER = WORKERS / "comm_worker.py"
 
 @pytest.mark.parametrize("ranks", [1, 3])
 def test_against_plain_arrays(ranks):
-    # with -m mpi4py a failure on one rank ends all ranks
+    # with -m mpi4py a failure on any rank ends all ranks
     done = run(ranks, "-m", "mpi4py", WORKER)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("passed") == ranks

@@ -1,5 +1,7 @@
-"""Results are read with the core dependencies alone; a package that is missing is named in one line
-with its extra."""
+"""Results are read with the core dependencies alone.
+
+An error names the missing package and its extra in a line.
+"""
 
 import os
 import re

@@ -34,7 +34,7 @@ NEVER = {
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Dotted names of all imports, those inside functions and of TYPE_CHECKING included."""
+    """Yield the dotted names of all imports, also within functions and TYPE_CHECKING."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -44,7 +44,10 @@ def imported(tree: ast.AST) -> Iterator[str]:
 
 
 def violations(layer: str, source: str) -> list[str]:
-    """What a file of this layer must not do; layer: file or folder name within the package."""
+    """Return the forbidden imports and prints of a file.
+
+    layer : file or folder name within the package
+    """
     tree, found = ast.parse(source), []
     for name in imported(tree):
         top, _, rest = name.partition(".")

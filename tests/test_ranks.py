@@ -1,5 +1,7 @@
-"""Scenes of all kinds on two ranks as on one: the same lattice, and the same frames to the error of
-their steps."""
+"""Scenes of all kinds on two ranks as on one.
+
+The lattice is the same. Frames agree to the error of their steps.
+"""
 
 from typing import Any, NamedTuple
 
@@ -119,7 +121,7 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[h5py.File]]:
-    """Of each scene, on one rank and on two; all of them in one process a rank."""
+    """Return the results of each scene on one rank and on two, all made in a process a rank."""
     folder, found = tmp_path_factory.mktemp("ranks"), {name: [] for name in CASES}
     for ranks in (1, 2):
         files = [folder / f"{name} {ranks}.h5" for name in CASES]

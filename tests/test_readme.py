@@ -139,7 +139,7 @@ def test_links_and_files_exist(path: Path):
 
 @cache
 def help_of(script: Path) -> str:
-    """Return what a script says of itself."""
+    """Return the help text of a script."""
     return python(script, "--help").stdout
 
 
@@ -175,7 +175,7 @@ def carried_out(command: str, folder: Path) -> subprocess.CompletedProcess:
 
 
 def carry_out(path: Path, folder: Path) -> None:
-    """Run the commands of a README, one after another."""
+    """Run the commands of a README in turn."""
     for command in commands(path):
         if "msmpetsc " not in command or any(f" {word}" in command for word in LONG):
             continue
@@ -185,7 +185,7 @@ def carry_out(path: Path, folder: Path) -> None:
 
 
 def write_own_scene(folder: Path) -> None:
-    """Write the scene of the page on own meshes, and its body, whose one end is the group "tip"."""
+    """Write the scene of the page on own meshes, and its body with an end as the group tip."""
     (folder / "scene.toml").write_text(blocks(START / "own-mesh.md", "toml")[0])
     box = trimesh.creation.box(bounds=[[0, 0, 0], [1, 0.5, 0.5]])
     at_end = (box.vertices[box.faces, 0] == 1).all(axis=1)
@@ -332,7 +332,10 @@ def test_underscores_of_symbols_become_subscripts():
 
 
 def test_the_tests_of_cases_are_there():
-    """Those that its table names, of which it gives how they begin or all but `test_`."""
+    """Each test that the table names exists.
+
+    The table gives the start of a name, or all but ``test_``.
+    """
     named = re.findall(
         r"\| `([\w/]+\.py)`: (.*) \|$", (ROOT / "tests" / "cases" / "README.md").read_text(), re.M
     )

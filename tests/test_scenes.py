@@ -1,7 +1,7 @@
-"""Every scene of the paper, and those that touch, at about 1,000 cells: what the figure shows, in
-numbers from the result file alone.
+"""Every scene of the paper, and scenes that touch, at about 1,000 cells.
 
-Bounds, not values: a coarse lattice is stiffer than the full one, its thin limbs thicker.
+The content of the figure is asserted by numbers from the result file alone. They are bounds, not
+values: a coarse lattice is stiffer than the full lattice, its thin limbs thicker.
 """
 
 import tomllib
@@ -323,7 +323,7 @@ def test_the_bunnys_ears_move_on_while_its_body_has_stopped(result):
     assert ears[turned + 1] < ears[turned] and feet[turned + 1] > feet[turned]
 
 
-# ---- What touches
+# ---- scenes that touch
 
 
 @pytest.mark.slow

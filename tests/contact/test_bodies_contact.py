@@ -58,7 +58,7 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
 
 
 def pile(folder: Path, meshes: list[str], gap: float) -> Path:
-    """Scene of a block on another, which is pinned, with such a distance [m] between the two."""
+    """Return the scene of a block on a pinned block, with a distance [m] between them."""
     pin = [{"region": {"box": [[0, 0, 0], [1, 1, 0.1]], "relative": True}}]
     bodies = [body(meshes[0], [0, 0, 0], pin=pin), body(meshes[1], [0, 0, SIDE + gap])]
     time, gravity = {"step": 0.01, "duration": 0.1}, {"acceleration": [0, 0, -G]}
@@ -77,8 +77,7 @@ def test_a_block_that_touches_another_at_rest_lies_on_it(folder: Path, meshes: l
 
 
 def test_cubes_side_by_side_in_the_same_plane_of_the_grid_stay_where_they_are(folder: Path):
-    """Without a distance given: the gap made must be more than what a coordinate may be off a
-    plane."""
+    """Without a given distance, the gap must exceed the rounding of a coordinate to a plane."""
     bodies = [body("block", [number * SIDE, 0, 0]) for number in range(2)]
     tables = {"time": {"step": 0.01, "duration": 0.03}, "gravity": {"acceleration": [0, 0, 0]}}
     model, frames = play(write(folder, "side_by_side", body=bodies, self_contact={}, **tables))
@@ -94,7 +93,7 @@ def test_bodies_that_overlap_at_rest_are_named(folder: Path):
 
 
 def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:
-    """Scene of a ball that falls from such a height [m] on a block that lies on the ground."""
+    """Return the scene of a ball that falls from a height [m] on a block on the ground."""
     bodies = [body("block", [0, 0, 0]), body("ball", [0.02, 0.01, SIDE + height])]
     # Springs come to rest sooner than a solid.
     tables = {
@@ -126,8 +125,10 @@ def crossings(model: Model, frames: list[Frame]) -> int:
 def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(
     turned: np.ndarray, bent: float
 ):
-    """Boxes around ways are those without what is linear in them, and yet hold what comes near by
-    that alone."""
+    """Boxes around paths leave out the linear part of the motion.
+
+    They still hold the pairs that come near by the linear part alone.
+    """
     rng = np.random.default_rng(0)
     plates = [trimesh.creation.box([SIDE, SIDE, 0.01]).subdivide().subdivide() for _ in range(2)]
     plates[1].apply_translation([0.003, 0.005, 0.01 + 1.15 * 0.02])
@@ -186,8 +187,7 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
 
 @pytest.fixture
 def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[str]]:
-    """Of each solve of each step of 10 ms, whether the surface was taken to touch nothing, or only
-    what is known."""
+    """Return for each solve of each step of 10 ms the contacts that it used: none, known or all."""
     found: dict[int, list[str]] = {}
     problem = ContactFaces.problem
 
@@ -252,7 +252,7 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
 def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(
     folder: Path, solves: dict[int, list[str]]
 ):
-    """Where it ends nothing touches: the way there tells."""
+    """Nothing touches at the end of the step; the path there reveals the contact."""
     bodies = [
         body("block", [0, 0, 0]),
         body("ball", [0.02, 0.01, SIDE + 0.02], start={"velocity": [0, 0, -50.0]}),

@@ -120,8 +120,10 @@ def test_the_blocks_are_the_slope_of_the_gradient(penalties: list[Penalty]):
 
 
 def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
-    """The energy 1/2 k d^2 has the block k (n n^T - d / r (I - n n^T)), d = R - r, of which the
-    first part is kept."""
+    """The energy 1/2 k d^2 with d = R - r has the block k (n n^T - d / r (I - n n^T)).
+
+    Our block is the first part alone.
+    """
     contact, q, v = pressed(BALLS["sphere"])
     step = 1e-7
     slope = (gradient(contact, q + step * v) - gradient(contact, q - step * v)) / (2 * step)
@@ -173,8 +175,10 @@ def test_the_parabola_of_frictions_secant_nowhere_lies_below_its_potential(name:
 
 @pytest.mark.parametrize("name", ["plane, sticking", "plane, slipping", "box, slipping"])
 def test_duals_of_friction_follow_its_forces(name: str):
-    """Those of a step from agreement are off by its square, those of no step are the forces, and
-    agreement is the true Hessian; whatever they are, no block is negative."""
+    """Duals after a step are off by the square of the step. Without a step they are the forces.
+
+    At agreement the block is the true Hessian. No duals make a block negative.
+    """
     contact, q, v = pressed(CASES[name])
     friction = contact.states[0].friction
     forces, off = friction.force(q) / friction.limit[:, None], []
@@ -227,8 +231,11 @@ def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
 
 
 def test_friction_of_a_step_of_bdf2_goes_by_the_velocity_and_the_depth_that_it_ends_with():
-    """0.1 and 0.15 deep, a node will be 0.2 deep; one from outside no more than 0.3; one on its way
-    out from 0.4 not at all. The plane goes (0.05, 0.02) a step."""
+    """The depth at the end of a step, extrapolated.
+
+    A node at depths of 0.1 and 0.15 will be 0.2 deep. A node from outside will be at most 0.3 deep.
+    A node on its way out from 0.4 will be out. The plane moves by (0.05, 0.02) a step.
+    """
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)
     before = np.array([[0.0, 0, -0.1], [0, 0, 0.9], [0, 0, -0.4]])
     start = np.array([[0.03, 0, -0.15], [0.03, 0, -0.15], [0.03, 0, -0.15]])
@@ -271,8 +278,10 @@ def test_a_block_at_rest_sinks_until_the_ground_carries_it(tmp_path: Path, stiff
 def test_a_stiff_die_comes_to_rest_though_contact_is_stiffer_than_the_corners_that_touch(
     tmp_path: Path,
 ):
-    """What F has of rounding is that of contact: the lightest corners weigh less than a millionth
-    of a cell."""
+    """The rounding of F is the rounding of contact.
+
+    The lightest corners weigh less than a millionth of a cell.
+    """
     die = trimesh.creation.box([0.2] * 3)
     die.apply_transform(
         trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3))
@@ -377,11 +386,14 @@ PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0,
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:
-    """How far [m] X + mu Z is off, X and Z how far the mass centre went, of a block that slides at
-    2 m/s under a force.
+    """Return the error [m] of X + mu Z for a block that slides at 2 m/s under a force.
 
-    M (x'' + mu z'') = mu (-N + N - F) = -mu F, whatever N is from moment to moment: X + mu Z = v T
-    - mu / M iint F. The ground is soft enough for steps to follow how the block sinks in."""
+    X and Z are the displacements of the centre of mass. For any N
+
+        M (x'' + mu z'') = mu (-N + N - F) = -mu F,        X + mu Z = v T - mu / M iint F.
+
+    The ground is soft enough for the steps to resolve how the block sinks in.
+    """
     mu, time = 0.2, {"step": t, "duration": 0.2, "integrator": "bdf2"}
     ground = GROUND | {"friction": mu, "stiffness": 2e3}
     force = [

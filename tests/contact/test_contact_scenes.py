@@ -1,7 +1,6 @@
-"""Scenes of bodies that touch, small: a block on a slope, a stack, a chain, a twisted bar, a ball
-pressed into a hole.
+"""Small scenes of bodies that touch: a slope, a stack, a chain, a twisted bar, a pressed ball.
 
-Nothing crosses, what should hold does, and what slides does so as Coulomb says.
+Nothing crosses, resting bodies hold, and sliding bodies slide as Coulomb's law says.
 """
 
 from pathlib import Path
@@ -42,10 +41,10 @@ def box(folder: Path, name: str, sides: list[float], splits: int = 2) -> dict[st
 
 
 def crossings(model: Model, frames: list[Frame], *solids: trimesh.Trimesh) -> int:
-    """Return how many edges cross triangles, of bodies and solids that do not move, over all
-    frames.
+    """Return how many edges cross triangles, of bodies and solids at rest, over all frames.
 
-    But for the first: at rest flat faces have triangles in one plane, which cross by rounding.
+    The first frame is left out: flat faces at rest have triangles in a common plane, which cross by
+    rounding.
     """
     assert model.surface is not None
     triangles, first = [model.surface.triangles], len(model.surface.points)
@@ -125,7 +124,7 @@ def test_bodies_side_by_side_are_not_thrown_apart_without_a_distance_given(tmp_p
 def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides_above_it(
     tmp_path, beyond: float
 ):
-    """On one of 1.2 m it crept at 6 to 9 mm/s, and had slid 2.3 mm before that."""
+    """On a slab of 1.2 m it crept at 6 to 9 mm/s, and had slid 2.3 mm before."""
     angle = np.arctan(0.5) + np.radians(beyond)
     slab = box(tmp_path, "slab", [0.4, 0.2, 0.04]) | {"base": [0.1, 0, -0.04]}
     block = box(tmp_path, "block", [SIDE] * 3) | {"base": [0, 0, 0.001]}
@@ -181,8 +180,10 @@ def stack(folder: Path, duration: float, error: float) -> tuple[Model, list[Fram
     ],
 )
 def test_a_stack_of_five_cubes_stands(tmp_path, duration: float, farthest: float, error: float):
-    """It settles, and sways for two seconds. One of 0.2 MPa is as high as buckles under its own
-    weight."""
+    """It settles, and sways for two seconds.
+
+    At 0.2 MPa the stack is as high as buckles by its own weight.
+    """
     model, frames, places = stack(tmp_path, duration, error)
     assert crossings(model, frames) == 0
     drift = np.linalg.norm((places[-1] - places[round(0.3 * len(frames))])[:, :2], axis=1)

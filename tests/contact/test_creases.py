@@ -1,5 +1,7 @@
-"""A surface that meets itself in a crease, where its parts are nearer at rest than its distance:
-they do not push at rest, they do not cross, and what is told of them is true."""
+"""A surface that meets itself in a crease, with parts nearer at rest than its distance.
+
+The parts do not push at rest, do not cross, and are reported truly.
+"""
 
 from pathlib import Path
 

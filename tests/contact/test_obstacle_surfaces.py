@@ -1,5 +1,7 @@
-"""Obstacles whose surface meets that of the bodies: nothing crosses at rest, pressed, turned, on
-one rank and two."""
+"""Obstacles whose surface meets the surfaces of bodies.
+
+Nothing crosses at rest, pressed or turned, on a single rank and on two.
+"""
 
 from pathlib import Path
 
@@ -36,7 +38,7 @@ ERROR = {"preset": "newton", "error": 1e-4}
 
 
 def fine_block(folder: Path, **tables) -> Path:
-    """A block whose surface has edges of 3 to 6 cm, about those of a cell."""
+    """Return a block whose surface has edges of 3 to 6 cm, about the size of a cell."""
     scene = block_scene(folder, **{"solver": ERROR, "material": SOLID, "output": {}} | tables)
     block = trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide_to_size(0.1)
     block.export(folder / "scene.ply")
@@ -84,8 +86,7 @@ def test_a_block_comes_to_rest_on_a_floor_that_carries_its_weight(tmp_path: Path
 
 
 def test_a_plate_presses_a_block_that_is_held_at_its_foot(tmp_path: Path):
-    """Its step is many times the distance from which it pushes: what is near it is carried
-    along."""
+    """A step moves the plate by many times its pushing distance and carries near nodes along."""
     time = {"step": 0.05, "duration": 0.6}
     model, frames = play(fine_block(tmp_path, time=time, obstacle=[PLATE], pin=FOOT))
     assert not any(crossed(model, frame) for frame in frames)
@@ -211,8 +212,7 @@ def test_friction_of_the_surface_is_of_second_order_with_bdf2(tmp_path: Path):
 
 
 def test_ranks_agree(tmp_path: Path):
-    """For six steps: the seventh has two minima, of 5 and of 7 contacts, and one rank or two come
-    to either."""
+    """Six steps: the seventh has two minima, with 5 and 7 contacts, and ranks may find either."""
     tables = {"self_contact": {"friction": 0.5}, "solver": ERROR | {"error": 1e-8}}
     ball = {
         "shape": "sphere",

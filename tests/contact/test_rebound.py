@@ -1,5 +1,7 @@
-"""What strikes an obstacle and leaps off again gains no energy, by its energy budget and by the sum
-of its frames."""
+"""A body that strikes an obstacle and leaps off gains no energy.
+
+Its energy budget and the sum of its frames show it.
+"""
 
 from pathlib import Path
 
@@ -66,7 +68,7 @@ def test_an_exchange_gains_and_a_reflection_does_not(tmp_path: Path):
 
 
 def test_nodes_that_reach_the_ground_stop_together(tmp_path: Path, monkeypatch):
-    """One by one they take two to three times the iterations."""
+    """Node by node, they take two to three times the iterations."""
 
     def iterations() -> int:
         fall = FALL | {"time": {"step": 0.01, "duration": 0.15}}

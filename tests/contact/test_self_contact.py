@@ -1,5 +1,7 @@
-"""A surface that meets itself: derivatives, momentum, no crossing on one rank and three, resumed
-runs, meshes that cut themselves, what is refused."""
+"""A surface that meets itself: derivatives, momentum, no crossing on one rank and three.
+
+Also resumed runs, meshes that cut themselves, and refusals.
+"""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,8 +47,7 @@ def closed(model: Model) -> np.ndarray:
 
 
 def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray]:
-    """The term of a step in which the left arm slides along the right one by so much [m], and where
-    it ends."""
+    """Return the contact of a step in which the left arm slides by a length [m], and its end."""
     q = closed(model)
     assert model.collision is not None
     end = q.copy()
@@ -61,7 +62,7 @@ def test_gradient_is_that_of_the_energy(model, slid: float):
     gradient = np.zeros_like(q)
     term.add_gradient(q, gradient)
     direction = np.random.default_rng(0).normal(size=q.shape)
-    # larger moves than those whose change of energy is computed from the forces
+    # larger moves than moves whose change of energy is computed from the forces
     for step in (
         1e-6,
         1e-7,
@@ -210,7 +211,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_pa
 
 
 def crossing_boxes(folder: Path, deep: float, subdivisions: int) -> Path:
-    """Scene of two bars, one of which dips so deep [m] into the other."""
+    """Return the scene of two bars, of which the first dips into the second by a depth [m]."""
     first = trimesh.creation.box([0.5, 0.25, 0.25])
     second = trimesh.creation.box([0.125, 0.125, 0.5])
     second.apply_translation([0.03, 0.02, 0.125 + 0.25 - deep])
@@ -371,8 +372,10 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
 
 @pytest.mark.slow
 def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Path, caplog):
-    """What bulges between passes: the upper one sinks further. Split as finely as the cells they
-    touch all over."""
+    """A bulge between the passes lets the upper block sink further.
+
+    Split as finely as the cells, they touch all over.
+    """
     sunk = []
     trimesh.creation.box(bounds=[[-0.5, -0.5, 0], [0.5, 0.5, 1]]).export(tmp_path / "cube.ply")
     below = {"region": {"box": [[-1, -1, -1], [1, 1, 1e-3]]}}

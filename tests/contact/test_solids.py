@@ -126,7 +126,7 @@ RESPONSES = [
 def test_a_function_is_the_sphere_that_it_describes(
     tmp_path: Path, response: dict, integrator: str
 ):
-    """The block meets it off its top and slips to one side."""
+    """The block meets the sphere off its top and slips to one side."""
     positions = []
     time = {"time": {**FALLING["time"], "integrator": integrator}}
     for obstacle in (BALL, OWN):
@@ -212,8 +212,7 @@ def test_a_large_sphere_is_a_plane(tmp_path: Path, integrator: str, response: di
 
 
 def test_a_node_is_turned_back_along_the_radius():
-    """What of its velocity goes to the centre becomes -e times itself; what goes along the sphere
-    stays."""
+    """The velocity towards the centre is multiplied by -e. The velocity along the sphere stays."""
     ball, q = (
         sphere([1.0, 2.0, 3.0], 0.5),
         np.array([[1.0, 2.3, 3.3], [1.0, 2.5, 3.5], [1.0, 2.2, 3.1]]),

@@ -129,7 +129,7 @@ def test_no_node_gets_past_a_thin_plate(
     speed: float,
     moving: bool,
 ):
-    """At 100 m/s it is folded over within a step; what it then gains is told."""
+    """At 100 m/s the plate is folded over within a step. Its energy gain is reported."""
     model, frames = play(against_a_plate(tmp_path, integrator, response, speed, moving))
     last, mass = frames[-1], model.lattice.mass
     top = -0.1 + (speed * last.time if moving else 0)
@@ -143,8 +143,10 @@ def test_no_node_gets_past_a_thin_plate(
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_to_and_from_a_moving_frame_nothing_changes(tmp_path: Path, integrator: str):
-    """A plate that moves and one at rest, the body seen from it: with friction. Verlet's substeps
-    differ."""
+    """A moving plate, and the same plate at rest in its frame, with friction.
+
+    Verlet's substeps differ.
+    """
     tables = {"solver": {"preset": "newton", "error": 1e-10}}
     positions = []
     for moving in (False, True):
@@ -176,9 +178,11 @@ def test_a_body_rests_on_a_plate_thinner_than_its_push_is_deep(tmp_path: Path):
 
 
 def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path):
-    """One pushes from below, one reflects from the side and strikes the nodes of some ranks alone:
-    positions, and the energy that is known of them. A third has nodes inside, which one rank
-    reports, and not again on resuming."""
+    """A plate pushes from below, a second plate reflects nodes of some ranks from the side.
+
+    Positions and known energies agree. A third plate has nodes inside. A single rank reports them,
+    and not again on resuming.
+    """
     time = {"step": 0.002, "duration": 0.046, "integrator": "bdf2"}
     pushing = {
         "shape": "box",
@@ -298,8 +302,11 @@ def told(caplog: pytest.LogCaptureFixture, what: str) -> list[str]:
 def test_energy_from_nowhere_is_told_once_with_its_frame(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    """The paper's exchange sets nodes back against their springs: 4% of a ball's energy at steps of
-    1 ms. What is told is a share of what the body had, not of what the exchange put in."""
+    """The paper's exchange sets nodes back against their springs.
+
+    It gives 4% of a ball's energy at steps of 1 ms. The report is a share of the body's energy, not
+    of the exchanged energy.
+    """
     floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1], "response": "exchange"}
     scene = {
         "start": {"velocity": [0, 0, -10.0]},

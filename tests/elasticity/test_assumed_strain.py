@@ -1,4 +1,4 @@
-"""Bending and twist of cells: what must hold in any cell, and errors of few cells."""
+"""Bending and twist of cells: rules for any cell, and errors of few cells."""
 
 import few_cells as study
 import numpy as np
@@ -128,8 +128,10 @@ def test_strips_thinner_than_their_cells_bend(poisson: float, thickness: float, 
 
 @pytest.mark.parametrize("stretch", [0.7, 1.5])
 def test_a_stretched_cell_bends_by_its_tangent_within_a_factor_of_two(stretch: float):
-    """The bending stiffness of one stretched cell, nu = 0, against P'(lambda) = mu (1 + 1 /
-    lambda^2)."""
+    """The bending stiffness of a stretched cell, nu = 0, against the tangent.
+
+    The tangent is P'(lambda) = mu (1 + 1 / lambda^2).
+    """
     lattice = solid(1, 1, 1, poisson=0.0)
     elastic = Elasticity(lattice)
     q = lattice.nodes * [stretch, 1, 1]

@@ -39,8 +39,10 @@ def test_volumes_at_rest_and_mirrored():
 
 @pytest.mark.parametrize("corner", range(8))
 def test_a_corner_pushed_through_its_cell_makes_its_volume_least(corner: int):
-    """Unit cube, the corner moved inwards by s along all edges: its own edges are left 1 - s, less
-    what they lean."""
+    """A unit cube whose corner is moved inwards by s along all edges.
+
+    Its own edges keep 1 - s, less by their tilt.
+    """
     one = lattice_of(1, 1, 1)
     cell, q = one.local_cells[0], one.nodes / H
     inwards = 2 * q.mean(axis=0) - 2 * q[cell[corner]]

@@ -35,8 +35,10 @@ YOUNG, H = 3e4, 0.1
 
 
 def points_inside(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Points (k, 3) of a random part of a cell about its middle: a half space of it, from a sliver
-    to all but one."""
+    """Return points (k, 3) of a random part of a cell about its middle.
+
+    The part is a half space, from a sliver to nearly all.
+    """
     points = rng.random((n, 3)) - 0.5
     height = points @ rng.standard_normal(3)
     return points[height >= np.quantile(height, rng.uniform(0, 0.99))]
@@ -99,7 +101,7 @@ def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool
 
 
 def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
-    """Of 96 cells the first and every seventh are cut; two materials."""
+    """The first and every seventh of 96 cells are cut; two materials."""
     lattice = solid(6, 4, 4, poisson=0.3)
     assert lattice.solid is not None
     cut, hard = (
@@ -126,9 +128,11 @@ def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
-    """lambda = 49 mu, no more than mu meanwhile: as that of Poisson's ratio 1/4, by its mu. A
-    Hessian with the pressure of the softer solid is that solid's in cells that are not bent, and
-    above it only by what resists the change of each cell's volume and three sums of its modes."""
+    """Meanwhile lambda = 49 mu is at most mu, as for Poisson's ratio 1/4.
+
+    A Hessian with the pressure of the softer solid is that solid's in cells without bending. Above
+    it lies only the resistance to the change of each cell's volume and to three sums of its modes.
+    """
     lattice = solid(2, 2, 1, poisson=0.49, cut=cut)
     assert lattice.solid is not None
     elastic = Elasticity(lattice)
@@ -213,8 +217,7 @@ def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_
 
 
 def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
-    """mu |grad|^2 and the second variation of one cell each; and what F sees of strain is what the
-    integral sees."""
+    """mu |grad|^2 and the second variation of each cell. F sees the strain of the integral."""
     count, n = 10_000, 60
     fills, second = map(
         np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True)
@@ -336,8 +339,7 @@ def test_below_the_onset_the_volume_energy_goes_on_smoothly(volume: str):
 
 
 def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
-    """A sliver's far corner may fold; the mean deformation gradient of what is inside has the
-    say."""
+    """A sliver's far corner may fold. The mean deformation gradient inside decides."""
     lattice = solid(1, 1, 1, poisson=0.45)
     points = 0.02 * RNG.random((100, 3)) - 0.5
     fills, second = moments(points, 10**8)
@@ -360,8 +362,10 @@ def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
 
 
 def test_viscosity_turns_with_its_cells_and_is_semidefinite_where_they_are_inside_out():
-    """A turn's rate costs nothing; a stretch of turned cells what it does at rest: 2 mu |eps|^2 +
-    lambda (tr eps)^2."""
+    """A rate of rotation costs nothing.
+
+    A stretch of turned cells costs as much as at rest: 2 mu |eps|^2 + lambda (tr eps)^2.
+    """
     lattice = solid(3, 2, 2, poisson=0.45)
     viscosity = Viscosity(NeoHookean.of_lattice(lattice), 3.0, lattice.owned, lattice.nodes)
     turn, rest = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), lattice.nodes

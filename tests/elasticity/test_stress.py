@@ -90,7 +90,7 @@ def test_the_stress_of_a_collapsed_cell_is_finite():
 
 
 def test_a_bar_in_tension_has_force_over_area(tmp_path):
-    """Of the area that it has when it is pulled."""
+    """The area is the area of the pulled bar."""
     scene = block_scene(
         tmp_path, np.array([1.0, 0.25, 0.25]), **STATIC, material=of_law(0.3),
         pin=[{"region": along_x(-0.01, 0.01)}],
@@ -147,12 +147,12 @@ def plate_with_a_hole(half: float, radius: float, thick: float) -> trimesh.Trime
 
 
 def test_a_plate_with_a_hole_has_thrice_the_stress_at_its_edge(tmp_path):
-    """Kirsch's  1/2 (2 + (a / r)^2 + 3 (a / r)^4)  beside the hole, 6 cells in radius, as far out
-    as its cells lie.
+    """Kirsch's  1/2 (2 + (a / r)^2 + 3 (a / r)^4)  beside the hole, as far out as its cells.
 
-    Poisson's ratio is 0, on which it does not depend, so that the clamp disturbs nothing. The plate
-    is 10 radii wide: 3 to 5% more than an endless one (Heywood: (2 + 0.8^3) / 0.8 = 3.14 for 3).
-    Cells that the edge cuts scatter by more than whole ones."""
+    The hole has 6 cells in radius. The stress does not depend on Poisson's ratio, which is 0, so
+    that the clamp disturbs nothing. The plate is 10 radii wide: 3 to 5% more than an endless plate
+    (Heywood: (2 + 0.8^3) / 0.8 = 3.14 for 3). Cut cells scatter by more than whole cells.
+    """
     radius, cell, sigma = 1.0, 1 / 6, 10.0
     half, thick = 5.0, 1 / 6
     plate_with_a_hole(half, radius, thick).export(tmp_path / "plate.ply")

@@ -1,4 +1,4 @@
-"""The command line, some of whose ranks fail: alone_worker.py RANKS WHERE WHAT ARGUMENTS."""
+"""The command line with failing ranks: alone_worker.py RANKS WHERE WHAT ARGUMENTS."""
 
 import sys
 

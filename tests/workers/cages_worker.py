@@ -16,8 +16,10 @@ FILLED = [("closed", 0.11), ("open", 0.11), ("one cell", 2.5)]
 
 
 def enclosed(boundary: np.ndarray) -> np.ndarray:
-    """What a dense flood fill from outside does not reach, without the boundary itself (bool
-    grids)."""
+    """Return cells that a dense flood fill from outside does not reach, without the boundary.
+
+    Grids are of bool.
+    """
     label, _ = ndimage.label(np.pad(~boundary, 1, constant_values=True))
     return ((label != label[0, 0, 0]) & (label != 0))[1:-1, 1:-1, 1:-1]
 

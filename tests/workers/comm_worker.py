@@ -66,8 +66,7 @@ def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit:
 
 
 def check_shares_are_even(rng: np.random.Generator) -> None:
-    """All keys come from one rank, clustered; no rank ends with more than a few per cent above its
-    part."""
+    """All keys come from a single rank, clustered. Parts end even within a few per cent."""
     given = np.unique((rng.random(40_000) ** 4 * 1e12).astype(np.int64))
     table = SortedKeys(comm, given if comm.rank == comm.size - 1 else given[:0])
     assert len(table.keys) < 1.05 * len(given) / comm.size

@@ -80,8 +80,10 @@ def refuse(path: str) -> None:
 
 
 def fill_disk(path: str, gathers: bool = True) -> None:
-    """The disk is full at the third frame, when the other ranks are already sending; or, not
-    gathered, for one of them in the midst of its rows."""
+    """The disk is full at the third frame, while the ranks are sending.
+
+    Without gathering, it is full for a rank in the midst of its rows.
+    """
     layout.PIECE_BYTES = 100
     nodes = share(NODES)
     store = h5py.Dataset.__setitem__

@@ -1,4 +1,4 @@
-"""Multigrid on as many ranks as mpiexec gives, against that of one."""
+"""Compare multigrid on the ranks of mpiexec with multigrid on a single rank."""
 
 import numpy as np
 from hierarchies import COMM, LATTICES, SHAPES, build, hierarchy

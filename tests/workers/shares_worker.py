@@ -1,4 +1,4 @@
-"""What each rank really holds of a scene: shares_worker.py SCENE OUT.json [KEY=VALUE ...]"""
+"""Count each rank's rows of a scene: shares_worker.py SCENE OUT.json [KEY=VALUE ...]"""
 
 import json
 import sys

@@ -1,8 +1,8 @@
-"""Scenes whose kernels run in numba's CUDA simulator: SCENE... -> the kernels that ran, and the
-last positions of each.
+"""Scenes by kernels in numba's CUDA simulator: SCENE... -> kernels that ran, last positions.
 
-The kernels are those of a GPU, one thread an index, with blocks that are not full; only the arrays
-are pretended."""
+The kernels are a GPU's, a thread an index, with blocks that are not full. Only the arrays are
+pretended.
+"""
 
 import os
 import sys

@@ -59,7 +59,7 @@ def matrix(path: Path) -> csr_array:
 
 @pytest.mark.parametrize("law", ["neo-hookean", "linear"])
 def test_a_system_solves_to_the_steps_own_correction(tmp_path: Path, law: str):
-    """With a budget of one iteration the step ends at x - y."""
+    """With a budget of a single iteration the step ends at x - y."""
     material = SOLID if law == "neo-hookean" else LINEAR["material"]
     path = clamped_beam(tmp_path, material=material, time=SWING, solver={"max_iterations": 1})
     result = msmpetsc.run(
@@ -90,7 +90,7 @@ STATIC = {"time": {"step": 1.0, "duration": 1.0, "integrator": "static"}}
 
 
 def roller(axis: int, sign: int, at: float) -> dict:
-    """A roller that holds one component of the nodes on a face of a block."""
+    """Return a roller that holds a component of the nodes on a face of a block."""
     normal, point = [0, 0, 0], [0, 0, 0]
     normal[axis], point[axis] = sign, at - sign * 0.01
     return {"region": {"half_space": {"point": point, "normal": normal}}, "fix": ["xyz"[axis]]}

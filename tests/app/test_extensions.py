@@ -22,7 +22,7 @@ INTEGRATORS = ("implicit-euler", "bdf2", "verlet")
 
 @pytest.fixture(autouse=True)
 def nothing_stays():
-    """Take out again what a test registers."""
+    """Remove the names that a test registers."""
     yield
     for extensions in (FORCES, PRESETS):
         extensions._registered.clear()
@@ -40,7 +40,7 @@ def flying(
 
 
 def heights(scene: Path) -> np.ndarray:
-    """How far the block, which no such force deforms, has come in each frame [m]."""
+    """Return the path [m] of the block in each frame; these forces do not deform it."""
     positions = np.array([frame.position for frame in msm.frames(scene)])
     assert np.ptp(positions - positions[0], axis=1).max() < 1e-9
     return (positions - positions[0]).mean(axis=1)[:, 2]

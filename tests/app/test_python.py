@@ -1,5 +1,4 @@
-"""Runs from Python: msmpetsc.run says and writes what the command does, and raises where that
-returns a status."""
+"""Runs from Python: msmpetsc.run writes and prints as the command does, and raises."""
 
 import inspect
 import shlex

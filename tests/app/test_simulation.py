@@ -1,5 +1,7 @@
-"""Frames without a file: those of msmpetsc.run, from files, tables and scenes, again and again on
-one lattice."""
+"""Frames without a file: the frames of msmpetsc.run, many times on the same lattice.
+
+The runs are from files, tables and scenes.
+"""
 
 import gc
 import tomllib
@@ -20,7 +22,7 @@ INTEGRATORS = ("implicit-euler", "bdf2", "verlet")
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A block that is held at one end and bends under its weight."""
+    """Return the scene of a block that is held at an end and bends under its weight."""
     return block_scene(tmp_path, **FALL | HELD)
 
 
@@ -167,7 +169,7 @@ def test_a_callback_sees_each_stored_frame(scene: Path, tmp_path: Path):
 
 
 def test_frames_are_those_of_every_third_step_and_the_last(tmp_path: Path):
-    """Nothing is computed for those left out, and what the steps cost is summed up."""
+    """Nothing is computed for steps left out. The cost of all steps is summed up."""
     time, solver = {"step": 0.02, "duration": 0.14}, {"preset": "anderson", "error": 1e-6}
     simulation = msm.Simulation(
         block_scene(tmp_path, **FALL | HELD | {"time": time, "solver": solver})

@@ -1,5 +1,4 @@
-"""Exported files are read back by libraries that no one here wrote, and hold the frames of the
-result."""
+"""Exported files are read back by independent libraries, and hold the frames of the result."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""USD files, read back by USD's own library: the frames of the result, in time, one mesh a body."""
+"""USD files, read back by USD's own library: frames of the result in time, a mesh a body."""
 
 from pathlib import Path
 

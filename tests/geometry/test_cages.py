@@ -1,10 +1,10 @@
-"""A surface filled with cells: which cells it touches, what it encloses, the same on any number of
-ranks.
+"""A surface filled with cells: cells that it touches or encloses, on any number of ranks.
 
-Two oracles. Touched cells: a separating-axis test in integers, so nothing is rounded. A cell is the
-half-open box [i, i+1)^3, but what touches only its far faces, where it is interpolated, may be
-marked or not: so all cells of the half-open test must be there, and none beyond the closed one.
-Enclosed cells: scipy.ndimage.label on the dense grid."""
+Touched cells have a separating-axis test in integers as oracle, so nothing is rounded. A cell is
+the half-open box [i, i+1)^3. A cell touched only at its far faces, where it is interpolated, may be
+marked or not. So all cells of the half-open test must be marked, and no cells beyond the closed
+test. Enclosed cells have scipy.ndimage.label on the dense grid as oracle.
+"""
 
 import os
 import tracemalloc
@@ -201,7 +201,7 @@ def single(surface: Surface) -> Surface:
 
 
 def l_shape() -> Surface:
-    """A square of 3 x 3 cells of 0.1 m, one high, less its upper 2 x 2."""
+    """Return a square of 3 x 3 cells of 0.1 m, a layer high, without its upper 2 x 2."""
     corners = np.array([[0, 0], [0.3, 0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.3], [0, 0.3]])
     cuts = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     low, high = (np.column_stack([corners, np.full(6, height)]) for height in (0, 0.1))
@@ -249,13 +249,13 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     assert not body.report.closed
     cages = fill([body], 0.1)
     assert len(cages.kind) == 150
-    # one layer more, because no triangle marks the upper layer as boundary
+    # a layer more, because no triangle marks the upper layer as boundary
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2
 
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Cages]]:
-    """A folder with the meshes that the worker fills, and their cells on one rank."""
+    """Return the folder with the meshes of the worker, and their cells on a single rank."""
     folder, cages = tmp_path_factory.mktemp("filled"), {}
     for name, cell_size in FILLED:
         mesh = SHAPES["one cell" if name == "one cell" else "torus upright"][0].copy()

@@ -104,7 +104,7 @@ CONVEX = {
 
 @pytest.mark.parametrize("name", CONVEX)
 def test_a_convex_body_has_no_copies(name: str):
-    """In a cell it has one part, and two cells of it meet in their face."""
+    """A cell holds a single part of it, and two of its cells meet in their face."""
     rng = np.random.default_rng(0)
     for turned in (False, True) * 5:
         mesh = CONVEX[name](rng)
@@ -357,10 +357,11 @@ def test_a_rolled_sheet_is_as_long_in_the_lattice(thickness: float, gap: float):
 
 @pytest.mark.parametrize("gap", [0.1, 0.3])
 def test_lips_part_along_an_arched_slit(tmp_path: Path, gap: float):
-    """As far as on finer cells, within 10%: a slit of 1.6 cells gives 0.93, for the plate bends.
+    """The opening agrees with finer cells within 10%.
 
-    The slit crosses rows of cells. Where it grazes a cell, a sliver of the lower lip reaches into
-    the cell between all lines of the search. Joined with the upper lip there, they part by 0.05.
+    A slit of 1.6 cells gives 0.93, for the plate bends. The slit crosses rows of cells. In a grazed
+    cell, a sliver of the lower lip lies between all lines of the search. If it were joined with the
+    upper lip, the lips would part by 0.05.
     """
     held, pulled_side = (
         {"half_space": {"point": [0, s * (4 * H - 1e-3), 0], "normal": [0, s, 0]}} for s in (-1, 1)

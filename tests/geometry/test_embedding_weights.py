@@ -15,7 +15,7 @@ KINDS = ("mvc", "cages", "affine")
 BAR, RADIUS = np.array([4, 1, 1]), 3.0
 # cell size [m]
 SIZES = np.array([1 / 2, 1 / 4, 1 / 8, 1 / 16])
-# standard deviation of random displacements and step of one-sided differences [cells]
+# standard deviation of random displacements and step of differences on a side [cells]
 MOVED, STEP = (
     0.1,
     1e-4,
@@ -28,14 +28,14 @@ SMOOTH_KINDS = pytest.mark.parametrize("kind", ["cages", "affine"])
 near_face = st.sampled_from([0.0, 1e-300, 1e-16, 3e-14, 1e-13, 1e-12, 1e-9, 1e-5, 0.00999, 0.01001])
 coordinate = st.one_of(near_face, near_face.map(lambda x: 1 - x), st.just(0.5), st.floats(0, 1))
 local_points = st.tuples(coordinate, coordinate, coordinate)
-# every cell of the block touches the middle one: any set of them is connected
+# every cell of the block touches the middle cell: any set of them is connected
 neighbour_masks = st.lists(st.booleans(), min_size=27, max_size=27).map(
     lambda m: [*m[:13], True, *m[14:]]
 )
 
 
 def weights(kind, u, mask, smoothing=1.0):
-    """Weights (64,) of one point."""
+    """Return the weights (64,) of a point."""
     return stencil_weights(kind, np.array([u], float), np.array([mask], bool), smoothing)[0]
 
 
@@ -172,7 +172,10 @@ def test_weights_know_no_direction(kind):
 
 
 def neighbours_of(valid, cells):
-    """(p,27) bool of cells (p,3); valid (nx,ny,nz) bool with a margin of one cell that is not."""
+    """Return a mask (p,27) of cells (p,3).
+
+    valid (nx,ny,nz) is bool, with a margin of a cell that is not valid.
+    """
     return valid[tuple(np.moveaxis(cells[:, None] + BLOCK, -1, 0))]
 
 
@@ -217,8 +220,7 @@ def rms_error(kind, size, points=4000):
 
 
 def shared(rng, valid, offsets, points):
-    """Cells (p,3), their valid neighbours (p,3) at one of the offsets, and u (p,3) in the first,
-    shared by both."""
+    """Return cells (p,3), their valid neighbours (p,3) at an offset, and u (p,3) in the cells."""
     pairs = [
         (cell, cell + offset)
         for offset in offsets
@@ -243,8 +245,10 @@ def position_jump(kind, valid, points=3000):
 
 
 def kinks(kind, valid, points=2000):
-    """Jumps (p,) of the derivative along the normal across shared faces, from one-sided
-    second-order differences."""
+    """Return the jumps (p,) of the normal derivative across shared faces.
+
+    They are from second-order differences on each side.
+    """
     rng = np.random.default_rng(3)
     nodes = moved_nodes(rng, valid)
     first, second, u = shared(rng, valid, np.eye(3, dtype=int), points)

@@ -27,8 +27,10 @@ BODIES["hollow"].faces[320:] = BODIES["hollow"].faces[320:, ::-1]
 def columns_of(
     mesh: trimesh.Trimesh, h: float, offset: float = 0.0
 ) -> tuple[Columns, np.ndarray, np.ndarray]:
-    """Of a mesh in cells of h from ``offset`` cells before it; all cells of its box, and where they
-    begin."""
+    """Return the columns of a mesh in cells of h from ``offset`` cells before it.
+
+    Also return all cells of its box, and their first cell.
+    """
     origin = mesh.bounds[0] - offset * h
     corners = (mesh.vertices - origin)[mesh.faces] / h
     shape = np.ceil(corners.max(axis=(0, 1))).astype(np.int64) + 1
@@ -52,8 +54,10 @@ def test_fills_have_the_bodys_volume_and_its_centre(name: str, offset: float):
 
 
 def test_a_plane_through_a_cell_gives_its_corners_what_lies_near_them():
-    """Below z: 2 z - z^2 at the lower corners, z^2 at the upper ones, the integrals of 2 (1 - z)
-    and 2 z."""
+    """Below z the lower corners have 2 z - z^2 and the upper corners z^2.
+
+    These are the integrals of 2 (1 - z) and 2 z.
+    """
     box = trimesh.creation.box(bounds=[[0, 0, 0], [3, 2, 1.3]])
     columns, _, _ = columns_of(box, 1.0)
     fills, _ = columns.inside(np.array([[1, 1, 1], [1, 1, 0]]))

@@ -1,5 +1,7 @@
-"""Mesh files of all formats, whole, damaged or hostile: a mesh of finite points comes out, or one
-line does."""
+"""Mesh files of all formats, whole, damaged or hostile.
+
+Each gives a mesh of finite points or an error of a line.
+"""
 
 import base64
 import json
@@ -110,7 +112,7 @@ SEEDS = [
 
 
 def read(folder: Path, kind: str, content: bytes, *changes: str) -> str:
-    """As a scene reads it; what is said."""
+    """Return the message of a read, as a scene reads it."""
     (folder / f"x.{kind}").write_bytes(content)
     (folder / "scene.toml").write_text(SCENE.format(f"x.{kind}"))
 
@@ -240,7 +242,7 @@ def test_relative_numbers_of_an_obj_count_from_where_they_stand(tmp_path):
 
 @pytest.mark.parametrize("kind", ["vtu", "vtk"])
 def test_tetrahedra_give_their_outer_surface(tmp_path, kind):
-    """A box filled with tetrahedra around its middle, every other one wound the wrong way."""
+    """A box filled with tetrahedra around its middle, every second of them wound the wrong way."""
     tetrahedra = np.column_stack([BOX.faces, np.full(12, 8)])
     tetrahedra[::2] = tetrahedra[::2][:, [1, 0, 2, 3]]
     meshio.Mesh(np.vstack([BOX.vertices, [[0, 0, 0]]]), [("tetra", tetrahedra)]).write(
@@ -346,7 +348,7 @@ def test_a_gltf_names_files_of_its_folder_only(tmp_path, opened, name):
 
 
 def glb(instances: int, faces: int, parts: int = 1) -> bytes:
-    """One mesh, put in by so many nodes."""
+    """Return a GLB file with a mesh that several nodes use."""
     points, corners = np.eye(3, dtype="<f4"), np.tile(np.arange(3, dtype="<u4"), faces)
     binary = points.tobytes() + corners.tobytes()
     part = {"attributes": {"POSITION": 0}, "indices": 1}

@@ -91,7 +91,7 @@ def test_repair_that_loses_the_body_is_refused():
 
 
 def pipe(hole: float) -> Surface:
-    """A pipe with walls of 5 cm, whose inner one lacks what lies beyond x = ``hole`` [m]."""
+    """Return a pipe with walls of 5 cm, whose inner wall ends at x = ``hole`` [m]."""
     surface = surface_of(
         trimesh.creation.annulus(0.45, 0.5, 1.0, sections=64).subdivide().subdivide()
     )
@@ -172,8 +172,10 @@ def test_orient_turns_each_part_outwards_also_loose_and_open_ones():
 
 @given(st.lists(st.booleans(), min_size=7, max_size=7), st.floats(0, 1e7))
 def test_orient_winds_cavities_inwards_and_their_cores_outwards(inwards, shift):
-    """A ball in a ball in a ball beside a box with a box in it, a second box over its edge, and one
-    far away."""
+    """A ball in a ball in a ball, and boxes.
+
+    A box contains a box, a second box lies over its edge, and a third box is far away.
+    """
     balls = [surface_of(trimesh.creation.icosphere(1, radius=radius)) for radius in (1.0, 0.7, 0.4)]
     parts = [*balls, box((5, 0, 0), 2.0), box((5.2, 0, 0)), box((6, 0, 0)), box((9, 0, 0))]
     outwards = np.array([examine(part).volume for part in parts]) * [1, -1, 1, 1, -1, 1, 1]

@@ -1,4 +1,4 @@
-"""What the tests of bad input share: how bytes are damaged, and what may come of it."""
+"""Damage to bytes, and the outcomes that the tests of bad input allow."""
 
 import re
 import resource
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
 
-# The same trials every time: what is found here once is found again.
+# The trials are the same every time: a fault found here is found again.
 TRIALS = settings(
     derandomize=True,
     deadline=None,
@@ -77,8 +77,10 @@ def limits() -> Iterator[None]:
 
 
 def refusal(call: Callable, lines: bool = False) -> str:
-    """What an InputError of the call says, in one line that a terminal can show; "" if it goes
-    well."""
+    """Return the message of an InputError of the call; an empty string if the call succeeds.
+
+    The message is a line that a terminal can show.
+    """
     with limits():
         try:
             call()

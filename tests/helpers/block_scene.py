@@ -52,7 +52,7 @@ def clamped_beam(folder: Path, **tables) -> Path:
 
 
 def play(path: Path, *overrides: str) -> tuple[Model, list[Frame]]:
-    """The frames of a scene, on one rank."""
+    """Return the model and the frames of a scene on a single rank."""
     scene = load_scene(path, overrides)
     model = build_model(MPI.COMM_SELF, scene)
     with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:

@@ -30,7 +30,7 @@ PATIENCE = 30.0
 
 
 class Browser:
-    """One page in a browser of its own; a context, which ends it."""
+    """A page in a browser of its own; a context, which ends the browser."""
 
     def __init__(self, page: Path, size: tuple[int, int] = (600, 700), address: str = ""):
         """Open a page at an address ("frame=3") in a window of so many pixels."""
@@ -81,7 +81,7 @@ class Browser:
         self._process.wait(PATIENCE)
 
     def _ask(self, method: str, **params: Any) -> dict[str, Any]:
-        """Return the answer to a command; what the browser says meanwhile is passed over."""
+        """Return the answer to a command. Events of the browser before it are dropped."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": params}
         message |= {"sessionId": self._session} if self._session else {}
@@ -103,7 +103,7 @@ class Browser:
             self._rest += more
 
     def value(self, expression: str) -> Any:
-        """Return what an expression of JavaScript is in the page."""
+        """Return the value of an expression of JavaScript in the page."""
         answer = self._ask(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
@@ -155,7 +155,7 @@ class Browser:
         self._ask("Input.dispatchKeyEvent", type="keyUp", key=key)
 
     def picture(self, selector: str = "#view") -> np.ndarray:
-        """Return what is seen of an element, (h, w, 3), after the page has drawn."""
+        """Return the picture (h, w, 3) of an element after the page has drawn."""
         self.value(
             "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
         )

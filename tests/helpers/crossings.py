@@ -12,10 +12,12 @@ def unique_edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def count_crossings(points: np.ndarray, triangles: np.ndarray) -> int:
-    """Return how many pairs of an edge and a triangle that share no corner cross; points (v, 3).
+    """Return how many pairs of an edge and a triangle without a common corner cross.
 
-    An edge with an end in the triangle's plane, up to rounding, does not cross it: a flat face has
-    triangles in one plane.
+    An edge with an end in the triangle's plane, up to rounding, does not cross it: the triangles of
+    a flat face are in a common plane.
+
+    points : (v, 3)
     """
     return _count(
         np.ascontiguousarray(points, float),

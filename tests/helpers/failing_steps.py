@@ -1,4 +1,4 @@
-"""Steps that fail as one that does not converge."""
+"""Steps that fail as if they did not converge."""
 
 import pytest
 

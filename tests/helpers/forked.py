@@ -1,9 +1,10 @@
-"""Programs without their start: a process that has imported the package forks a child for each run,
-and for each rank.
+"""Programs without their start: forks of a process that has imported the package.
 
-A small run takes 3 s of a core with its start, 0.7 s in a fork. Ranks are those of a real mpiexec:
-what it starts for each leaves the environment of the rank, by which a forked child joins the
-others, and ends as the child does."""
+A child is forked for each run and rank. A small run takes 3 s of a core with its start, 0.7 s in a
+fork. Ranks are ranks of a real mpiexec. For each rank it starts a small program, which passes on
+the environment of the rank. By it a forked child joins the remaining ranks. The program ends as the
+child does.
+"""
 
 import os
 import runpy
@@ -90,7 +91,7 @@ def _environment_of(path: Path, mpiexec: subprocess.Popen, end: float) -> dict[s
 
 
 def _hand_on(children: list, mpiexec: subprocess.Popen, folder: str, end: float) -> None:
-    """Let what stands in for each rank end with its status, until all have ended or mpiexec has."""
+    """Let the program of each rank end with its child's status, until all or mpiexec have ended."""
     running = dict(enumerate(children))
     while running and mpiexec.poll() is None:
         if time.monotonic() > end:
@@ -115,7 +116,7 @@ def _rank(arguments: list[str], streams: list[Path], environment: dict[str, str]
 
 
 def _python(arguments: list[str]) -> None:
-    """As Python takes them: -c TEXT, -m MODULE or a file, and what follows."""
+    """Run Python's arguments: -c TEXT, -m MODULE or a file, and the rest."""
     kind, *rest = arguments
     if kind not in ("-c", "-m"):
         sys.argv, sys.path[0:0] = arguments, [str(Path(kind).parent)]

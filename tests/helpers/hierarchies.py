@@ -1,5 +1,8 @@
-"""Lattices that are hard for multigrid, on any number of ranks, and the parts of the cycle as dense
-matrices whose rows and columns are x, y, z of one node after another, whatever the ranks."""
+"""Lattices that are hard for multigrid, on any number of ranks.
+
+Parts of the cycle are dense matrices. Their rows and columns are x, y, z of each node in turn, on
+any number of ranks.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -167,15 +170,14 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def contact_blocks(lattice: Lattice) -> np.ndarray:
-    """(owned, 9) [N/m]: a push along an oblique normal on every third node, its stiffness no small
-    one."""
+    """Return (owned, 9) [N/m]: a hard push along an oblique normal on every third node."""
     normal = np.array([0.6, 0.0, 0.8])
     touched = lattice.global_numbers[: lattice.owned] % 3 == 0
     return touched[:, None] * 5e4 * np.outer(normal, normal).ravel()
 
 
 class Applied:
-    """A PC as the context of another one."""
+    """A PC as the context of another PC."""
 
     def __init__(self, pc: PETSc.PC):
         self.pc = pc
@@ -208,8 +210,7 @@ class Case:
         return 3 * self.unknowns.total
 
     def dense(self, act: Callable[[PETSc.Vec, PETSc.Vec], None], every: int = 1) -> np.ndarray:
-        """Matrix of what writes into its second vector, column by column, or some of its columns
-        (collective)."""
+        """Return the matrix, or some columns, of a function into its second vector (collective)."""
         first = self.multigrid.operator.getOwnershipRange()[0] // 3
         own = np.zeros((3 * self.unknowns.size, self.size))
         for column in range(0, self.size, every):
@@ -302,7 +303,7 @@ def hierarchy(
     contact: bool = False,
     coarsest: int = 800,
 ) -> Iterator[Case]:
-    """The cycle as presets have it, with coarser grids until one has ``coarsest`` nodes or less."""
+    """Return the cycle of the presets, whose coarsest grid has at most ``coarsest`` nodes."""
     database, before = PETSc.Options(), cycle.COARSEST
     for name, value in LATTICE_MULTIGRID.items():
         database.setValue(name, value)

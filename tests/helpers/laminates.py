@@ -102,7 +102,7 @@ def error(bar: Bar, degrees: float, across: int, poisson: float | None = 0.0) ->
 
 
 THREE, TWO, COATS = (0.3, 0.7), (0.4,), (0.1, 0.9)
-# layers across the pull: of 0.7 m each, and two soft ones of 0.1 m
+# layers across the pull: of 0.7 m each, and two soft layers of 0.1 m
 ROW, GLUE = (0.7, 1.4, 2.1, 2.8, 3.5, 4.2, 4.9, 5.6, 6.3, 7.0), (2.3, 2.4, 5.4, 5.5)
 BARS = {
     "three layers, bent": (THREE, True, False),

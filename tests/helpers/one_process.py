@@ -1,4 +1,4 @@
-"""Many commands in one process, and the lines of error among what they print."""
+"""Many commands in a process, and the lines of error in their output."""
 
 import contextlib
 import io
@@ -34,10 +34,11 @@ Answers = list[tuple[int, str]]
 
 
 def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers]:
-    """Return the answers to each of these commands, which one process a rank carries out.
+    """Return the answers to each of these commands, which a process a rank carries out.
 
-    None leaves a PETSc object to Python's collector: what one rank alone has collected, PETSc waits
-    for at its end."""
+    No PETSc object is left to Python's collector: at its end PETSc waits for objects that a single
+    rank has collected.
+    """
     words = [[*map(str, command)] for command in commands]
     done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(words), status=0)
     assert done.stderr.strip() == "", "not even the C libraries speak"
@@ -47,7 +48,7 @@ def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers
 
 
 def refusal_in(answers: Answers) -> str:
-    """Return the one line, of one rank, with which all ranks refuse a command."""
+    """Return the line of a single rank with which all ranks refuse a command."""
     assert all(status == 2 for status, _ in answers), answers
     (line,) = (line for _, told in answers for line in told.splitlines() if not is_aside(line))
     assert errors(answers[0][1]) == [line], answers
@@ -67,7 +68,7 @@ NOISE = ("Traceback", "PETSC ERROR", "MPI_ABORT", "ORTE_ERROR", "Segmentation", 
 
 
 def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
-    """It ended with this status, said why in one line that holds these words, and ended cleanly."""
+    """Assert that a command ended cleanly, with this status and a line that holds these words."""
     told = done.stdout + done.stderr
     (line,) = errors(done.stderr)
     assert done.returncode == status and all(word in line for word in words), told
@@ -75,8 +76,7 @@ def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str)
 
 
 def command_error(*arguments: object) -> str:
-    """Return the one line of error with which a command ends, status 2; of notes there may be
-    more."""
+    """Return the line of error with which a command ends, status 2. Notes may precede it."""
     stream = io.StringIO()
     with contextlib.redirect_stderr(stream):
         status = main([*map(str, arguments)])
@@ -90,7 +90,7 @@ def command_error(*arguments: object) -> str:
 
 
 def input_error(call: Callable[[], object]) -> str:
-    """Return what the InputError of a call says, in one line."""
+    """Return the message of the InputError of a call, a single line."""
     with pytest.raises(InputError) as raised:
         call()
     assert "\n" not in str(raised.value)

@@ -1,9 +1,9 @@
-"""A GPU that is none: arrays that behave as CuPy's do towards NumPy's, in the memory of the CPU,
-where the bodies of kernels are run one index after another. What a run on a GPU would mix up or
-carry to and fro is an error or counted.
+"""A pretended GPU: arrays in CPU memory that behave towards NumPy's as CuPy's do.
 
-CuPy's arrays refuse what these refuse: to become NumPy's unasked, and to be computed with together
-with them."""
+Bodies of kernels run index by index. Mixing of arrays is an error, and copies between machines are
+counted. Like CuPy's, these arrays refuse to become NumPy's unasked, and to be computed with
+together with them.
+"""
 
 import sys
 from collections import Counter
@@ -18,7 +18,7 @@ from petsc4py import PETSc
 
 from msmpetsc.solve.petsc import device
 
-# what CuPy 13 has of NumPy's functions, of those that the steps call
+# functions of NumPy that CuPy 13 has, among the functions that the steps call
 KNOWN = [
     "array_equal", "asarray", "bincount", "concatenate", "copyto", "cross", "einsum", "empty",
     "empty_like",
@@ -132,7 +132,7 @@ for _name in (
 
 
 def bare(value):
-    """What the array holds; NumPy's own arrays are refused."""
+    """Return the values of the array. NumPy's own arrays are refused."""
     if isinstance(value, Array):
         return value.values
     if isinstance(value, np.ndarray) and value.ndim:
@@ -185,8 +185,10 @@ def send(array: np.ndarray) -> Array:
 
 @contextmanager
 def module(name: str, **contents) -> Iterator[None]:
-    """One that is imported in place of what has that name. (patch.dict would forget all that is
-    imported meanwhile.)"""
+    """Replace a module by a stand-in of this name.
+
+    patch.dict would forget all modules imported meanwhile.
+    """
     before = sys.modules.get(name)
     sys.modules[name] = SimpleNamespace(**contents)
     try:
@@ -197,7 +199,10 @@ def module(name: str, **contents) -> Iterator[None]:
 
 @contextmanager
 def pretended(launch=launcher) -> Iterator[Counter]:
-    """Runs within compute on such a GPU; yields the counts. launch: backend.launcher.launcher"""
+    """Compute runs within on this GPU; yield the counts.
+
+    launch : backend.launcher.launcher
+    """
     counted.clear()
     with (
         patch.object(device, "sender", lambda comm: send),

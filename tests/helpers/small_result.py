@@ -1,4 +1,4 @@
-"""A small result file for tests of what reads one: a bar of two cells whose frames are formulas."""
+"""A small result file for tests of readers: a bar of two cells whose frames are formulas."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def cells() -> np.ndarray:
 
 
 def number(place: np.ndarray) -> int:
-    """Of the node there."""
+    """Return the number of the node there."""
     return int(np.argmin(np.linalg.norm(NODES - place, axis=1)))
 
 

@@ -34,7 +34,7 @@ def every_step_forgets() -> Iterator[None]:
 
 
 def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:
-    """A soft block that hangs by one side and swings, a frame every third step."""
+    """Return a soft block that hangs by a side and swings, with a frame every third step."""
     side = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
     material = {"young_modulus": 1e5, "density": 1000.0}
     output = {"surface": True, "every": EVERY}

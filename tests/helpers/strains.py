@@ -1,5 +1,4 @@
-"""Uniform strains of a lattice at rest, and what an isotropic solid of Poisson's ratio 1/4 has of
-them."""
+"""Uniform strains of a lattice at rest, and their energy in a solid of Poisson's ratio 1/4."""
 
 from collections.abc import Iterator
 
@@ -20,8 +19,7 @@ def elastic_constant(lattice: Lattice, G: np.ndarray, other: np.ndarray) -> floa
 
 
 def uniform_strains() -> Iterator[tuple[str, np.ndarray, np.ndarray, float]]:
-    """Name, two displacement gradients, and what u^T H v / volume is in an isotropic solid of nu =
-    1/4 [Pa]."""
+    """Return names, two displacement gradients, and u^T H v / volume [Pa] of the solid."""
     x, y, z = np.eye(3)
     yield "C11: stretch along an edge", np.outer(x, x), np.outer(x, x), C11
     yield "C12: stretch along one edge against another", np.outer(x, x), np.outer(y, y), C12

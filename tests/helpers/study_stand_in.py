@@ -21,8 +21,7 @@ CALLS = "calls.txt"
 
 
 def begin(words: list[str]) -> None:
-    """Say that it was called, and start and do what is to be stopped: before imports, which take
-    long on busy cores."""
+    """Record the call, and start and do the work to be stopped: before slow imports."""
     folder = Path(words[words.index("-o") + 1]).parent.parent
     if os.environ.get("OMPI_COMM_WORLD_RANK", "0") == "0":
         with open(folder / CALLS, "a") as file:
@@ -96,7 +95,7 @@ def write(comm, out: Path, table: dict, every: int, count: int) -> None:
 
 
 def blank_frame(**given) -> Frame:
-    """A frame of zeros but for what is given."""
+    """Return a frame of zeros with the given values."""
     blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING} | {
         "surface": None,
         "momentum": np.zeros(3),

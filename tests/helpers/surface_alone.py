@@ -10,7 +10,7 @@ from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
 
 def drawable_of(points: np.ndarray, triangles: np.ndarray) -> Drawable:
-    """The surface at rest; of one cell, so large that no triangle is divided."""
+    """Return the surface at rest, of a cell so large that no triangle is divided."""
     ends = [*points.argmin(axis=0), *points.argmax(axis=0)]
     body = np.zeros(len(points), int)
     return Drawable(

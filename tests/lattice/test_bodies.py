@@ -1,4 +1,4 @@
-"""Several bodies in one run: each as if it were alone, however they lie."""
+"""Several bodies in a run: each moves as if it were alone, however they lie."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -80,7 +80,7 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
 
 
 def alone(folder: Path, number: int, **tables: Any) -> Path:
-    """The scene of one of the bodies, which is then all there is."""
+    """Return the scene of a single body."""
     body = dict(BODIES[number])
     material = SPRINGS | body.pop("material", {})
     return write(folder, f"alone{number}", **body, material=material, **tables)
@@ -88,8 +88,10 @@ def alone(folder: Path, number: int, **tables: Any) -> Path:
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
 def test_bodies_move_as_each_does_alone(folder: Path, integrator: str):
-    """They overlap from the start, and do not touch: an obstacle, parts, pins, anchors, forces and
-    starts are all there is, and regions are of one body each."""
+    """They overlap from the start and do not touch.
+
+    Obstacles, parts, pins, anchors, forces and starts are there. Each region is of a single body.
+    """
     time = {"step": 0.01, "duration": 0.1, "integrator": integrator}
     time |= {"substep": 5e-4} if integrator == "verlet" else {}
     together, frames = play(write(folder, "three", body=BODIES, time=time))
@@ -200,7 +202,7 @@ def test_no_two_bodies_have_a_node_in_common_and_one_follows_the_other():
 
 
 def test_coarse_cells_join_no_bodies_until_they_are_as_large():
-    """A node of a grid coarsened l times, whose weight reaches from i to i + 1, is of one body."""
+    """A node of a grid coarsened l times, with weights from i to i + 1, is of a single body."""
     several = grids((7, 7, 7), (7, 7, 7), (7, 7, 7))
     # a body is a single cell at level 3
     for level in range(4):
@@ -234,8 +236,10 @@ def test_count_is_that_of_all_bodies(folder: Path):
 
 
 def test_tables_of_the_scene_are_of_all_bodies(folder: Path):
-    """The scene's pin holds what of any body lies in its region; its start is that of a body
-    without one."""
+    """The scene's pin holds nodes of any body in its region.
+
+    Its start is the start of a body without its own.
+    """
     bodies = [{"mesh": {"source": "bar.ply", "base": [x, 0, 0]}} for x in (0, 1)]
     bodies[1]["start"] = {"velocity": [0, 1.0, 0]}
     pin, part = (

@@ -43,8 +43,10 @@ def test_springs_have_the_mean_fill_of_the_corners_that_agree_with_both_ends():
 
 
 def test_uniform_strain_costs_the_energy_of_the_volume_inside():
-    """Of a box askew in the grid: u^T H u = C volume of any uniform strain, but for the least fill
-    of corners."""
+    """For a box askew in the grid, u^T H u = C volume of any uniform strain.
+
+    Only the least fill of corners differs.
+    """
     box = tilted_box()
     lattice = study.lattice_of(box, 0.06, "fill")
     assert lattice.mass.sum() == pytest.approx(DENSITY * box.volume, rel=1e-3)
@@ -69,8 +71,10 @@ def test_every_node_has_the_mass_that_its_springs_diagonal_says():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BARS)
 def test_bars_across_the_grid_sag_as_timoshenkos(name: str):
-    """A fifth of what whole cells are off, whose mass is a third too large; nearly as beams along
-    the grid."""
+    """The error is a fifth of the error of whole cells, whose mass is a third too large.
+
+    The bars are nearly as accurate as beams along the grid.
+    """
     errors = np.array([bar_errors(name, size) for size in (0.4, 0.25)])
     assert (errors < 0).all() and errors[0].mean() > -0.105 and errors[1].mean() > -0.055
     # the error hardly depends on the place of the grid

@@ -162,7 +162,7 @@ def test_a_large_mesh_turns_with_its_groups(tmp_path: Path, monkeypatch):
 
 
 def test_a_closed_group_is_all_that_it_encloses(tmp_path: Path):
-    """Of two blocks in one file, each its own part and half of the body."""
+    """Two blocks in a file, each its own part and half of the body."""
     halves = {
         name: block(SIDES / [2, 1, 1], low)[0] for name, low in (("near", 0), ("far", 2 * CELL))
     }

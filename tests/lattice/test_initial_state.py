@@ -23,12 +23,12 @@ NEAR = [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}]
 
 
 def begin(folder: Path, start: dict, **tables) -> tuple[Model, list[Frame]]:
-    """Its start and one step."""
+    """Return the model with its start and the frames of a step."""
     return play(block_scene(folder, time={"step": T, "duration": T}, start=start, **tables))
 
 
 def at_start(folder: Path, start: dict) -> tuple[Model, Frame]:
-    """Its start alone: what a step makes of a body that is a line is for rounding to say."""
+    """Return the start alone: a step of a body that is a line is decided by rounding."""
     scene = load_scene(block_scene(folder, time={"step": T, "duration": T}, start=start))
     model = build_model(MPI.COMM_SELF, scene)
     with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
@@ -46,15 +46,17 @@ def test_scale_is_about_the_middle_of_the_box(tmp_path: Path, scale: list[float]
 
 @pytest.mark.parametrize("more", [{}, {"velocity": [1, 0, 0]}])
 def test_a_body_in_a_point_is_refused(tmp_path: Path, more: dict):
-    """No spring has a direction there: what a step made of it was rounding's to say, or nothing."""
+    """No spring has a direction there, so rounding would decide a step."""
     with pytest.raises(InputError, match="start: scales the body to a point"):
         at_start(tmp_path, {"scale": [0, 0, 0]} | more)
     assert at_start(tmp_path, {"scale": [0, 0, 0], "scatter": 0.5} | more)[1].elastic > 0
 
 
 def test_twist_about_a_slanted_axis_turns_all_in_planes_across_it(tmp_path: Path):
-    """The angle by the cosine of what is across the axis; at the corners of the box, where it is 0
-    and 30 degrees."""
+    """The angle follows from the cosine of the vectors across the axis.
+
+    At the corners of the box it is 0 and 30 degrees.
+    """
     axis = np.array([1, 1, 1]) / np.sqrt(3)
     model, frames = begin(tmp_path, {"twist": {"axis": [1, 1, 1], "degrees": -30}})
     p, q = model.lattice.nodes - MIDDLE, frames[0].position - MIDDLE
@@ -129,8 +131,10 @@ def test_spin_has_the_angular_momentum_of_the_block(tmp_path: Path, integrator: 
 
 
 def test_gradient_stretches_and_turns_about_the_centre_or_a_point(tmp_path: Path):
-    """Of diag(a, b, c) the kinetic energy is m/2 (a^2 (A^2 / 12 + h^2 / 6) + ...), since a cell's
-    mass sits at its corners; an antisymmetric gradient is a spin."""
+    """The kinetic energy of diag(a, b, c) is m/2 (a^2 (A^2 / 12 + h^2 / 6) + ...).
+
+    A cell's mass sits at its corners. An antisymmetric gradient is a spin.
+    """
     rates, about = np.array([2.0, -1.0, 3.0]), np.array([0.1, 0.2, -0.3])
     second = SIDES**2 / 12 + CELL**2 / 6
     energy = MASS / 2 * rates**2 @ second
@@ -152,9 +156,11 @@ def test_gradient_stretches_and_turns_about_the_centre_or_a_point(tmp_path: Path
 
 @pytest.mark.parametrize("h", [1 / 2, 1 / 4])
 def test_swirl_of_the_twisting_column(tmp_path: Path, h: float):
-    """A column of 1 x 6 x 1 m and 1100 kg/m^3, turning by 105 sin(pi y / 12) about y, has 3.031875
-    MJ. With its mass at nodes, the sums of x^2 are larger by h^2 / 6, and the sums of the sine are
-    those of the trapezium rule: exact for sine^2, h/2 cot(pi h / 24) for the sine."""
+    """A column of 1 x 6 x 1 m and 1100 kg/m^3 that turns by 105 sin(pi y / 12) has 3.031875 MJ.
+
+    With lumped masses, sums of x^2 are larger by h^2 / 6. Sums of the sine follow the trapezium
+    rule. It is exact for sine^2 and gives h/2 cot(pi h / 24) for the sine.
+    """
     y = np.arange(0, 6 + h / 2, h)
     rates = 105 * np.sin(np.pi * y / 12)
     swirl = {"axis": [0, 2, 0], "distances": y.tolist(), "rates": rates.tolist()}

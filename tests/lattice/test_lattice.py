@@ -14,7 +14,7 @@ from msmpetsc.scene.body import Material
 
 
 def springs_by_definition(cells: np.ndarray) -> dict[frozenset, int]:
-    """Every pair of corners of one cell, with the number of cells that share it."""
+    """Return every pair of corners of a cell, with the number of cells that share the pair."""
     springs: dict[frozenset, int] = {}
     for cell in cells:
         corners = [tuple(corner) for corner in cell + CORNERS]

@@ -65,8 +65,11 @@ def fem_sag(across: int, order: int = 1) -> float:
 
 @pytest.mark.parametrize("across", ACROSS)
 def test_the_excess_stiffness_is_that_of_cells_that_cannot_curve(across: int):
-    """E I (1 + 169/140 (h/b)^2); what is left is the clamp, which holds the width too (0.7% by
-    scikit-fem), and at two cells across twice that."""
+    """E I (1 + 169/140 (h/b)^2).
+
+    The rest is the clamp, which holds the width, too: 0.7% by scikit-fem, twice as much at two
+    cells across.
+    """
     sag, frequency = lattice_beam(across)
     assert -0.015 < sag / study.timoshenko_sag(across) - 1 < 0
     assert 0 < frequency / study.timoshenko_frequency(across) - 1 < 0.0075
@@ -128,19 +131,21 @@ def free_flight(t: float, shake: float, error: float, poisson: float | None) -> 
 def test_a_shaken_body_keeps_its_momentum_however_loose_its_steps(
     error: float, poisson: float | None
 ):
-    """Every cell gives each of its corners the same mass and the same diagonal entry of L: Jacobi's
-    preconditioner is a multiple of M, and CG then brings in no net force however early it stops. (A
-    start from q_n does, but this one is not taken here.)"""
+    """Every cell gives each of its corners the same mass and the same diagonal entry of L.
+
+    So Jacobi's preconditioner is a multiple of M, and CG brings in no net force however early it
+    stops. A start from q_n would, but is not used here.
+    """
     assert free_flight(1 / 100, 0.1, error, poisson)[0] < 1e-12
 
 
 def rigid_loss(angle: float, steps: int) -> float:
-    """Angular momentum that implicit Euler takes from a rigid body turning by ``angle`` a step, as
-    a share.
+    """Return the share of angular momentum that implicit Euler takes from a rigid body.
 
-    Central forces make no torque, so sum_i x_(n+1) x M (x_(n+1) - 2 x_n + x_(n-1)) = 0: with a_n
-    the n-th turn sin(a_n + a_(n-1)) = 2 sin a_n. The momentum goes as sin a_n; da/dn = -a^3 for
-    small ones."""
+    It turns by ``angle`` a step. Central forces make no torque, so sum_i x_(n+1) x M (x_(n+1) - 2
+    x_n + x_(n-1)) = 0. For the n-th turn a_n this is sin(a_n + a_(n-1)) = 2 sin a_n. The momentum
+    goes as sin a_n, and da/dn = -a^3 for small turns.
+    """
     last = angle
     for _ in range(steps):
         last = np.arctan2(np.sin(last), 2 - np.cos(last))

@@ -27,7 +27,7 @@ def of_parts(folder: Path, *parts: dict, **tables) -> Model:
     )
 
 
-# ---- what a node and a spring get
+# ---- material of a node and a spring
 
 
 def test_each_cell_gives_its_own_mass_to_its_corners(tmp_path: Path):
@@ -93,7 +93,7 @@ def test_painted_cells_are_a_part(tmp_path: Path):
 
 
 def forces(model: Model, displacement: np.ndarray) -> np.ndarray:
-    """Of the springs, (n, 3) [N]."""
+    """Return the forces (n, 3) [N] of the springs."""
     force = np.zeros_like(displacement)
     Elasticity(model.lattice).add_gradient(model.lattice.nodes + displacement, force)
     return force
@@ -140,8 +140,10 @@ def test_halves_side_by_side_are_springs_in_parallel(tmp_path: Path, ratio: floa
 
 
 def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp_path: Path):
-    """Momentum is that of the heavy half, thrown; steps long enough that the light one has no swing
-    left."""
+    """The heavy half, thrown, has nearly all momentum.
+
+    Steps are so long that the light half does not swing any more.
+    """
     path = block_scene(
         tmp_path,
         part=[{"region": FAR, "density": 1e6 * DENSITY}],

@@ -75,7 +75,7 @@ def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
 
 
 def test_parts_are_those_of_the_nearest_cell(subject):
-    """Two cells; the later of two parts that both mean the second one counts."""
+    """Two cells. The later of two parts that name the second cell counts."""
     x, y, z = np.mgrid[0:3, 0:2, 0:2].reshape(3, -1)
     cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(2)])
     nodes, points = (

@@ -1,4 +1,4 @@
-"""Films: their playback, their pictures as they come out of the file, and what cannot be filmed."""
+"""Films: their playback, their pictures as read from the file, and refusals."""
 
 import re
 from dataclasses import replace

@@ -1,5 +1,4 @@
-"""The page of a result: what is packed into it comes out again, and a browser shows the body where
-it should."""
+"""The page of a result: its packed data are read back, and a browser shows the body in place."""
 
 import base64
 import json

@@ -112,8 +112,10 @@ def test_play_plays_and_pauses(browser: Browser):
 
 
 def test_the_slider_goes_to_a_frame(browser: Browser):
-    """Of eleven frames the fourth stands at 3/10 of the slider; there the ball is 0.4 m lower than
-    at the start."""
+    """The fourth of eleven frames is at 3/10 of the slider.
+
+    The ball is 0.4 m lower than at the start.
+    """
     first = seen(browser)
     # pixels per metre; the ball is 0.2 m wide
     metre = np.ptp(first, axis=0)[0] / 0.2

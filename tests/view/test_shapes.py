@@ -1,4 +1,4 @@
-"""Obstacles that are meshes: drawn where they are at a time, from what the result holds of them."""
+"""Obstacles that are meshes are drawn at their places, from the data of the result."""
 
 from pathlib import Path
 
@@ -68,8 +68,7 @@ def with_mesh(path: Path, bounds) -> Path:
 
 
 def right_of_the_ball(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rows and columns of what is drawn a diameter and more right of the ball's left end, and the
-    ball's diameter."""
+    """Return rows and columns drawn a diameter or more right of the ball, and the diameter."""
     rows, columns = np.nonzero(picture.min(axis=2) < 230)
     left = columns.min()
     # ball from 0 to 0.2 m, cube from 0.25 to 0.35 m

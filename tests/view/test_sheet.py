@@ -1,5 +1,7 @@
-"""Contact sheets: the moments, the axes, and a picture that shows what it should (never compared as
-an image)."""
+"""Contact sheets: the moments, the axes, and the content of a picture.
+
+No picture is compared as an image.
+"""
 
 import os
 from dataclasses import replace

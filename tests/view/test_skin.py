@@ -1,5 +1,4 @@
-"""The surface as it is drawn: what the points put into long edges follow, and where sharp edges
-part the shading."""
+"""The surface as drawn: points put into long edges, and sharp edges that split the shading."""
 
 from dataclasses import replace
 
@@ -72,7 +71,7 @@ def test_long_edges_are_divided_without_holes():
 
 
 def test_normals_are_split_at_sharp_edges_alone():
-    """A cube has three normals at each corner; a ball of fine triangles one at each point."""
+    """A cube has three normals at each corner, a ball of fine triangles a single normal a point."""
     cube, ball = trimesh.creation.box([1, 1, 1]), trimesh.creation.icosphere(subdivisions=2)
     origin, triangles = split_at_edges(np.array(cube.vertices), np.array(cube.faces))
     assert len(origin) == 24 and (origin[triangles] == cube.faces).all()
@@ -102,7 +101,7 @@ def test_a_mesh_whose_triangles_share_no_points_is_drawn_smooth():
 
 
 def test_pins_are_coloured_up_to_where_half_of_a_point_is_held():
-    """A flat strip from above, one end of which is held: two colours, and none between them."""
+    """A flat strip from above, held at an end: two colours, and none between them."""
     x = np.arange(6.0)
     points = np.array([(a, b, 0) for a in x for b in (0, 1)])
     triangles = np.array(

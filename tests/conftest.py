@@ -49,8 +49,7 @@ DURATIONS = Path(__file__).parent / "durations.json"
 # minutes in all
 SMOKE = 10.0
 
-# [s]: what takes longer will not end; a loaded machine was seen to take ten times as
-# long as another
+# time limit of a run [s]; ten times the longest, since a loaded machine is as much slower
 HANGS = 500.0
 
 Run = Callable[..., subprocess.CompletedProcess]

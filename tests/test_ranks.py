@@ -1,4 +1,4 @@
-"""Scenes of all kinds on two ranks as on one.
+"""Scenes of all kinds agree on two ranks and in a serial run.
 
 The lattice is the same. Frames agree to the error of their steps.
 """

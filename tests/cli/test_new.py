@@ -26,7 +26,7 @@ from msmpetsc.scene.reading import load_scene
 def chair(upwards: int, back: int) -> trimesh.Trimesh:
     """Return a chair of boxes on y (1) or z (2).
 
-    Its back points to one end (1) or the opposite end (-1).
+    Its back points to an end (1) or the opposite end (-1).
     """
     # seat and back
     boxes = [[[0, 0.4, 0], [0.45, 0.45, 0.45]], [[0, 0.45, 0], [0.45, 0.9, 0.05]]]

@@ -152,7 +152,7 @@ def balls(tmp_path_factory) -> Path:
 def corners_of_cells_of(
     points: np.ndarray, low: np.ndarray, cell_size: float
 ) -> set[tuple[int, ...]]:
-    """Grid index of the corners of the cells that the points lie in, one by one."""
+    """Return the grid indices of the corners of the cells that hold the points."""
     found = set()
     for point in points:
         cell = [int((p - least) // cell_size) for p, least in zip(point, low, strict=True)]

@@ -1,12 +1,12 @@
-"""Stands in for ``msmpetsc run`` in tests of studies: a lattice of 8 nodes that swings by a
-formula.
+"""Stand in for ``msmpetsc run`` in tests of studies: 8 nodes that swing by a formula.
 
     study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
 
-What it does is ruled by the options: -ksp_fail ends it with an error, -ksp_hang never ends it,
--ksp_children starts another process before that, -ksp_exit N ends it with that status, -ksp_kind K
-tells of a failed step of that kind. Its wall time counts up with the runs of the folder, its motion
-is off by the time step."""
+Its options rule the outcome. -ksp_fail ends it with an error, -ksp_hang never ends it, and
+-ksp_children starts a further process before. -ksp_exit N ends it with that status, -ksp_kind K
+reports a failed step of that kind. Its wall time counts the runs of the folder, and the error of
+its motion is the time step.
+"""
 
 import json
 import os

@@ -133,7 +133,7 @@ def test_every_key_is_described_with_its_unit():
             assert not numeric or "[" in field["description"], name
 
 
-# --- one mistake, one line
+# --- mistakes, a line each
 
 SPHERE = "{ sphere = { center = [0, 0, 1], radius = 0.5 } }"
 # old text, new text, key of the message, and its line

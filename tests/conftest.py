@@ -49,7 +49,7 @@ DURATIONS = Path(__file__).parent / "durations.json"
 # minutes in all
 SMOKE = 10.0
 
-# time limit of a run [s]; ten times the longest, since a loaded machine is as much slower
+# time limit of a run [s]; a loaded machine is up to ten times as slow
 HANGS = 500.0
 
 Run = Callable[..., subprocess.CompletedProcess]

@@ -1,6 +1,6 @@
 """Paths on the command line that do not exist, are no file, or have the name of another format.
 
-Each gives one line and status 2. Commands for one process say so under mpiexec.
+Each gives a line and status 2. Commands for a single process say so under mpiexec.
 """
 
 import os

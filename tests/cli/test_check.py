@@ -1,4 +1,4 @@
-"""``msmpetsc check``: a scene of one's own guarded by its numbers."""
+"""``msmpetsc check``: a scene of the user guarded by its numbers."""
 
 import json
 from pathlib import Path

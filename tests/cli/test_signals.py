@@ -150,7 +150,7 @@ def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks:
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path):
-    """Both signals come within one linear solve, which these settings would not end for minutes."""
+    """Both signals come within a linear solve, which these settings would not end for minutes."""
     path = tmp_path / "x.h5"
     scene = hanging(
         tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9}

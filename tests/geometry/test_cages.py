@@ -151,7 +151,7 @@ def test_interior_is_what_a_dense_flood_fill_finds(name):
 def test_a_cavity_is_filled_but_where_cells_count_by_what_is_inside_and_it_is_wound_as_one(
     turned, boundary
 ):
-    # the flood from outside cannot reach the cavity, so it counts as interior in the paper
+    # the flood from outside cannot reach the cavity: it is interior in the paper
     cages = fill([body_of(hollow_ball(turned))], 0.1, boundary=boundary)
     middle = np.floor((0 - cages.grids.grids[0].origin) / 0.1).astype(int)
     assert dense(cages, INTERIOR)[tuple(middle)] != (turned and boundary == "fill")

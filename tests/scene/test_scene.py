@@ -1,4 +1,4 @@
-"""Scene files: their meaning, and one plain line for every mistake."""
+"""Scene files: their meaning, and a plain line for every mistake."""
 
 import json
 import math

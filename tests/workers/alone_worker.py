@@ -1,4 +1,4 @@
-"""The command line with failing ranks: alone_worker.py RANKS WHERE WHAT ARGUMENTS."""
+"""The command line with failing ranks: alone_worker.py RANKS PLACE ERROR ARGUMENTS."""
 
 import sys
 
@@ -9,26 +9,26 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 
 abort.PATIENCE = 1.0
-WHAT = {
+ERRORS = {
     "input": lambda: InputError("it fails"),
     "memory": lambda: MemoryError("Unable to allocate it all"),
 }
 
 
-def fail_at(where: str, what: str, fails: bool) -> None:
+def fail_at(place: str, error: str, fails: bool) -> None:
     import petsc4py
 
     petsc4py.init(["msmpetsc"])
     from msmpetsc import build
     from msmpetsc.solve.integrators.implicit import ImplicitEuler
 
-    owner, name = {"model": (build, "build_lattice"), "step": (ImplicitEuler, "advance")}[where]
+    owner, name = {"model": (build, "build_lattice"), "step": (ImplicitEuler, "advance")}[place]
     function, calls = getattr(owner, name), []
 
     def failing(*given, **named):
         calls.append(1)
-        if fails and len(calls) == (1 if where == "model" else 3):
-            raise WHAT[what]()
+        if fails and len(calls) == (1 if place == "model" else 3):
+            raise ERRORS[error]()
         return function(*given, **named)
 
     setattr(owner, name, failing)

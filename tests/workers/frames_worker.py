@@ -23,7 +23,7 @@ def positions(index: int, rows: int) -> np.ndarray:
 
 
 def frame(index: int, nodes: slice = slice(None), points: slice | None = slice(None)) -> Frame:
-    """Frame `index` of a body of NODES nodes and POINTS surface points, the rows of one rank."""
+    """Return frame ``index`` of NODES nodes and POINTS surface points, the rows of a rank."""
     surface = None if points is None else -positions(index, POINTS)[points]
     numbers = dict(
         step_error=index / 7, iterations=index + 1, ksp_its=index + 2, wall_time=index / 3

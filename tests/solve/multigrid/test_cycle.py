@@ -136,7 +136,7 @@ NAMED = {
     "clamped sheet": (lambda n: block(10 * n, 10 * n, 1), True, (1, 2, 4)),
     "figure": (figure, False, (1, 2)),
 }
-# most iterations, with a margin of 1; the legs of the figure share coarse nodes, since a
+# most iterations, with a margin of 1; the legs of the figure share coarse nodes, as a
 # single cell lies between them
 MOST = {"clamped beam": 3, "block": 3, "clamped sheet": 4, "figure": 9}
 # most additional iterations from the coarsest lattice to the finest

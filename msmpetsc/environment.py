@@ -11,7 +11,7 @@ from msmpetsc.constraints.anchors import Anchor, Anchors
 from msmpetsc.constraints.forces import ActingForces
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
-from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch, ContactSummary
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 
@@ -50,7 +50,7 @@ class Environment:
             self.self_contact and self.self_contact.law.friction > 0
         )
         # end positions and contact of the last step, if friction continues from it
-        self._ended: tuple[Positions, Contact] | None = None
+        self._ended: tuple[Positions, StepContact] | None = None
         self.touches = bool(model.penalties or self.self_contact)
         self.watch: Callable[[Any, Any], None] | None = None
 
@@ -78,7 +78,7 @@ class Environment:
         time_step: float,
         sides: Indices | None,
         end: Positions | None = None,
-    ) -> Contact | None:
+    ) -> StepContact | None:
         """Return the contact of the step from q, with friction; None if there is none (collective).
 
         last : positions (l, 3) [m] one step before q, for a two-step method
@@ -92,7 +92,7 @@ class Environment:
             surface = SurfaceContact(
                 self.contacts, q, time_step, last, end, previous.surface if previous else None
             )
-        return Contact(states, self.lattice.owned, surface) if states or surface else None
+        return StepContact(states, self.lattice.owned, surface) if states or surface else None
 
     def begin_contacts(self, q: Positions, time: float, time_step: float) -> None:
         """Begin a step at q with candidate pairs of the surface (collective).
@@ -104,18 +104,18 @@ class Environment:
             self.contacts = ContactSearch(self.self_contact, begin, time, self.contacts)
             self.contacts.narrow(q, begin)
 
-    def _previous_contact(self, q: Positions) -> Contact | None:
+    def _previous_contact(self, q: Positions) -> StepContact | None:
         """Return the contact of the last step if it ended at q, otherwise None (collective)."""
         if self._ended is None:
             return None
         ended, contact = self._ended
         return contact if self.lattice.table.comm.allreduce(q is ended, MPI.LAND) else None
 
-    def end_step(self, x: Positions, contact: Contact | None) -> None:
+    def end_step(self, x: Positions, contact: StepContact | None) -> None:
         """Record that a step ended at x (l, 3) [m], from which friction continues."""
         self._ended = (x, contact) if contact and self.has_friction else None
 
-    def friction_lags(self, x: Positions, contact: Contact | None) -> bool:
+    def friction_lags(self, x: Positions, contact: StepContact | None) -> bool:
         """Return whether friction in a step to x (l, 3) [m] used an outdated limit (collective).
 
         The limit is outdated if it differs from mu N at x by more than a factor of LAG_LIMIT.

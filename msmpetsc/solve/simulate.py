@@ -13,7 +13,7 @@ from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import AT_END, Checkpoint
 from msmpetsc.constraints.holders import sums_by
-from msmpetsc.contact.obstacles.penalty import ContactAt
+from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
@@ -405,7 +405,7 @@ class Forces:
         return points
 
     def _holding_forces(
-        self, q: Positions, contact: ContactAt | None, step: StepResult | None
+        self, q: Positions, contact: StepContactAt | None, step: StepResult | None
     ) -> Rows:
         """Return the forces (owned, 3) [N] that hold the nodes in place, without the loads."""
         forces, owned = np.zeros_like(q), self.model.lattice.owned
@@ -423,7 +423,7 @@ class Forces:
             )
         return forces
 
-    def _pushes(self, q: Positions, contact: ContactAt | None) -> dict[str, Any]:
+    def _pushes(self, q: Positions, contact: StepContactAt | None) -> dict[str, Any]:
         """Return the contact forces [N] of obstacles (o, 3) and on bodies (b, 3) of this rank."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
         push = np.zeros((len(self.keys), 3))

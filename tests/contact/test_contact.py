@@ -11,8 +11,9 @@ from mpi4py import MPI
 from obstacles import box, plane, sphere
 
 from msmpetsc.constraints.time_functions import Motion
-from msmpetsc.contact.obstacles.penalty import Contact, Penalty
+from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
+from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.scene.motion import Pose
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -55,23 +56,23 @@ cases = pytest.mark.parametrize(
 flat_cases = pytest.mark.parametrize("penalties", CASES.values(), ids=CASES)
 
 
-def pressed(penalties: list[Penalty]) -> tuple[Contact, np.ndarray, np.ndarray]:
+def pressed(penalties: list[Penalty]) -> tuple[StepContact, np.ndarray, np.ndarray]:
     """Contact of a step from random q, positions a little away from q, and a direction to go in
     from there."""
     rng = np.random.default_rng(3)
     q = rng.uniform(-0.9, 0.9, (40, 3))
-    contact = Contact([p.during(q, 0.5, T) for p in penalties], len(q))
+    contact = StepContact([p.during(q, 0.5, T) for p in penalties], len(q))
     return contact, q + 0.01 * rng.normal(size=q.shape), rng.normal(size=q.shape)
 
 
-def gradient(contact: Contact, q: np.ndarray) -> np.ndarray:
+def gradient(contact: StepContact, q: np.ndarray) -> np.ndarray:
     total = np.zeros_like(q)
     contact.at(q).add_gradient(total)
     return total
 
 
 def hessian(
-    contact: Contact, q: np.ndarray, duals: list | None = None
+    contact: StepContact, q: np.ndarray, duals: list | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nodes that any part of it is of, ascending, and the sums of their blocks."""
     total = np.zeros((len(q), 3, 3))
@@ -202,7 +203,7 @@ def test_a_node_in_a_box_is_pushed_out_through_the_nearest_face(axis: int, side:
     q = np.array([[0.05, -0.02, 0.03], [0.05, -0.02, 0.03]])
     # a point inside and a point outside the cube from -1 to 1
     q[0, axis], q[1, axis] = side * 0.8, side * 1.1
-    contact = Contact([Penalty(box([-1] * 3, [1] * 3), 50.0, 0.0, 1.0).during(q, T, T)], 2)
+    contact = StepContact([Penalty(box([-1] * 3, [1] * 3), 50.0, 0.0, 1.0).during(q, T, T)], 2)
     push = np.zeros((2, 3))
     push[0, axis] = side * 50 * 0.2
     np.testing.assert_allclose(-gradient(contact, q), push, atol=1e-13)
@@ -221,7 +222,7 @@ def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
         0.5: 1.0,
         0.01: 1.0,
     }.items():
-        contact = Contact([Penalty(moving, 100.0, 0.3, stick).during(start, 0.3, T)], 1)
+        contact = StepContact([Penalty(moving, 100.0, 0.3, stick).during(start, 0.3, T)], 1)
         np.testing.assert_allclose(gradient(contact, carried), [[0, 0, -20]], atol=1e-12)
         # deeper, but the normal force is that of the start
         slipped = carried - [0.05, 0, 0.1]
@@ -491,7 +492,7 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
     lattice, obstacle = model.lattice, model.penalties
     q, before = frames[5].position, frames[4].position
     penalties = [Penalty(p.obstacle, p.stiffness, friction, 0.01) for p in obstacle]
-    contact = Contact([p.during(q, 6 * PRESS_T, PRESS_T) for p in penalties], lattice.owned)
+    contact = StepContact([p.during(q, 6 * PRESS_T, PRESS_T) for p in penalties], lattice.owned)
     load = lattice.mass[:, None] * [4.0, 0, 0]
 
     def one_step(name: str, error: float):

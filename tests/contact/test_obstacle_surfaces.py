@@ -14,7 +14,7 @@ from crossings import count_crossings
 from one_process import input_error
 
 from msmpetsc.build import Model
-from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.contact.surface.obstacle_surfaces import ObstacleSurfaces
 from msmpetsc.fields import Frame
 from msmpetsc.results.reader import Result
@@ -104,7 +104,7 @@ def test_a_plate_turns_as_its_path_says_and_pushes_a_block_aside(
 ):
     prepare, free_but_pressed = LatticePreconditioner.prepare, []
 
-    def noting(self: LatticePreconditioner, q: np.ndarray, contact: Contact) -> bool:
+    def noting(self: LatticePreconditioner, q: np.ndarray, contact: StepContact) -> bool:
         changed = prepare(self, q, contact)
         free_but_pressed.append(self.is_free and contact.surface.presses(q))
         return changed

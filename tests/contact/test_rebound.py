@@ -10,7 +10,7 @@ import pytest
 from block_scene import block_scene, play
 from test_tunnelling import ball, totals
 
-from msmpetsc.contact.obstacles.penalty import ContactAt
+from msmpetsc.contact.step_contact import StepContactAt
 
 PLANE = {"shape": "plane", "point": [0, 0, -0.55], "normal": [0, 0, 1]}
 FALL = {"gravity": {"acceleration": [0, 0, -9.81]}, "start": {"velocity": [0, 0, -2.0]}}
@@ -79,5 +79,5 @@ def test_nodes_that_reach_the_ground_stop_together(tmp_path: Path, monkeypatch):
         return sum(frame.iterations for frame in frames)
 
     together = iterations()
-    monkeypatch.setattr(ContactAt, "stopped", lambda *_: None)
+    monkeypatch.setattr(StepContactAt, "stopped", lambda *_: None)
     assert together < 0.6 * iterations()

@@ -15,8 +15,9 @@ from hypothesis.extra.numpy import arrays
 from obstacles import box
 
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
-from msmpetsc.contact.obstacles.penalty import Contact, Penalty
+from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
+from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.errors import StepFailed
 
 INTEGRATORS = ["implicit-euler", "bdf2", "verlet"]
@@ -70,7 +71,7 @@ def test_what_appears_is_met_by_the_nearest_face_and_what_is_not_there_by_none()
 def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
     q = np.array([[0, 0, -0.3], [0, 0, 0.0009], [0, 0, 0.0001], [0, 0, -0.3]])
     sides = np.array([TOP, TOP, TOP, 0], np.int8)
-    contact = Contact([Penalty(THIN, 50.0, 0.0, 1.0).during(q, 1.0, 0.1, sides)], len(q))
+    contact = StepContact([Penalty(THIN, 50.0, 0.0, 1.0).during(q, 1.0, 0.1, sides)], len(q))
     push = np.zeros_like(q)
     contact.at(q).add_gradient(push)
     depth = np.array([0.301, 0.0001, 0.0009, 0])

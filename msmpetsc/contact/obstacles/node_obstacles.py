@@ -8,8 +8,9 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_host
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
+from msmpetsc.contact.obstacles.penalty import ObstacleContact, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
+from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.lattice.lattice import Lattice
 
 # positions (owned, 3) [m] and sides (o, owned or more); None without contact
@@ -70,12 +71,12 @@ class NodeObstacles:
         pushed = ([self._depths(row, (rows, side), time) for row in pressing] for side in (a, b))
         return bool(self.lattice.table.comm.allreduce(all(map(np.array_equal, *pushed)), MPI.LAND))
 
-    def push(self, time: float, sides: Indices | None) -> Contact | None:
+    def push(self, time: float, sides: Indices | None) -> StepContact | None:
         """Return the penalty contact at a time, without friction; None if no penalty acts."""
         states = [
             p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)
         ]
-        return Contact(states, self.lattice.owned) if states else None
+        return StepContact(states, self.lattice.owned) if states else None
 
     def during(
         self,
@@ -84,8 +85,8 @@ class NodeObstacles:
         end: Positions | None,
         step: tuple[float, float],
         sides: Indices | None,
-        before: Contact | None,
-    ) -> list[ContactState]:
+        before: StepContact | None,
+    ) -> list[ObstacleContact]:
         """Return the penalty contacts in a step from q, with friction.
 
         last, end : see Environment.contact
@@ -133,7 +134,7 @@ class NodeObstacles:
             for p, side in self._pressing(end, sides)
             if not p.obstacle.acts_at(begin)
         ]
-        return Contact(new, self.lattice.owned).energy(q) if new else 0.0
+        return StepContact(new, self.lattice.owned).energy(q) if new else 0.0
 
     def friction_work_bound(
         self, before: Placed, after: Placed, time: float, time_step: float, frame: Floats

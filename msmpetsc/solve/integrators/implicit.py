@@ -20,8 +20,8 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.constraints.forces import ExternalForces
-from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.obstacles.reflection import StepTaken
+from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
@@ -77,7 +77,7 @@ class ContactFaces:
     def __post_init__(self) -> None:
         self.solves = 0
         self.is_settled = False
-        self.contact: Contact | None = None
+        self.contact: StepContact | None = None
         self.start: Positions | None = None
         self.end: Positions | None = None
         self.sides = self._crossed(self.y)

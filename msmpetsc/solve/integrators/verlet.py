@@ -30,8 +30,8 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.node_friction import Movers
-from msmpetsc.contact.obstacles.penalty import ContactAt
 from msmpetsc.contact.obstacles.reflection import StepTaken
+from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.springs import crushing_energy
 from msmpetsc.environment import Environment
@@ -95,7 +95,7 @@ class Verlet(Integrator):
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.elastic = self.gradient[:owned]
-        self.contact: ContactAt | None = None
+        self.contact: StepContactAt | None = None
         self.sides = environment.obstacles.no_sides[:, :owned]
         self.load = np.zeros((owned, 3), like=self.lattice.nodes)
         self.damping = environment.damping

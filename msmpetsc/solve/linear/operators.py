@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scipy.sparse import coo_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
-from msmpetsc.contact.obstacles.penalty import ContactAt, Duals
+from msmpetsc.contact.step_contact import Duals, StepContactAt
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.elasticity.solid import CellHessians
@@ -48,7 +48,7 @@ class ContactBlocks:
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
-    def linearise(self, contact: ContactAt | None, duals: Duals | None) -> None:
+    def linearise(self, contact: StepContactAt | None, duals: Duals | None) -> None:
         """Compute the blocks of contact, with the duals of friction if given."""
         self.parts = []
         with CONTACT:
@@ -118,7 +118,7 @@ class TrueHessian:
     def linearise(
         self,
         q: Positions,
-        contact: ContactAt | None,
+        contact: StepContactAt | None,
         projected: bool = False,
         duals: Duals | None = None,
     ) -> None:

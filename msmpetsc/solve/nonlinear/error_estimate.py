@@ -16,7 +16,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions
-from msmpetsc.contact.obstacles.penalty import ContactAt
+from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
@@ -75,7 +75,7 @@ class ErrorEstimate:
         self.products += self.hessian.products + self.preconditioner.products - before
         return self.found + self.missing if self.ksp.reason > 0 else np.inf
 
-    def linearise(self, q: Positions, contact: ContactAt | None) -> None:
+    def linearise(self, q: Positions, contact: StepContactAt | None) -> None:
         """Linearise the Hessian and the preconditioner at positions q (l, 3) [m]."""
         self.preconditioner.prepare(q, contact)
         self.hessian.linearise(q, contact)

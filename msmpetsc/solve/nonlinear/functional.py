@@ -16,7 +16,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest, like, to_host
-from msmpetsc.contact.obstacles.penalty import Contact, ContactAt
+from msmpetsc.contact.step_contact import StepContact, StepContactAt
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError, StepFailed
@@ -56,7 +56,7 @@ class StepProblem:
     q: Positions
     y: Positions
     load: Rows
-    contact: Contact | None = None
+    contact: StepContact | None = None
     prescribed: Positions | None = None
     rates: tuple[Positions, Positions] | None = None
     pressures: tuple[float, ...] = ()
@@ -81,7 +81,7 @@ class Iterate:
     x: PETSc.Vec
     q: Positions
     f: PETSc.Vec
-    contact: ContactAt | None
+    contact: StepContactAt | None
 
 
 class StepFunctional:
@@ -139,7 +139,7 @@ class StepFunctional:
             self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
         return Iterate(x, q, f, contact)
 
-    def contact_at(self, q: Positions) -> ContactAt | None:
+    def contact_at(self, q: Positions) -> StepContactAt | None:
         """Return the step's contact at positions q (l, 3) [m]; None without contact."""
         return self.problem.contact.at(q) if self.problem.contact else None
 

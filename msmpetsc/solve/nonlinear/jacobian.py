@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, greatest
-from msmpetsc.contact.obstacles.penalty import Contact, ContactAt, Duals
+from msmpetsc.contact.step_contact import Duals, StepContact, StepContactAt
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import (
     ContactBlocks,
@@ -116,7 +116,7 @@ class Jacobian:
     def linearise(
         self,
         q: Positions,
-        contact: ContactAt | None,
+        contact: StepContactAt | None,
         projected: bool,
         duals: Duals | None,
         known: bool = False,
@@ -146,10 +146,10 @@ class FrictionDuals:
     """
 
     def __init__(self) -> None:
-        self.contact: Contact | None = None
+        self.contact: StepContact | None = None
         self.duals: Duals | None = None
 
-    def begin(self, contact: Contact | None) -> None:
+    def begin(self, contact: StepContact | None) -> None:
         """Begin a step."""
         self.contact = contact
         self.duals = contact.no_duals() if contact else None

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Positions
-from msmpetsc.contact.obstacles.penalty import ContactAt
+from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
@@ -192,7 +192,7 @@ class Newton(StepMethod):
         if share < 1.0:
             self.y.scale(share)
 
-    def _stop_at_obstacles(self, now: Iterate, contact: ContactAt, end: Positions) -> Positions:
+    def _stop_at_obstacles(self, now: Iterate, contact: StepContactAt, end: Positions) -> Positions:
         """Bend y so that nodes stop at obstacles that they would enter.
 
         H at x does not know obstacles that nodes do not touch yet. A line search that shortened the

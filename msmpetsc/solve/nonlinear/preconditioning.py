@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows, like
 from msmpetsc.comm import log
-from msmpetsc.contact.obstacles.penalty import ContactAt
+from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.operators import Block
@@ -70,7 +70,7 @@ class Preconditioner:
         self.own = unknowns.memory.read(self.vector).copy()
         self.added = np.zeros_like(self.own)
 
-    def prepare(self, q: Positions, contact: ContactAt | None) -> bool:
+    def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
         """Add the bound of contact at positions q (l, 3) [m] (collective).
 
         Return whether the matrix changed.
@@ -132,7 +132,7 @@ class LatticePreconditioner:
         self.excess = 0.0
         self.is_stale, self.is_new, self.is_free = True, False, False
 
-    def prepare(self, q: Positions, contact: ContactAt | None) -> bool:
+    def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
         """Build a hierarchy at positions q (l, 3) [m] if it is due; return whether it was."""
         self.is_free, is_due = self._is_free(q, contact), self.is_stale
         self.is_new = is_due
@@ -175,7 +175,7 @@ class LatticePreconditioner:
         self.excess = 0.0
         self.is_first = self.is_stale = False
 
-    def _is_free(self, q: Positions, contact: ContactAt | None) -> bool:
+    def _is_free(self, q: Positions, contact: StepContactAt | None) -> bool:
         """Return whether no obstacle presses on a node at positions q (l, 3) [m].
 
         Translations are then resisted by mass alone.
@@ -192,7 +192,7 @@ class LatticePreconditioner:
         pressed = any(len(nodes) for nodes, _ in contact.hessian())
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
-    def _blocks(self, contact: ContactAt | None) -> Rows:
+    def _blocks(self, contact: StepContactAt | None) -> Rows:
         """Return the Hessian (owned, 9) of obstacles, with the secant of friction.
 
         Return (0, 9) without contact.
@@ -274,7 +274,7 @@ class StepPreconditioner:
         assert chosen is not None
         return chosen
 
-    def prepare(self, q: Positions, contact: ContactAt | None) -> bool:
+    def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
         """Prepare for positions q (l, 3) [m]; return whether the preconditioner changed."""
         if (
             self.chooses
@@ -301,7 +301,7 @@ class StepPreconditioner:
         )
 
     @contextmanager
-    def searching(self, q: Positions, contact: ContactAt | None) -> Iterator[None]:
+    def searching(self, q: Positions, contact: StepContactAt | None) -> Iterator[None]:
         """Switch to multigrid, built at positions q (l, 3) [m], for a long search.
 
         Smooth modes converge last with Jacobi's preconditioner, and at once with multigrid. This

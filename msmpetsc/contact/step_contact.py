@@ -1,0 +1,194 @@
+"""Contact energy of a step: obstacles that nodes meet, and surfaces that meet.
+
+``StepContact.at`` gives its values at positions with the nodes inside each obstacle. Gradient,
+Hessian and bounds share these nodes.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
+from msmpetsc.contact.friction import squares
+from msmpetsc.contact.obstacles.node_friction import Movers, Pressed, apply_friction
+from msmpetsc.contact.obstacles.penalty import ObstacleContact
+from msmpetsc.contact.surface.surface_contact import SurfaceContact
+
+# depth at which nodes are stopped [fraction]; above 0, so that the Hessian has contact
+STOP_DEPTH = 1e-3
+# duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
+Duals = list[Rows | None]
+
+
+class StepContact:
+    """The contact energy of a step: all obstacles, and the surface's self-contact.
+
+    Positions q are (owned or more, 3) [m]. The Hessian of obstacles has a 3 x 3 block per node in
+    contact. Methods that use the surface are collective.
+
+    surface : self-contact of the scene; None if it has none
+    """
+
+    def __init__(
+        self, states: list[ObstacleContact], owned: int, surface: SurfaceContact | None = None
+    ):
+        self.states, self.owned, self.surface = states, owned, surface
+
+    def energy(self, q: Positions) -> float:
+        """Return the penalty energy [J] of obstacles, without friction and self-contact."""
+        energy = 0.0
+        for state in self.states:
+            inside = np.maximum(state.depths(q[: self.owned])[0], 0)
+            energy += 0.5 * state.penalty.stiffness * float(inside @ inside)
+        return energy
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return the change [J] of the contact energy from base to q, friction included."""
+        total = 0.0
+        for state in self.states:
+            total += state.change(q[: self.owned], base[: self.owned])
+            if state.friction:
+                total += state.friction.change(q, base)
+        return total + (self.surface.change(q, base) if self.surface else 0.0)
+
+    def change_of_friction(self, q: Positions, base: Positions) -> float:
+        """Return the change [J] of the energy of the obstacles' friction from base to q."""
+        return sum(state.friction.change(q, base) for state in self.states if state.friction)
+
+    def at(self, q: Positions) -> "StepContactAt":
+        """Return the contact at q."""
+        return StepContactAt(self, q, [state.pressed(q[: self.owned]) for state in self.states])
+
+    def friction_limits(self, q: Positions) -> Floats:
+        """Return the sum of mu N [N] that this rank's friction uses, and its value at q, (2,)."""
+        of_nodes = sum(
+            (state.friction_limits(q[: self.owned]) for state in self.states), np.zeros(2)
+        )
+        return of_nodes + self.surface.friction_limits(q) if self.surface else of_nodes
+
+    def released(self, q: Positions) -> float:
+        """Return the energy [J] of elastic slips at the step's beginning minus that at q."""
+        of_nodes = sum(
+            state.friction.released(q[: self.owned]) for state in self.states if state.friction
+        )
+        return of_nodes + (self.surface.released(q) if self.surface else 0.0)
+
+    def no_duals(self) -> Duals:
+        """Return the duals for which ``hessian`` has the secant of the obstacles' friction.
+
+        The matrix A needs the secant: the true Hessian is zero along a slip, so nodes oscillate.
+        """
+        return [
+            *(state.friction.no_duals() if state.friction else None for state in self.states),
+            None,
+        ]
+
+    def duals_after(self, q: Positions, base: Positions, duals: Duals) -> Duals:
+        """Return the duals of friction after the full step from base to q."""
+        of_nodes = [
+            state.friction.duals_after(q, base, known) if state.friction else None
+            for state, known in zip(self.states, duals[:-1], strict=True)
+        ]
+        return [*of_nodes, self.surface.duals_after(q, base, duals[-1]) if self.surface else None]
+
+
+@dataclass(frozen=True)
+class StepContactAt:
+    """The contact energy of a step at given positions, with its derivatives.
+
+    q       : (owned or more, 3) positions [m]
+    pressed : the nodes inside each obstacle
+    """
+
+    contact: StepContact
+    q: Positions
+    pressed: list[Pressed]
+
+    @property
+    def surface(self) -> SurfaceContact | None:
+        """Self-contact of the scene; None if it has none."""
+        return self.contact.surface
+
+    @property
+    def of_obstacles(self) -> Iterator[tuple[ObstacleContact, Pressed]]:
+        """The contact of each obstacle, with the nodes inside."""
+        return zip(self.contact.states, self.pressed, strict=True)
+
+    def add_gradient(self, gradient: Rows) -> None:
+        """Add the gradient [N] of the contact energy to ``gradient`` (owned or more, 3)."""
+        for state, pressed in self.of_obstacles:
+            state.add_gradient(self.q[: self.contact.owned], pressed, gradient)
+        if self.surface:
+            self.surface.add_gradient(self.q, gradient)
+
+    def stopped(self, end: Positions) -> Positions | None:
+        """Return positions with the nodes that enter obstacles on the path to ``end`` stopped.
+
+        They stop at a small depth, where the Hessian has the contact. Return None without such
+        nodes.
+
+        end : (owned or more, 3) [m]
+        """
+        owned, stopped = self.contact.owned, None
+        for state, (inside, _, _) in self.of_obstacles:
+            rows, depth, normal = state.pressed(end[:owned])
+            was_inside = np.zeros(owned, bool, like=end)
+            was_inside[inside] = True
+            new = ~was_inside[rows]
+            if new.any():
+                stopped = end.copy() if stopped is None else stopped
+                stopped[rows[new]] += (1 - STOP_DEPTH) * depth[new][:, None] * normal[new]
+        return stopped
+
+    def hessian(self, duals: Duals | None = None) -> Iterator[tuple[Indices, Rows]]:
+        """Yield the nodes (a,) and blocks (a, 3, 3) [N/m] of each obstacle's penalty and friction.
+
+        The Hessian is the sum of all blocks, each positive semidefinite. The negative term -k d / r
+        of a solid with radius of curvature r is neglected.
+
+        duals : duals of friction; None for its true Hessian
+        """
+        of_states = duals[:-1] if duals else [None] * len(self.pressed)
+        for (state, pressed), known in zip(self.of_obstacles, of_states, strict=True):
+            rows, _, normal = pressed
+            yield rows, state.penalty.stiffness * squares(normal)
+            if state.friction:
+                yield state.friction.nodes, state.friction.blocks(self.q, known)
+
+    def bound(self) -> Floats:
+        """Return an upper bound (owned,) [N/m] of each node's block.
+
+        It is constant while the set of nodes in contact is.
+        """
+        bound = np.zeros(self.contact.owned, like=self.q)
+        for state, (rows, _, _) in self.of_obstacles:
+            bound[rows] += state.penalty.stiffness
+            if state.friction:
+                bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
+        return bound + self.surface.bound(self.q) if self.surface else bound
+
+    def power(self, begin: float, end: float) -> float:
+        """Return the power [W] of the penalties on this rank's nodes.
+
+        begin, end : the substep [s] that gives an obstacle's velocity
+        """
+        power = 0.0
+        for state, (_, depth, normal) in self.of_obstacles:
+            displacement = state.penalty.obstacle.path.displacement_between(begin, end)
+            if displacement.any():
+                work = float(depth @ (normal @ like(self.q, displacement)))
+                power += state.penalty.stiffness / (end - begin) * work
+        return power
+
+    def apply_friction(self, nodes: Movers, duration: float, begin: float, end: float) -> None:
+        """Apply the obstacles' friction for a ``duration`` [s] to this rank's nodes.
+
+        begin, end : the substep [s] that gives an obstacle's velocity
+        """
+        for state, pressed in self.of_obstacles:
+            p = state.penalty
+            if p.friction > 0:
+                displacement = p.obstacle.path.displacement_between(begin, end)
+                carried = like(self.q, displacement / (end - begin))
+                apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)

@@ -31,7 +31,7 @@ class Environment:
     retardation : viscosity over stiffness [s]
     contacts    : surface contacts of the step begun last; None without surface contact
     touches     : whether the model has penalty obstacles or surface contact
-    watch       : called with the first iterate of each solve and its Jacobian; None for no call
+    system_monitor : called with the first iterate of each solve and its Jacobian; None for no call
     """
 
     def __init__(self, model: Model):
@@ -52,7 +52,7 @@ class Environment:
         # end positions and contact of the last step, if friction continues from it
         self._ended: tuple[Positions, StepContact] | None = None
         self.touches = bool(model.penalties or self.self_contact)
-        self.watch: Callable[[Any, Any], None] | None = None
+        self.system_monitor: Callable[[Any, Any], None] | None = None
 
     def events(self) -> list[float]:
         """Return the times [s] at which a load or path starts, stops or changes its slope."""

@@ -105,7 +105,7 @@ class TimeLoop:
     state  : state after the last step
     step   : number of steps taken, of ``steps``
     stored : number of frames of the whole run; ``stored_until(step)`` of its first steps
-    watch  : called with the number of a step, the first iterate of a solve and its Jacobian
+    system_monitor : called with the number of a step, the first iterate of a solve and its Jacobian
     saved  : checkpoint of the last ``REMEMBERED``-th step, from which the run may resume
     """
 
@@ -115,7 +115,7 @@ class TimeLoop:
         scene: Scene,
         model: Model,
         true_error: int | None = None,
-        watch: Callable[[int, Iterate, Jacobian], None] | None = None,
+        system_monitor: Callable[[int, Iterate, Jacobian], None] | None = None,
     ):
         model = to_device(model, sender(comm))
         if model.collision and not on_host(model.lattice.nodes):
@@ -123,7 +123,8 @@ class TimeLoop:
         if model.pressures and not on_host(model.lattice.nodes):
             raise InputError("pressure is computed on CPUs: --device cpu")
         self.comm, self.model = comm, model
-        self.true_error, self.time_step, self.watch = true_error, scene.time.step, watch
+        self.true_error, self.time_step = true_error, scene.time.step
+        self.system_monitor = system_monitor
         self.steps, self.every = scene.time.steps, scene.output.every
         self.step = 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
@@ -192,7 +193,8 @@ class TimeLoop:
         """Take the next step; return its frame if it is stored (collective). Raises StepFailed."""
         time = index * self.time_step
         self.monitors.overlaps(index, time, self.state.q)
-        self.environment.watch = partial(self.watch, index) if self.watch else None
+        if self.system_monitor:
+            self.environment.system_monitor = partial(self.system_monitor, index)
         begin = perf_counter()
         try:
             result, self.state = self.recovery.step(self.state, time)

@@ -141,7 +141,7 @@ def test_the_matrix_multiplies_as_the_products_do(tmp_path: Path, tables: dict, 
 
     scene = load_scene(bodies(tmp_path, **tables))
     model = build_model(MPI.COMM_SELF, scene)
-    with TimeLoop(MPI.COMM_SELF, scene, model, watch=check) as loop:
+    with TimeLoop(MPI.COMM_SELF, scene, model, system_monitor=check) as loop:
         for _ in loop.frames():
             pass
     assert checked

@@ -191,7 +191,7 @@ def test_an_exported_hessian_is_that_of_the_cpu(tmp_path: Path, case: str, on_gp
                 found.append(assembled(jacobian.unknowns, blocks_of(jacobian.hessian)))
 
         model = build_model(MPI.COMM_SELF, scene)
-        with TimeLoop(MPI.COMM_SELF, scene, model, watch=keep) as simulation:
+        with TimeLoop(MPI.COMM_SELF, scene, model, system_monitor=keep) as simulation:
             for _ in simulation.advance():
                 if found:
                     return csr_array(found[0].getValuesCSR()[::-1]).toarray()

@@ -100,7 +100,7 @@ class ContactFaces:
         load, pressures = self.load.force, self.load.pressures.values
         return StepProblem(
             self.q, self.y, load, self.contact, prescribed,
-            pressures=pressures, watch=environment.watch,
+            pressures=pressures, system_monitor=environment.system_monitor,
         )  # fmt: skip
 
     def solve(self, step: Callable[[StepProblem], StepResult]) -> StepResult:

@@ -50,7 +50,7 @@ class StepProblem:
     rates      : two positions (l, 3) [m] whose difference gives the strain rates of a viscous solid
                  (elasticity.viscosity.Viscosity.begin)
     pressures  : pressures on the lattice's surfaces [Pa]
-    watch      : called with the first iterate of a solve and its Jacobian; None for no call
+    system_monitor : called with the first iterate of a solve and its Jacobian; None for no call
     """
 
     q: Positions
@@ -60,7 +60,7 @@ class StepProblem:
     prescribed: Positions | None = None
     rates: tuple[Positions, Positions] | None = None
     pressures: tuple[float, ...] = ()
-    watch: Callable[[Any, Any], None] | None = None
+    system_monitor: Callable[[Any, Any], None] | None = None
 
     @property
     def fixed_positions(self) -> Positions:

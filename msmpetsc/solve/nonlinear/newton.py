@@ -87,8 +87,8 @@ class Newton(StepMethod):
         projected, its = self.preset.projected, 0
         while not (reason := self._reason(snes, its, now, outcome)):
             self._linearise(now, outcome, projected > 0)
-            if its == 0 and (watch := self.functional.problem.watch):
-                watch(now, self.jacobian)
+            if its == 0 and (monitor := self.functional.problem.system_monitor):
+                monitor(now, self.jacobian)
             if not self._solve(now, outcome):
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break

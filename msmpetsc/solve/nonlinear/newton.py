@@ -63,7 +63,7 @@ class Newton(StepMethod):
         self.slopes: Array | None = None
         # Whether the solve may end after an iteration in which |F| grows by SOFTER,
         # whether it did so, and |F| at its start
-        self.watches, self.overshot, self.begun = False, False, np.inf
+        self.ends_on_overshoot, self.overshot, self.begun = False, False, np.inf
         self._given: tuple[Iterate, Outcome] | None = None
 
     def begin(self) -> None:
@@ -115,7 +115,9 @@ class Newton(StepMethod):
         snes.monitor(its, now.f.norm())
         if its == 0:
             self.begun = outcome.residual
-        self.overshot = self.watches and its == 1 and outcome.residual > SOFTER * self.begun
+        self.overshot = (
+            self.ends_on_overshoot and its == 1 and outcome.residual > SOFTER * self.begun
+        )
         if self.overshot:
             return int(REASON.CONVERGED_ITS)
         most = snes.getTolerances()[3]

@@ -265,11 +265,11 @@ class Stepper:
             isinstance(newton, Newton) and self.static and self.stiffest > 2 and not self.budget
         ):
             return self.method.minimise(start, outcome)
-        newton.watches = True
+        newton.ends_on_overshoot = True
         try:
             now, reached = newton.minimise(start, outcome)
         finally:
-            newton.watches = False
+            newton.ends_on_overshoot = False
         return (
             newton.minimise(self._softened(newton, now), outcome)
             if newton.overshot

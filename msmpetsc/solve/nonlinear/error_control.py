@@ -87,7 +87,7 @@ class Outcome:
         return self.bound < FULL_STEP_ERROR and (self.corrected or not self.doubts)
 
     @property
-    def is_enough(self) -> bool:
+    def is_converged(self) -> bool:
         """Whether the error is below the goal or F is rounding."""
         return self.at_rounding or self.error <= self.goal
 

@@ -51,7 +51,7 @@ class LocalGlobal(StepMethod):
         if self.has_npc:
             # The NPC solves with A before SNES tests its start
             self.outcome = self.control.judge(start, self.outcome)
-            if self.outcome.is_enough:
+            if self.outcome.is_converged:
                 return start, self.outcome
             self.adapt(self.outcome)
         if self.snes.getType() == PETSc.SNES.Type.QN:
@@ -66,7 +66,7 @@ class LocalGlobal(StepMethod):
         self.snes.getSolution().copy(end)
         iterate = self.functional.iterate(end)
         self.outcome = self.finish(iterate, self.outcome)
-        if not (self.outcome.is_enough or self.budget):
+        if not (self.outcome.is_converged or self.budget):
             ends = f"-{self.prefix}snes_type {self.snes.getType()} ends by a rule of its own"
             raise InputError(f"{ends}, {self.outcome.error:.2e} off: {BY_ERROR}")
         return iterate, self.outcome

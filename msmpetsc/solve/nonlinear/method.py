@@ -62,7 +62,7 @@ class StepMethod(ABC):
             return NOT_FINITE
         if outcome.at_rounding:
             return int(REASON.CONVERGED_FNORM_ABS)
-        if outcome.is_enough:
+        if outcome.is_converged:
             return int(
                 REASON.CONVERGED_SNORM_RELATIVE
                 if outcome.corrected
@@ -85,7 +85,7 @@ class StepMethod(ABC):
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
         """Return the final outcome by SNES's reason. Raises StepStopped and StepFailed."""
         reason = self.snes.reason
-        if reason == REASON.CONVERGED_ITS and not (outcome.corrected or outcome.is_enough):
+        if reason == REASON.CONVERGED_ITS and not (outcome.corrected or outcome.is_converged):
             return self.control.estimated(iterate, outcome, 0.0)
         if reason < 0:
             if Stop.agreed(self.functional.comm):

@@ -97,7 +97,7 @@ def _about(
         contact = functional.contact_at(q)
         stepper.jacobian.hessian.linearise(q, contact)
         stepper.jacobian.preconditioner.prepare(q, contact)
-        squares, modes = _lowest(stepper.minimum.curvature.search, count)
+        squares, modes = _lowest(stepper.optimality.curvature.search, count)
         order = np.lexsort((squares, squares != 0))
         shapes = np.zeros((count, lattice.owned, 3))
         shapes[:, unknowns.free] = modes[order].reshape(count, 3, -1).transpose(0, 2, 1)

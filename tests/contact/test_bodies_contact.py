@@ -280,7 +280,7 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
             simulation.integrator.stepper,
             simulation.state,
         )
-        functional, minimum, q = stepper.functional, stepper.minimum, state.q
+        functional, optimality, q = stepper.functional, stepper.optimality, state.q
         y, load = 2 * q - state.q_previous, environment.forces.at(0.01)
         faces = ContactFaces(environment, q, y, load, 0.01, 0.01, None, stepper.lattice.pinned)
         environment.contacts.widen()
@@ -288,8 +288,8 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
         now = functional.at(q)
         stepper.control.estimate(now)
         correction = stepper.control.estimate.found
-        outcome = Outcome(corrected=True, compression=minimum.curvature.compression(q))
-        verdict = minimum.examine(now, outcome, correction)
+        outcome = Outcome(corrected=True, compression=optimality.curvature.compression(q))
+        verdict = optimality.examine(now, outcome, correction)
     assert verdict.error > 10 * correction / functional.distance(q)
 
 

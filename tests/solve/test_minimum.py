@@ -133,7 +133,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
         petsc_options(pc_type="jacobi")
     simulation, q = squashed(tmp_path, share)
     stepper = simulation.integrator.stepper
-    functional, curvature = stepper.functional, stepper.minimum.curvature
+    functional, curvature = stepper.functional, stepper.optimality.curvature
     functional.begin(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.jacobian.hessian.linearise(q, None)
     found, direction = curvature.lowest(q, curvature.compression(q), Alarm.NOWHERE, None)
@@ -180,7 +180,7 @@ def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: flo
     lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
     stepper = Stepper(MPI.COMM_SELF, lattice, T, find_preset(preset), error=1e-3)
     q = lattice.nodes + shift
-    compression = stepper.minimum.curvature.compression(q)
+    compression = stepper.optimality.curvature.compression(q)
     assert compression.least_curvature == 0 and compression.greatest == pytest.approx(4 * 0.29)
     result = stepper.step(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.destroy()

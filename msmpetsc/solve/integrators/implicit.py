@@ -302,13 +302,13 @@ class ImplicitEuler(Integrator):
         if checkpoint.step:
             self.stepper.forget(modes=False)
         checkpoint.keep_counts(self)
-        self.stepper.minimum.curvature.save(checkpoint)
+        self.stepper.optimality.curvature.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         self._let_go(time)
         self.stepper.forget()
         checkpoint.restore_counts(self)
-        self.stepper.minimum.curvature.restore(checkpoint)
+        self.stepper.optimality.curvature.restore(checkpoint)
 
     def forget(self) -> None:
         self.stepper.forget()

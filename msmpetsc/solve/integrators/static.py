@@ -168,9 +168,9 @@ class Static(ImplicitEuler):
         """Choose tau and build the preconditioner. Raises InputError if a body is not held."""
         refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
-        minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
-        minimum.estimate.linearise(rest, None)
-        lowest, _ = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
+        optimality, rest = self.stepper.optimality, self.stepper.lattice.nodes
+        optimality.estimate.linearise(rest, None)
+        lowest, _ = optimality.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
         if lowest > 0 and not ACCEPTED_LOWEST[0] <= lowest <= ACCEPTED_LOWEST[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()

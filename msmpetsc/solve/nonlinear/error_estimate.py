@@ -9,7 +9,7 @@ lambda. The solve ends if
 - |e_k|_M and the missing part together are acceptable, or
 - the missing part is at most |e_k|_M, so that the estimate, their sum, is at most twice |e|_M.
 
-Then g can be examined at x - e_k (minimum.Minimum).
+Then g can be examined at x - e_k (optimality.Optimality).
 """
 
 import numpy as np

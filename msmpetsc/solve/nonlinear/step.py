@@ -27,8 +27,8 @@ from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.nonlinear.local_global import LocalGlobal
-from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.newton import SOFTER, Newton
+from msmpetsc.solve.nonlinear.optimality import Optimality, Verdict
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
@@ -126,7 +126,7 @@ class Stepper:
                     self.functional, self.preset, self.options, self.touches, self.owned
                 )
                 self.snes, self.ksp = self._create_solvers()
-                self.control, self.minimum = self._create_control()
+                self.control, self.optimality = self._create_control()
                 self.method = self._create_method()
                 take = self.functional.vectors.take
                 self.carried_start = CarriedStart(
@@ -177,18 +177,19 @@ class Stepper:
                     "their own; presets anderson and lbfgs take it"
                 )
 
-    def _create_control(self) -> tuple[ErrorControl, Minimum]:
+    def _create_control(self) -> tuple[ErrorControl, Optimality]:
         functional, jacobian = self.functional, self.jacobian
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
         estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.prefix))
         curvature = self._keep(LowestCurvature(functional, hessian, preconditioner))
         rounding = Rounding(functional, jacobian.diagonal)
-        minimum = Minimum(functional, estimate, curvature, rounding)
+        optimality = Optimality(functional, estimate, curvature, rounding)
         error = self.error
         if error is None and not self.budget:
             error = DEFAULT_STEP_ERROR
         rtol = self.ksp.getTolerances()[0]
-        return ErrorControl(functional, estimate, curvature, rounding, error or 0.0, rtol), minimum
+        control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, rtol)
+        return control, optimality
 
     def _create_method(self) -> Newton | LocalGlobal:
         given = (
@@ -307,14 +308,14 @@ class Stepper:
         self.jacobian.preconditioner.forget()
         self.control.forget()
         if modes:
-            self.minimum.curvature.forget()
+            self.optimality.curvature.forget()
 
     def work_so_far(self) -> Work:
         """Return the work of all steps so far, with estimates and searches for modes."""
         of_estimates = total_iterations(self.control.estimate.ksp)
-        ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.search.its
+        ksp_its = total_iterations(self.ksp) + of_estimates + self.optimality.curvature.search.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
-        proof = self.control.estimate.products + self.minimum.curvature.products
+        proof = self.control.estimate.products + self.optimality.curvature.products
         return Work(
             iterations=self.method.iterations,
             ksp_its=ksp_its,
@@ -335,7 +336,7 @@ class Stepper:
         if outcome.compression.least_curvature > 0 and not self.budget:
             return Verdict(outcome.error, now, is_minimum=True)
         enough = control.target * self.functional.distance(now.q) if control.target else np.inf
-        verdict = self.minimum.examine(now, outcome, enough)
+        verdict = self.optimality.examine(now, outcome, enough)
         is_good = verdict.error <= control.target or (
             outcome.at_rounding and not np.isinf(verdict.error)
         )
@@ -351,7 +352,7 @@ class Stepper:
 
         Raises StepFailed.
         """
-        lower = self.minimum.lower_iterate(now, verdict)
+        lower = self.optimality.lower_iterate(now, verdict)
         doubted = self.control.doubt(replace(outcome, error=verdict.error), lower is not None)
         if doubted and doubted.doubts > DOUBTS:
             raise no_minimum(doubted, where_worst(self.functional, lower or now))

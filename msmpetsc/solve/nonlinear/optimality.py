@@ -50,7 +50,7 @@ class Verdict:
     is_minimum: bool = False
 
 
-class Minimum:
+class Optimality:
     """Second-order test of a stepper's iterates. All methods are collective."""
 
     def __init__(

@@ -165,7 +165,7 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     contacts.find(end, with_points=True)
     free = 0.02 / (0.02 + 2.5 * SIDE)
     # a tenth of the way that collision detection finds is kept as distance
-    assert 0.75 * free < contacts.free_share(start, end) < free
+    assert 0.75 * free < contacts.collision_free_step(start, end) < free
 
 
 def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):

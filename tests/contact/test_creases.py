@@ -12,7 +12,7 @@ from block_scene import block_scene, play
 from crossings import count_crossings
 
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
-from msmpetsc.contact.surface.continuous_collision import free_share, sweep
+from msmpetsc.contact.surface.continuous_collision import collision_free_step, sweep
 from msmpetsc.geometry.surface import Surface
 
 # sizes of a block, of the groove's bottom, and its half width [m]
@@ -81,10 +81,10 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     assert not barrier.contacts(barrier.creases, closed(points, 0.99 * tight))[level].empty()
     through = closed(points, -2 * HALF) - points
     # the sides meet halfway
-    assert 0.3 < free_share(barrier, points, through, candidates) < 0.5
+    assert 0.3 < collision_free_step(barrier, points, through, candidates) < 0.5
     assert 0.3 < sweep(barrier, points, through) < 0.5
-    assert 0.3 < free_share(barrier, points, through, barrier.creases) < 0.5
-    assert free_share(barrier, points, closed(points, 0.05) - points, candidates) == 1
+    assert 0.3 < collision_free_step(barrier, points, through, barrier.creases) < 0.5
+    assert collision_free_step(barrier, points, closed(points, 0.05) - points, candidates) == 1
 
 
 def test_the_derivatives_in_a_crease_are_those_of_its_energy():

@@ -173,12 +173,13 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     through[q[:, 0] < 0, 0] += 2 * GAP
     opened[q[:, 0] < 0, 0] -= 2 * GAP
     # the arms meet halfway
-    assert 0.3 < term.contacts.free_share(q, through) < 0.5
-    assert term.contacts.free_share(q, opened) == term.contacts.free_share(q, carried) == 1.0
+    assert 0.3 < term.contacts.collision_free_step(q, through) < 0.5
+    for end in (opened, carried):
+        assert term.contacts.collision_free_step(q, end) == 1.0
     far = q.copy()
     # a way of many edge lengths, whose end is free again
     far[q[:, 0] < 0, 0] += 500 * GAP
-    assert 0 < term.contacts.free_share(q, far) < 1 / 500
+    assert 0 < term.contacts.collision_free_step(q, far) < 1 / 500
 
 
 # otherwise the ends of the arms turn inside out

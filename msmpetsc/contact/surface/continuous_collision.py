@@ -2,8 +2,8 @@
 
 The broad phase finds the pairs that may meet on the paths. The narrow phase is ipctk's additive CCD
 (Li, Kaufman and Jiang 2021, Codimensional Incremental Potential Contact). A translation that all
-points have in common is left out. The function ``free_share`` takes paths with known candidates,
-``sweep`` takes long paths piece by piece.
+points have in common is left out. The function ``collision_free_step`` takes paths with known
+candidates, ``sweep`` takes long paths piece by piece.
 """
 
 from typing import TYPE_CHECKING
@@ -63,8 +63,10 @@ def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
     return (rest - x @ linear, size) if size < STRETCHED else (rest, 0.0)
 
 
-def free_share(barrier: "Barrier", start: Positions, moved: Rows, sets: "CandidateSets") -> float:
-    """Return the free share of the paths from start (p, 3) by ``moved`` (p, 3) [m].
+def collision_free_step(
+    barrier: "Barrier", start: Positions, moved: Rows, sets: "CandidateSets"
+) -> float:
+    """Return the collision-free step length, at most 1, from start (p, 3) by ``moved`` (p, 3) [m].
 
     sets : candidate pairs of the paths
     """
@@ -73,7 +75,7 @@ def free_share(barrier: "Barrier", start: Positions, moved: Rows, sets: "Candida
 
 
 def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
-    """Return the free share of paths of any length, with new candidates for each piece."""
+    """Return the collision-free step length of any paths, with new candidates for each piece."""
     moved = moved - moved.mean(axis=0)
     whole = max(
         int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * barrier.edge))), 1

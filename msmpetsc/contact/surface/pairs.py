@@ -20,7 +20,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, CandidateSets, ContactSets
-from msmpetsc.contact.surface.continuous_collision import PIECE, free_share, sweep
+from msmpetsc.contact.surface.continuous_collision import PIECE, collision_free_step, sweep
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -314,7 +314,7 @@ class ContactSearch:
         if bound > pairs.margin and ahead <= FARTHEST * self.near.edge:
             self.near.broad_phase(x, self.time, ahead)
         self.find(x, base=q)
-        of_all, free = self.touch(x, self.time), self.free_share(q, x, self.begin) == 1.0
+        of_all, free = self.touch(x, self.time), self.collision_free_step(q, x, self.begin) == 1.0
         is_right = (
             free and abs(of_all.energy - known.energy) <= SAME_ENERGY * known.energy + left_out
         )
@@ -386,8 +386,10 @@ class ContactSearch:
         places = (q, begin), (end, self.time)
         return pairs, max(self.near.farthest(at, pairs.q, time, pairs.time) for at, time in places)
 
-    def free_share(self, q: Positions, end: Positions, begin: float | None = None) -> float:
-        """Return the share of the straight path from q to ``end`` on which no two triangles meet.
+    def collision_free_step(
+        self, q: Positions, end: Positions, begin: float | None = None
+    ) -> float:
+        """Return the step length, at most 1, from q to ``end`` before two triangles meet.
 
         begin : time [s] from which obstacles move to their present places; None if they stay
         """
@@ -410,7 +412,9 @@ class ContactSearch:
                 )
             sets = (known or self.near.broad_phase(q, begin, LEAST * self.near.edge, moved)).sets
         return float(
-            self.comm.bcast(free_share(self.barrier, start, moved, sets) if self.barrier else 1.0)
+            self.comm.bcast(
+                collision_free_step(self.barrier, start, moved, sets) if self.barrier else 1.0
+            )
         )
 
     def _clearance(self, q: Positions, time: float) -> float:

@@ -67,7 +67,7 @@ class CarriedStart:
         contacts = functional.surface.contacts if functional.surface else None
         if contacts is None:
             return guess
-        share = functional.free_share(problem.q, guess, contacts.begin)
+        share = functional.collision_free_step(problem.q, guess, contacts.begin)
         if share == 1.0:
             return guess
         end, obstacles, moved = contacts.time, contacts.obstacles, guess - problem.q
@@ -80,7 +80,7 @@ class CarriedStart:
             carried = np.where(
                 functional.lattice.fixed, problem.fixed_positions, problem.q + displacement
             )
-            if functional.free_share(problem.q, carried, contacts.begin) == 1.0:
+            if functional.collision_free_step(problem.q, carried, contacts.begin) == 1.0:
                 return carried
         obstacles.straight = contacts.begin, end
         try:
@@ -127,10 +127,10 @@ class CarriedStart:
                 )
                 for _ in range(CORRECTIONS):
                     direction = self._direction(q, np.zeros_like(left), still)
-                    q = q + functional.free_share(q, q + direction) * direction
+                    q = q + functional.collision_free_step(q, q + direction) * direction
                 direction = self._direction(q, left, contacts.obstacles.displacements(now, end))
                 contacts.time = end
-                share = functional.free_share(q, q + direction, now)
+                share = functional.collision_free_step(q, q + direction, now)
                 if share == 1.0:
                     return q + direction
                 q, s = q + share * direction, s + share * (1 - s)

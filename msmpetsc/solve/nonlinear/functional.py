@@ -197,15 +197,17 @@ class StepFunctional:
         """Contact of the surface with itself and obstacles in this step; None without any."""
         return self.problem.contact.surface if self.problem.contact else None
 
-    def free_share(self, base: Positions, q: Positions, begin: float | None = None) -> float:
-        """Return the share of the straight path from base to q (l, 3) [m] without a crossing.
+    def collision_free_step(
+        self, base: Positions, q: Positions, begin: float | None = None
+    ) -> float:
+        """Return the collision-free step length, at most 1, on the way from base to q (l, 3) [m].
 
         begin : time [s] from which obstacles move to their present places; None if they stay
         """
         if self.surface is None:
             return 1.0
         with CONTACT:
-            return self.surface.contacts.free_share(base, q, begin)
+            return self.surface.contacts.collision_free_step(base, q, begin)
 
     def noise(self, count: int) -> Rows:
         """Return random numbers (count, n) in [-1/2, 1/2), the same for any number of ranks."""

@@ -190,7 +190,7 @@ class Newton(StepMethod):
         self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
             end = self._stop_at_obstacles(now, now.contact, self.functional.positions(self.end))
-            share = self.functional.free_share(now.q, end)
+            share = self.functional.collision_free_step(now.q, end)
         if share < 1.0:
             self.y.scale(share)
 

@@ -128,7 +128,7 @@ class Optimality:
         functional, x = self.functional, self.functional.vectors.take()
         x.waxpy(-1.0, self.estimate.correction, at.x)
         q = functional.positions(x)
-        return x, q, functional.free_share(at.q, q) == 1.0
+        return x, q, functional.collision_free_step(at.q, q) == 1.0
 
     def _second_estimate(
         self, examined: Iterate, first: float, bound: float, acceptable: float, lowest: float
@@ -181,9 +181,8 @@ class Optimality:
         for _ in range(MOVES):
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
             q = functional.positions(x)
-            change = (
-                functional.change(q, base)[0] if functional.free_share(base, q) == 1.0 else np.inf
-            )
+            is_free = functional.collision_free_step(base, q) == 1.0
+            change = functional.change(q, base)[0] if is_free else np.inf
             if change < lowest:
                 best, lowest = move, change
                 move *= 2

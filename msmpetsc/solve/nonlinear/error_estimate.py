@@ -28,7 +28,7 @@ class ErrorEstimate:
 
     correction : e of the last estimate
     residual   : F - H e of the last estimate
-    found      : |e_k|_M of the last estimate [m sqrt(kg)]
+    correction_norm : |e_k|_M of the last estimate [m sqrt(kg)]
     missing    : bound on the part of e that the last estimate has not found [m sqrt(kg)]
     lowest     : bound on the eigenvalues of M^(-1) H that the last estimate used
     convexity  : least eigenvalue of M^(-1) H that the step has met, at most 1
@@ -45,7 +45,7 @@ class ErrorEstimate:
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.operator = python_matrix(functional.unknowns, hessian, functional.comm)
         self.correction, self.residual = self.operator.createVecs()
-        self.found = self.missing = np.inf
+        self.correction_norm = self.missing = np.inf
         self.products = 0
         self.lowest = self.convexity = 1.0
         self._acceptable = 0.0
@@ -73,7 +73,7 @@ class ErrorEstimate:
             self.linearise(iterate.q, iterate.contact)
             self.ksp.solve(iterate.f, self.correction)
         self.products += self.hessian.products + self.preconditioner.products - before
-        return self.found + self.missing if self.ksp.reason > 0 else np.inf
+        return self.correction_norm + self.missing if self.ksp.reason > 0 else np.inf
 
     def linearise(self, q: Positions, contact: StepContactAt | None) -> None:
         """Linearise the Hessian and the preconditioner at positions q (l, 3) [m]."""
@@ -89,12 +89,13 @@ class ErrorEstimate:
         if residual > 0 and its == 0:
             return reasons.ITERATING
         self.residual = ksp.buildResidual(self.residual)
-        self.found = self.functional.norm(ksp.getSolution())
+        self.correction_norm = self.functional.norm(ksp.getSolution())
         self.missing = self.functional.dual_norm(self.residual) / self.lowest
         is_decided = (
-            0 < self._acceptable < self.found or self.found + self.missing <= self._acceptable
+            0 < self._acceptable < self.correction_norm
+            or self.correction_norm + self.missing <= self._acceptable
         )
-        if residual == 0 or is_decided or self.missing <= self.found:
+        if residual == 0 or is_decided or self.missing <= self.correction_norm:
             return reasons.CONVERGED_ITS
         return reasons.ITERATING
 

@@ -95,14 +95,14 @@ class Newton(StepMethod):
             if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
                 outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
             self._limit(now)
-            found = self._search(now, outcome.is_flat)
-            if found is None and projected:
+            lower = self._search(now, outcome.is_flat)
+            if lower is None and projected:
                 reason = REASON.DIVERGED_LINE_SEARCH
                 break
-            if found is None:
+            if lower is None:
                 projected = PROJECTED
                 continue
-            now, outcome = found, self.control.judge(found, outcome)
+            now, outcome = lower, self.control.judge(lower, outcome)
             projected, its = max(projected - 1, 0), its + 1
         self.iterations += its
         self._given = now, outcome

@@ -105,7 +105,7 @@ class Optimality:
             # The estimate took the missing part of the error for too small
             again = bool(np.isfinite(estimate(at)))
             return self.examine(at, replace(outcome, corrected=again), acceptable)
-        estimated = estimate.found + estimate.missing
+        estimated = estimate.correction_norm + estimate.missing
         if corrected and bent <= SMALL * estimated and value > CONVEX:
             return Verdict(
                 self.rounding.relative(estimated, functional.distance(examined.q)), examined
@@ -149,7 +149,7 @@ class Optimality:
             functional.vectors.give_back(end)
             if not is_free:
                 return relative(first + DOUBTFUL * second, distance)
-        if first > 0 and estimate.found > SMALL * first:
+        if first > 0 and estimate.correction_norm > SMALL * first:
             return DOUBTFUL * relative(max(first, second), distance)
         return relative(first + second, distance)
 

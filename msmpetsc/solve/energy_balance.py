@@ -149,14 +149,19 @@ class EnergyBalance:
     ) -> bool:
         """Return whether a solved step gains more than NOTABLE_GAIN of all energy (collective).
 
-        Count energy and work in a frame that moves with the pressing obstacles. If no obstacle
-        presses, the frame moves with the body, so that rigid motion does not matter.
+        Count energy and work in a frame that moves with the obstacles that press at the start or
+        the end of the step: in another frame they do work. If no obstacle presses, the frame moves
+        with the body, so that rigid motion does not matter.
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
         displacement = result.position[owned] - result.previous[owned]
         pressing, dragged = self.environment.obstacles.pressing_displacement(
-            (result.position[owned], after.sides), time, time_step
+            (before.q[owned], before.sides), (result.position[owned], after.sides), time, time_step
         )
+        contact = result.problem and result.problem.contact
+        if contact and contact.surface:
+            pushed, carried = contact.surface.pressing_displacement(before.q, result.position)
+            pressing, dragged = pressing + pushed, dragged + carried
         is_fixed = self.environment.anchors.fixed_at(time)[owned].any(axis=0)
         sums = self._sums(
             lattice.mass.sum(),

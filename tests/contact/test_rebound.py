@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import block_scene, play
+from block_scene import GRAVITY, block_scene, play
 from test_tunnelling import ball, totals
 
 from msmpetsc.contact.step_contact import StepContactAt
@@ -40,20 +40,45 @@ def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: floa
     assert frames[-1].momentum[2] > 0
 
 
-@pytest.mark.parametrize("step", [0.005, 0.0025])
-def test_bdf2_does_not_give_back_what_the_impact_of_a_soft_plate_took(tmp_path: Path, step: float):
-    fall = FALL | {
-        "start": {"velocity": [0, 0, -2.5]},
-        "time": {"step": step, "duration": 0.08, "integrator": "bdf2"},
-    }
-    material = {"young_modulus": 5e4, "density": 1000.0, "poisson_ratio": 0.1, "law": "neo-hookean"}
-    ground = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": "penalty"}
-    size = np.array([0.25, 0.125, 0.0125])
-    _, frames = play(
-        block_scene(
-            tmp_path, size, cages={"count": 50}, material=material, obstacle=[ground], **fall
-        )
+# response -> obstacle 0.05 m below a plate
+GROUNDS = {
+    "penalty": {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1]},
+    "barrier": {"shape": "box", "box": [[-1, -1, -0.2], [1, 1, -0.05]]},
+}
+
+
+@pytest.mark.parametrize(
+    ("response", "step", "speed", "size", "cells"),
+    [
+        # pressed at the end of the step that would gain
+        ("penalty", 0.005, 2.5, [0.25, 0.125, 0.0125], 50),
+        ("penalty", 0.0025, 2.5, [0.25, 0.125, 0.0125], 50),
+        # has left the ground by then
+        ("penalty", 0.005, 3.0, [0.25, 0.125, 0.0125], 50),
+        ("barrier", 0.005, 3.0, [0.3, 0.1, 0.01], 300),
+    ],
+)
+def test_bdf2_does_not_give_back_what_the_impact_of_a_soft_plate_took(
+    tmp_path: Path, response: str, step: float, speed: float, size: list[float], cells: int
+):
+    scene = block_scene(
+        tmp_path,
+        np.array(size),
+        mesh={"source": "scene.ply", "prepare": [{"refine": 0.25}]},
+        cages={"count": cells},
+        material={
+            "young_modulus": 5e4,
+            "density": 1000.0,
+            "poisson_ratio": 0.1,
+            "law": "neo-hookean",
+        },
+        obstacle=[GROUNDS[response] | {"response": response}],
+        gravity=GRAVITY,
+        start={"velocity": [0, 0, -speed]},
+        time={"step": step, "duration": 0.08, "integrator": "bdf2"},
+        solver={"preset": "newton", "error": 1e-4},
     )
+    _, frames = play(scene)
     assert rise(frames) < 1e-2
     assert frames[-1].momentum[2] > 0
 

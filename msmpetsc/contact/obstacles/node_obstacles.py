@@ -154,19 +154,21 @@ class NodeObstacles:
         return work
 
     def pressing_displacement(
-        self, state: Placed, time: float, time_step: float
+        self, before: Placed, after: Placed, time: float, time_step: float
     ) -> tuple[float, Floats]:
         """Return the sum of penalty forces [N], and the sum (3,) [N m] of force times displacement.
 
-        The sums are over this rank's nodes, with the obstacles' displacements in the step.
+        The sums are over this rank's nodes at a step's start and end, with the obstacles'
+        displacements in the step.
         """
         total, weighted = 0.0, np.zeros(3)
         for row, p in enumerate(self.penalties):
-            if p.obstacle.acts_at(time):
-                force = p.stiffness * float(self._depths(row, state, time).sum())
-                displacement = p.obstacle.path.displacement_between(time - time_step, time)
-                total += force
-                weighted = weighted + force * displacement
+            displacement = p.obstacle.path.displacement_between(time - time_step, time)
+            for state, when in ((before, time - time_step), (after, time)):
+                if p.obstacle.acts_at(when):
+                    force = p.stiffness * float(self._depths(row, state, when).sum())
+                    total += force
+                    weighted = weighted + force * displacement
         return total, weighted
 
     def change_of_push(

@@ -270,6 +270,22 @@ class SurfaceContact:
             forces_and_work = self.comm.bcast(forces_and_work)
         return forces_and_work
 
+    def pressing_displacement(self, before: Positions, after: Positions) -> tuple[float, Floats]:
+        """Return the sum of forces [N], and the sum (3,) [N m] of force times displacement.
+
+        The sums are over obstacles' points on rank 0, at a step's start and end, without friction.
+        """
+        contacts, total, weighted = self.contacts, 0.0, np.zeros(3)
+        if contacts.obstacles.total:
+            moved = contacts.obstacles.displacements(contacts.begin, contacts.time)
+            for moment in (contacts.find(before, contacts.begin), contacts.find(after)):
+                if moment.count and len(moment.points):
+                    pushes = self._pushes(moment)[contacts.points.bodies :]
+                    forces = np.linalg.norm(pushes, axis=1)
+                    total += float(forces.sum())
+                    weighted += (forces[:, None] * moved).sum(axis=0)
+        return total, weighted
+
     def released(self, q: Positions) -> float:
         """Return the energy [J] of elastic slips at the start minus that at q, on rank 0."""
         moment = self._acting(q)

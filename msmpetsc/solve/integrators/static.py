@@ -33,6 +33,7 @@ from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.petsc.library import keep_for_ever, petsc_errors
 from msmpetsc.solve.recovery import Halving
 from msmpetsc.solve.work import Work
 
@@ -165,12 +166,16 @@ class Static(ImplicitEuler):
         return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
     def set_up(self) -> None:
-        """Choose tau and build the preconditioner. Raises InputError if a body is not held."""
+        """Choose tau and build the preconditioner.
+
+        Raises InputError if a body is not held, or if PETSc cannot apply the preconditioner.
+        """
         refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
         optimality, rest = self.stepper.optimality, self.stepper.lattice.nodes
-        optimality.estimate.linearise(rest, None)
-        lowest, _ = optimality.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
+        with petsc_errors("PETSc cannot set up the solver", lambda: keep_for_ever(self.stepper)):
+            optimality.estimate.linearise(rest, None)
+            lowest, _ = optimality.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
         if lowest > 0 and not ACCEPTED_LOWEST[0] <= lowest <= ACCEPTED_LOWEST[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()

@@ -3,8 +3,9 @@
 import ctypes
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 from petsc4py import PETSc
@@ -120,6 +121,21 @@ def petsc_errors(heading: str, abandon: Callable[[], None] = lambda: None) -> It
             raise cause  # noqa: B904
         abandon()
         raise InputError(f"{heading}: {last_words(cause or error)}") from None
+
+
+class Owner(Protocol):
+    """An object that destroys PETSc objects.
+
+    owned : destroys them when closed
+    """
+
+    owned: ExitStack
+
+
+def keep_for_ever(owner: Owner) -> None:
+    """Keep an owner's PETSc objects for ever: destroying them after an error may crash."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(owner))
+    owner.owned = ExitStack()
 
 
 def last_words(error: BaseException) -> str:

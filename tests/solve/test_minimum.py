@@ -249,11 +249,12 @@ def shares_said(seed: int, number: int, *changes: str) -> list[float]:
     return [error / true for error, true in json.loads(printed)["steps"]]
 
 
-def test_random_hard_scenes_say_no_less_than_a_third_of_their_error():
+@pytest.mark.parametrize(("seed", "kinds"), [(7, ["any"]), (8, ["rub", "far", "touch"])])
+def test_random_hard_scenes_say_no_less_than_a_third_of_their_error(seed: int, kinds: list[str]):
     """A sample of the scenes of scripts/error_study.py, which takes 500."""
     (last,) = (
         line
-        for line in error_study("--scenes", 12, "--seed", 7).splitlines()
+        for line in error_study("--scenes", 12, "--seed", seed, "--kinds", *kinds).splitlines()
         if line.startswith("| all |")
     )
     done, stopped, refused, cut_off, faults, steps = map(int, last.split("|")[2:8])

@@ -256,6 +256,8 @@ def test_a_load_beyond_all_numbers_is_told(tmp_path: Path, load: str):
     )
     path = block_scene(tmp_path, **SCENE | tables)
     assert "check gravity, force" in command_error("run", path, "-o", tmp_path / "o.h5")
+    # no lock
+    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize("preset", ["newton", "anderson", "lbfgs"])

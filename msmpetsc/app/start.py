@@ -1,5 +1,6 @@
 """The Python interface of runs. Modules that use PETSc are imported after it has its options."""
 
+import atexit
 import inspect
 import logging
 import shlex
@@ -248,6 +249,9 @@ class Simulation:
         """Yield the frames of a run and close its resources at the end (collective)."""
         with ExitStack() as resources:
             with self._guarded():
+                # A process that ends PETSc first closes the runs that it has left open.
+                atexit.register(resources.close)
+                resources.callback(atexit.unregister, resources.close)
                 steps = self._begin(scene, resources)
             while True:
                 with self._guarded():

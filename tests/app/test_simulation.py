@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import DENSITY, G, block_scene
-from conftest import run
+from conftest import ENVIRONMENT, python, run
 
 import msmpetsc as msm
+from msmpetsc.app.ranks import ALONE
 from msmpetsc.errors import InputError, StepFailed
 
 FALL = {"gravity": {"acceleration": [0, 0, -G]}, "time": {"step": 0.01, "duration": 0.03}}
@@ -132,6 +133,14 @@ def test_a_loop_may_end_early_and_leaves_nothing_behind(scene: Path):
     assert PETSc.Options().getAll() == before
     assert np.geterr()["invalid"] == "warn"
     assert len(list(simulation.frames())) == 4
+
+
+@pytest.mark.parametrize(("end", "status"), [("", 0), ("raise SystemExit(5)", 5)])
+def test_a_process_may_end_while_its_frames_have_not(scene: Path, end: str, status: int):
+    """The frames outlive PETSc, whose objects they hold."""
+    program = f"import sys, msmpetsc; f = msmpetsc.frames(sys.argv[1]); next(f); next(f)\n{end}"
+    done = python("-c", program, scene, env=ENVIRONMENT | ALONE)
+    assert done.returncode == status and "error" not in done.stderr.lower(), done.stderr
 
 
 def test_two_simulations_may_go_side_by_side(scene: Path):
